@@ -18,7 +18,7 @@ from neurosim_core.learn.episodes import (
     free_points,
     look_at_vehicles,
 )
-from neurosim_core.learn.surfaces import EventSurface, LeakySurface, SurfaceConfig
+from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
@@ -57,7 +57,7 @@ def make_env(
         worlds: N.
         device: Where everything is: auto, cpu, cuda:0.
         observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
-        surface: How events are shown; None: sums that decay with 20 ms and 200 ms.
+        surface: How events are shown; None: as the task says.
         scenes: Where to fly.
         models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
         randomise: Draw parameters anew in each episode; as the task says, or as told.
@@ -67,9 +67,7 @@ def make_env(
     Raises:
         ValueError: There is no such task, or a setting is not for worlds.
     """
-    import neurosim_core.learn.tasks  # noqa: F401  (registers)
-
-    chosen = find("task", task)() if isinstance(task, str) else task
+    chosen = find_task(task) if isinstance(task, str) else task
     if pixels is not None:
         chosen.camera = {**chosen.camera, "width": pixels, "height": pixels}
     return Env(
@@ -83,6 +81,18 @@ def make_env(
         randomise=randomise,
         seed=seed,
     )
+
+
+def find_task(name: str) -> Task:
+    """Return a task by its name in the registry.
+
+    Raises:
+        ValueError: There is none.
+    """
+    import neurosim_core.learn.tasks  # noqa: F401  (registers)
+
+    task: Task = find("task", name)()
+    return task
 
 
 class Env:
@@ -150,7 +160,7 @@ class Env:
         self._surface: EventSurface | None = None
         if sees:
             self._surface = EventSurface(
-                LeakySurface(tau_s=(0.02, 0.2)) if surface is None else surface,
+                task.surface if surface is None else surface,
                 world_count=worlds,
                 width=task.camera["width"],
                 height=task.camera["height"],

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
 from neurosim_core.vehicle import MultirotorConfig
 
 MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
@@ -119,6 +120,8 @@ class Task:
     """Lens of the event camera."""
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03)}
     """Where it sits on the body: {position_m, rpy_rad}; a positive pitch looks down."""
+    surface: SurfaceConfig = LeakySurface(tau_s=(0.02, 0.2))
+    """How events are shown."""
     threshold: float = 0.1
     """Of the event camera, both ways."""
     renders_per_step: int = 1
@@ -129,6 +132,8 @@ class Task:
     """Settings of the vehicle."""
     start: StartConfig = StartConfig()
     randomisation: Randomisation = Randomisation()
+    training: Randomisation | None = None
+    """What training draws in its place: with more of it, students cope with other scenes; None: the same."""
     rate_max_rad_s: Sequence[float] = (4.0, 4.0, 2.0)
     """Body rates of an action of 1 [rad/s]."""
     thrust_span: float = 0.6

@@ -21,7 +21,7 @@ import torch
 
 from neurosim_core.learn import need
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
-from neurosim_core.learn.env import Env, make_env
+from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
@@ -78,11 +78,14 @@ class Training:
         self.trained_s: dict[str, float] = {}
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
+        drawn = find_task(config.task).training
+        randomise = True if drawn is None else drawn
         self.env = make_env(
             config.task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
+            randomise=randomise,
             pixels=config.pixels,
             seed=config.seed,
         )
@@ -95,6 +98,7 @@ class Training:
             device=config.device,
             observe=states,
             models=self.env.sim.models,
+            randomise=randomise,
             seed=config.seed,
         )
         self._teacher = Ppo(teacher_env, config.teacher, self._generator)
@@ -197,11 +201,11 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     """Return how a task is trained: with more worlds on a GPU, and for longer."""
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
-        return config
+        return dataclasses.replace(config, pixels=24)
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512, iterations=50),
-        student=DaggerConfig(worlds=1024, iterations=120, replay=4, updates=24, batch=128),
+        teacher=PpoConfig(worlds=512, iterations=40),
+        student=DaggerConfig(worlds=1024, iterations=100, replay=4, updates=24, batch=128),
         evaluation_worlds=512,
     )
 

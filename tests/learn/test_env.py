@@ -175,12 +175,16 @@ def still(**ranges):
 
 def calm(**start):
     """Return a task that begins at rest and level."""
-    return type("Calm", (Brief,), {"start": ns.learn.StartConfig(clearance_m=0.9, **start), "episode_s": 1.0})()
+    return type(
+        "Calm", (Brief,), {"start": ns.learn.StartConfig(clearance_m=0.9, **start), "episode_s": 1.0}
+    )()
 
 
 def test_a_mass_that_is_drawn_is_the_mass_that_flies(make):
     """The thrust that carries the nominal mass m accelerates f m with g (1 / f - 1) upwards."""
-    env = make(8, calm(), observe=["state"], randomise=still(mass_factor=(0.7, 1.3), inertia_factor=(0.5, 2.0)))
+    env = make(
+        8, calm(), observe=["state"], randomise=still(mass_factor=(0.7, 1.3), inertia_factor=(0.5, 2.0))
+    )
     env.reset(seed=1)
     for _ in range(5):
         env.step(torch.zeros(8, 4))
@@ -199,7 +203,7 @@ def test_a_mass_that_is_drawn_is_the_mass_that_flies(make):
 
 
 def test_a_wind_that_is_drawn_blows_in_proportion_to_the_drag(make):
-    """At rest and level the acceleration is k (v_wind - v) / m, with the drag k that is drawn, and small v."""
+    """At rest and level the acceleration is k (v_wind - v) / m, with the drag k that is drawn."""
     env = make(8, calm(), observe=["state"], randomise=still(drag_factor=(0.5, 2.0), wind_m_s=1.0))
     env.reset(seed=1)
     for _ in range(5):

@@ -81,7 +81,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     pilot = Pilot(tmp_path / "policy.onnx")
     rng = np.random.default_rng(0)
     memory, action = torch.zeros(1, policy.memory_size), torch.zeros(1, 4)
-    surface = np.zeros((4, 8, 8))
+    surface = np.zeros((6, 8, 8))
     for step in range(1, 6):
         count = 40
         t = np.sort(rng.integers(20_000 * (step - 1) + 1, 20_000 * step + 1, count))
@@ -90,7 +90,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
         command = pilot.act(
             t, x, y, polarity, stamp_ns=20_000_000 * step, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate
         )
-        for scale, tau_s in enumerate((0.02, 0.2)):
+        for scale, tau_s in enumerate((0.02, 0.06, 0.3)):
             surface[2 * scale : 2 * scale + 2] *= np.exp(-0.02 / tau_s)
             np.add.at(surface, (2 * scale + polarity, y, x), np.exp(-(20_000 * step - t) / (1e6 * tau_s)))
         vector = torch.tensor(np.concatenate([[0.0, 0.0, -1.0], 0.3 * rate]), dtype=torch.float32)[None]
@@ -119,7 +119,7 @@ def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):
     memories = [np.zeros((1, policy.memory_size), np.float32) for _ in range(2)]
     actions = []
     for _ in range(50):
-        seen = rng.exponential(2.0, (1, 4, 8, 8)).astype(np.float32)
+        seen = rng.exponential(2.0, (1, 6, 8, 8)).astype(np.float32)
         vector = rng.normal(size=(1, 10)).astype(np.float32)
         inputs = {"events": seen, "vector": vector, "memory": memories[0]}
         action, memories[0] = session.run(None, inputs)
