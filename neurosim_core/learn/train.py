@@ -205,7 +205,8 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     return dataclasses.replace(
         config,
         teacher=PpoConfig(worlds=512, iterations=40),
-        student=DaggerConfig(worlds=1024, iterations=100, replay=4, updates=24, batch=128),
+        student=DaggerConfig(worlds=1024, iterations=88, replay=4, updates=24, batch=128),
+        block=44,
         evaluation_worlds=512,
     )
 
