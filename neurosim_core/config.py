@@ -36,7 +36,7 @@ from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuSensorConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import Settings, documentation
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
@@ -402,7 +402,8 @@ def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     for name in bodies if isinstance(bodies, Mapping) else ():
         places += [("bodies", name, "shape"), ("bodies", name, "surface")]
     sensors = raw.get("sensors")
-    places += [("sensors", name, "lens") for name in (sensors if isinstance(sensors, Mapping) else ())]
+    for name in sensors if isinstance(sensors, Mapping) else ():
+        places += [("sensors", name, "lens"), ("sensors", name, "pixel", "measured_noise")]
     for place in places:
         group: Any = raw
         for key in place:
@@ -458,10 +459,10 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:
     pad = "  " * indent
-    for name, field in type(model).model_fields.items():
+    for name in type(model).model_fields:
         value = getattr(model, name)
-        if comments and field.description:
-            for line in field.description.split("\n"):
+        if comments and (description := documentation(type(model)).get(name)):
+            for line in description.split("\n"):
                 yield f"{pad}# {line.strip()}"
         if isinstance(value, BaseModel):
             yield f"{pad}{name}:"
