@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -202,6 +203,27 @@ def test_reliable_from_rust(start, make_node, over):
     numbers = [block.number for block in received]
     assert numbers == sorted(set(numbers))
     assert subscriber.counters.rejected == subscriber.counters.cut_off == 0
+
+
+def test_a_reader_that_rust_does_not_wait_for(start, make_node):
+    """It counts what it has lost, learns of the last loss, and gets messages again."""
+    publishing = Publishing(start("cortex-pub", "/blocks"), Block)
+    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
+    publishing.await_subscribers(1)
+    count = 3_000  # of a kilobyte: three times what lies between the two
+    for number in range(count):
+        publishing.publish(make_block(number, 1_000))
+    received = 0
+    while received + subscriber.counters.lost < count:
+        with contextlib.suppress(TimeoutError):
+            assert is_whole(subscriber.recv(0.01))
+            received += 1
+    lost = subscriber.counters.lost
+    assert lost > 0
+    publishing.publish(make_block(count, 5))
+    assert subscriber.recv(SOON_S).number == count
+    assert publishing.close() == {"published": count + 1, "timeouts": lost}
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
 
 
 def test_several_subscribers_of_rust(start, make_node):

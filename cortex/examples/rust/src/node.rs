@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{Read, Result};
+use std::io::{Error, Read, Result};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, mpsc};
@@ -56,6 +56,12 @@ fn base() -> PathBuf {
 pub fn directory() -> Result<PathBuf> {
     let path = base().join(std::env::var("CORTEX_DOMAIN").unwrap_or("0".into()));
     fs::DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
+    for ours in [&path, &base()] {
+        let status = fs::symlink_metadata(ours)?;
+        if !status.is_dir() || status.uid() != user() || status.mode() & 0o077 != 0 {
+            return Err(Error::other(format!("{} is not a directory of ours with mode 0700", ours.display())));
+        }
+    }
     Ok(path)
 }
 
