@@ -210,7 +210,7 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     publishing = Publishing(start("cortex-pub", "/blocks"), Block)
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
     publishing.await_subscribers(1)
-    count = 3_000  # of a kilobyte: three times what lies between the two
+    count = 2_000  # of a kilobyte: more than lies between the two
     for number in range(count):
         publishing.publish(make_block(number, 1_000))
     received = 0
