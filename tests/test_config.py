@@ -261,6 +261,18 @@ def test_sensors_that_a_file_leaves_out_are_named():
     assert absent_sensors(load_config()) == ""
 
 
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ({"seed": 3}, "tour"),
+        ({"points_m": [[0, 0, 1], [1, 0, 1]]}, "waypoints"),
+        ({"file": "poses.txt"}, "poses"),
+    ],
+)
+def test_the_kind_of_a_path_follows_from_keys_that_one_kind_has(path, kind):
+    assert load_config({"path": path}).path.kind == kind
+
+
 def test_the_kind_of_a_scene_follows_from_its_keys(tmp_path):
     assert load_config({"scene": {"file": "/a.glb"}}).scene.kind == "mesh"
     assert load_config({"scene": {"rooms": 2}}).scene.kind == "apartment"

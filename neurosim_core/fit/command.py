@@ -129,6 +129,7 @@ def write_noise_table(
 
 def print_fit(fit: SensorFit, console: Console) -> None:
     """Print settings with errors, and statistics of the recording beside those of a simulation."""
+    from rich.markup import escape
     from rich.table import Table
 
     from neurosim_core.fit.sensor import statistics
@@ -141,7 +142,7 @@ def print_fit(fit: SensorFit, console: Console) -> None:
     table = Table("statistic", "recording", "simulation", box=None, pad_edge=False)
     simulated = statistics(fit.simulated)
     for name, value in statistics(fit.real).items():
-        table.add_row(name, _short(value), _short(simulated[name]) if name in simulated else "")
+        table.add_row(escape(name), _short(value), _short(simulated[name]) if name in simulated else "")
     console.print(table, highlight=False)
     for note in fit.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
