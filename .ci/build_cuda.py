@@ -20,7 +20,7 @@ import warp as wp
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller, mode_kernel
-from neurosim_core.render.antialias import antialiasing_kernel
+from neurosim_core.render.antialias import antialiasing_kernels
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
@@ -94,7 +94,7 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
-        antialiasing_kernel(OUTPUTS, terms, is_cuda=True)
+        antialiasing_kernels(OUTPUTS, terms, is_cuda=True)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -1,22 +1,21 @@
 """Fly a sensor of your own, from a file of your own: a switch that closes near the ground.
 
-It prints how often the switch was closed, and with --out leaves a recording that `neurosim view` shows. To
-install such a sensor as a package, name its module in an entry point of the group `neurosim.plugins`.
+It prints how often the switch was closed, and leaves a recording for `neurosim view proximity`. To install
+such a sensor as a package, name its module in an entry point of the group `neurosim.plugins`.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 import neurosim_core as ns
+from neurosim_core.flight import fly
 from neurosim_core.packets import FieldSpec
 from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
 
@@ -26,9 +25,7 @@ class Proximity(ns.Packet):
     """What the switch reads: its recording, plot and messages follow from these fields."""
 
     closed: bool
-    """Whether the vehicle is lower than the threshold."""
     height_m: Annotated[float, FieldSpec(unit="m")]
-    """Height of the vehicle above z = 0 [m]."""
 
 
 @ns.register("sensor", "proximity")
@@ -52,16 +49,13 @@ class ProximitySampler(Sampler):
     """Copies the heights of the vehicles of all worlds on the device; the host compares them."""
 
     def __init__(self, threshold_m: float, context: SamplerContext) -> None:
-        vehicle = context.vehicle
-        self._threshold_m = threshold_m
-        self._position = vehicle.arrays.position
-        shape = (context.slot_count, vehicle.count)
-        self.arrays = {"position": wp.zeros(shape, dtype=wp.vec3d, device=vehicle.device)}
+        self._threshold_m, self._position = threshold_m, context.vehicle.arrays.position
+        shape = (context.slot_count, context.vehicle.count)
+        self.arrays = {"position": wp.zeros(shape, dtype=wp.vec3d, device=self._position.device)}
 
     def measure(self, slot: int) -> None:
         """Copy the present positions into a slot."""
-        count = self._position.shape[0]
-        wp.copy(self.arrays["position"].flatten(), self._position, dest_offset=slot * count, count=count)
+        wp.copy(self.arrays["position"][slot], self._position)
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Proximity:
         """Return one sample as a packet."""
@@ -69,29 +63,18 @@ class ProximitySampler(Sampler):
         return Proximity(closed=height_m < self._threshold_m, height_m=height_m, **header)
 
 
-def main(out: Path | None = None) -> int:
+def main(out: Path = Path("proximity")) -> int:
     """Fly a descent; return how many readings said that the switch was closed."""
-    config = ns.load_config(
-        {
-            "duration_s": 2.0,
-            "device": "cpu",
-            "scene": {"kind": "apartment", "rooms": 1},
-            "path": {"kind": "tour"},
-            "sensors": {"proximity": {"kind": "proximity", "threshold_m": 1.45}},
-        }
-    )
-    readings = [packet for packet in ns.run(config) if isinstance(packet, Proximity)]
+    sensors = {"proximity": {"kind": "proximity", "threshold_m": 1.45}}
+    config = {"duration_s": 2.0, "device": "cpu", "scene": {"rooms": 1}, "sensors": sensors}
+    fly(ns.load_config(config), out)
+    with ns.Recording(out / "flight.h5") as flight:
+        readings = [packet for packet in flight.packets() if isinstance(packet, Proximity)]
     closed = sum(reading.closed for reading in readings)
-    heights = np.array([reading.height_m for reading in readings])
-    print(f"{len(readings)} readings, {closed} closed, heights {heights.min():.2f} to {heights.max():.2f} m")
-    if out is not None:
-        from neurosim_core.flight import fly
-
-        fly(config, out)
+    heights = [reading.height_m for reading in readings]
+    print(f"{len(readings)} readings, {closed} closed, heights {min(heights):.2f} to {max(heights):.2f} m")
     return closed
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, help="folder for a recording")
-    main(parser.parse_args().out)
+    main()

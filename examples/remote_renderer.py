@@ -11,26 +11,24 @@ import threading
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 import neurosim_core as ns
 from neurosim_core.live.remote_renderer import Frames, serve_frames
+from neurosim_core.render.conformance import check_renderer
 
 SCENE = {"kind": "apartment", "rooms": 1}
+LENS = ("width", "height", "fx", "fy", "cx", "cy")
 
 
 def render_process(topic: str, ready: Any, done: Any) -> None:
     """Run the other process: answer requests for frames with pyrender."""
-    import warp as wp
-
     config = ns.load_config({"scene": SCENE})
     scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
     cameras: dict[ns.PinholeConfig, Any] = {}
 
     def render(request: Any) -> Frames:
-        lens = ns.PinholeConfig(
-            width=request.width, height=request.height,
-            fx=request.fx, fy=request.fy, cx=request.cx, cy=request.cy,
-        )  # fmt: skip
+        lens = ns.PinholeConfig(**{name: getattr(request, name) for name in LENS})
         if lens not in cameras:
             cameras[lens] = ns.make_renderer(scene, lens, outputs=["depth", "rgb"], instant_count=1)
         camera, depths, pictures = cameras[lens], [], []
@@ -55,27 +53,13 @@ def main() -> tuple[int, list[str]]:
     process.start()
     try:
         while not ready.wait(0.1):
-            if not process.is_alive():
-                raise RuntimeError("the other process has ended")
+            assert process.is_alive(), "the other process has ended"
         lens = {"width": 160, "height": 120, "horizontal_fov_rad": 1.2}
-        config = ns.load_config(
-            {
-                "duration_s": 0.2,
-                "device": "cpu",
-                "scene": SCENE,
-                "renderer": {"kind": "remote", "topic": "/example/renderer"},
-                "sensors": {
-                    "rgb": {"kind": "rgb", "rate_hz": 20, "lens": lens},
-                    "depth": {"kind": "depth", "rate_hz": 20, "lens": lens},
-                },
-            }
-        )
-        model = ns.make_model(config)
-        pictures = [
-            packet for packet in ns.run_model(model, ns.make_state(model)) if isinstance(packet, ns.Image)
-        ]
-        from neurosim_core.render.conformance import check_renderer
-
+        sensors = {kind: {"kind": kind, "rate_hz": 20, "lens": lens} for kind in ("rgb", "depth")}
+        config = {"duration_s": 0.2, "device": "cpu", "scene": SCENE, "sensors": sensors}
+        renderer = {"kind": "remote", "topic": "/example/renderer"}
+        model = ns.make_model(ns.load_config({**config, "renderer": renderer}))
+        pictures = [p for p in ns.run_model(model, ns.make_state(model)) if isinstance(p, ns.Image)]
         complaints = check_renderer(
             model.scene_on_device,
             ns.PinholeConfig(**lens),

@@ -17,13 +17,7 @@ from neurosim_core.vehicle import Acceleration, MultirotorConfig, MultirotorStat
 from neurosim_core.vehicle.config import VehicleConfig, VehicleContext
 from neurosim_core.vehicle.host_vehicle import HostVehicle
 
-_NAMES = {
-    "position": "x",
-    "velocity": "v",
-    "orientation": "q",
-    "body_rate": "w",
-    "rotor_speed": "rotor_speeds",
-}
+_NAMES = dict(zip(MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 
 
 @ns.register("vehicle", "rotorpy")
@@ -68,15 +62,9 @@ class RotorPyVehicle(HostVehicle):
 
 def fly(vehicle: str) -> NDArray[np.float64]:
     """Return the positions of a flight through a generated flat, shape [200, 3]."""
-    config = ns.load_config(
-        {
-            "duration_s": 1.0,
-            "device": "cpu",
-            "scene": {"kind": "apartment", "rooms": 1},
-            "vehicle": {"kind": vehicle},
-            "sensors": {"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}},
-        }
-    )
+    sensors = {"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}}
+    scene = {"kind": "apartment", "rooms": 1}
+    config = {"duration_s": 1.0, "device": "cpu", "scene": scene, "vehicle": vehicle, "sensors": sensors}
     return np.array([packet.position for packet in ns.run(config) if isinstance(packet, ns.Odometry)])
 
 

@@ -18,6 +18,7 @@ from neurosim_core import __version__, docs
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
+from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
@@ -36,9 +37,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
     arguments = _parser().parse_args(argv)
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
-        from neurosim_core.warp_start import start_warp
+        if arguments.computes:
+            from neurosim_core.warp_start import start_warp
 
-        start_warp()
+            start_warp()
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         try:
             return int(arguments.command(arguments))
@@ -85,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="neurosim",
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
+    parser.set_defaults(computes=True)
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
@@ -93,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
+        fit.add_parser,
         bench.add_parser,
         learn.add_parsers,
         docs.add_parser,
@@ -175,7 +179,7 @@ def _add_call(commands: _Commands) -> None:
     requests.add_parser("status", help="print how it is doing")
     for request in requests.choices.values():
         request.add_argument("--timeout", type=float, default=10.0, metavar="S", help="wait at most [s]")
-    call.set_defaults(command=_call)
+    call.set_defaults(command=_call, computes=False)
 
 
 def _add_top(commands: _Commands) -> None:
@@ -186,7 +190,7 @@ def _add_top(commands: _Commands) -> None:
     top.add_argument(
         "--timeout", type=float, default=10.0, metavar="S", help="wait for a simulator at most [s]"
     )
-    top.set_defaults(command=_top)
+    top.set_defaults(command=_top, computes=False)
 
 
 def _add_scene(commands: _Commands) -> None:

@@ -6,7 +6,7 @@ import functools
 import operator
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import yaml
 from pydantic import (
@@ -36,7 +36,7 @@ from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuSensorConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import Settings, documentation
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
@@ -104,6 +104,7 @@ else:
     AnyRenderer = _any_kind("renderer", default=_DEFAULT_KINDS["renderer"])
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
+_PATHS: tuple[type[Settings], ...] = get_args(get_args(PathConfig)[0])
 Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
 Links = dict[Name, LinkConfig]
 
@@ -287,7 +288,8 @@ def load_config(
         options: What the user calls a key of `overrides`, such as {"duration_s": "--duration"}: an error
             there is said of it, and so is what lacks or is unknown in a group that only it has made.
 
-    A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
+    A group that comes in several kinds and does not say which (`scene`, `path`) is of the only kind that has
+    its keys, else of the default kind.
     A sensor or body that is null is left out: {"sensors.depth": None}. Sensors under the key `sensors+`
     change the default set, as overrides do.
 
@@ -402,7 +404,8 @@ def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     for name in bodies if isinstance(bodies, Mapping) else ():
         places += [("bodies", name, "shape"), ("bodies", name, "surface")]
     sensors = raw.get("sensors")
-    places += [("sensors", name, "lens") for name in (sensors if isinstance(sensors, Mapping) else ())]
+    for name in sensors if isinstance(sensors, Mapping) else ():
+        places += [("sensors", name, "lens"), ("sensors", name, "pixel", "measured_noise")]
     for place in places:
         group: Any = raw
         for key in place:
@@ -421,8 +424,13 @@ def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
     for key, item in SimulationConfig.model_fields.items():
         group = raw.get(key)
         if isinstance(group, Mapping) and "kind" not in group and hasattr(item.default, "kind"):
-            is_mesh = key == "scene" and not _ONLY_MESH.isdisjoint(group)
-            raw = {**raw, key: {"kind": "mesh" if is_mesh else item.default.kind, **group}}
+            kind = item.default.kind
+            if key == "scene" and not _ONLY_MESH.isdisjoint(group):
+                kind = "mesh"
+            elif key == "path" and not group.keys() <= type(item.default).model_fields.keys():
+                fitting = [one for one in _PATHS if group.keys() <= one.model_fields.keys()]
+                kind = fitting[0].model_fields["kind"].default if len(fitting) == 1 else kind
+            raw = {**raw, key: {"kind": kind, **group}}
     return raw
 
 
@@ -458,10 +466,10 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:
     pad = "  " * indent
-    for name, field in type(model).model_fields.items():
+    for name in type(model).model_fields:
         value = getattr(model, name)
-        if comments and field.description:
-            for line in field.description.split("\n"):
+        if comments and (description := documentation(type(model)).get(name)):
+            for line in description.split("\n"):
                 yield f"{pad}# {line.strip()}"
         if isinstance(value, BaseModel):
             yield f"{pad}{name}:"

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import functools
-import http.server
 import importlib.util
 import os
 import signal
 import subprocess
 import sys
-import webbrowser
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +70,13 @@ def _docs(arguments: argparse.Namespace) -> int:
     if arguments.build:
         print(f"{SITE / 'index.html'}")
         return 0
+    import http.server
+    import webbrowser
+
+    class _Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            """Say nothing of each file."""
+
     handler = functools.partial(_Quiet, directory=str(SITE))
     with http.server.ThreadingHTTPServer(("127.0.0.1", arguments.port), handler) as server:
         address = f"http://127.0.0.1:{server.server_port}/index.html"
@@ -81,8 +86,3 @@ def _docs(arguments: argparse.Namespace) -> int:
         with handle_signals(signal.default_int_handler):
             server.serve_forever()
     return 0
-
-
-class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        """Say nothing of each file."""

@@ -30,7 +30,7 @@ from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, de
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
-from neurosim_core.sim.rollout import run_model
+from neurosim_core.sim.rollout import run_model, warm_flight
 from neurosim_core.sim.state import make_state
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.overview import FlightSummary, Track
@@ -92,7 +92,9 @@ def fly(
     report = FlightReport()
     begin = time.perf_counter()
     with _new_folder(folder), console.status("preparing") as status:
-        model = make_model(config, on_phase=lambda phase: status.update(f"preparing: {phase}"))
+        model = make_model(
+            config, on_phase=lambda phase: status.update(f"preparing: {phase}"), meanwhile=warm_flight
+        )
         status.update(
             "preparing: kernels (the first run compiles them, 10 s to a minute; then they are kept)"
         )

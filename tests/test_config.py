@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from neurosim_core.config import ConfigError, SimulationConfig, absent_sensors, load_config, to_yaml
 from neurosim_core.live.config import LinkConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import Settings, documentation
 
 
 def test_defaults_are_what_the_manual_says():
@@ -34,8 +34,9 @@ def test_yaml_round_trip(comments):
 
 def test_every_key_is_documented():
     def undocumented(model: type[BaseModel], path: str) -> Iterator[str]:
-        for name, item in model.model_fields.items():
-            if not item.description:
+        described = documentation(model)
+        for name in model.model_fields:
+            if not described.get(name):
                 yield f"{path}.{name}"
 
     def subclasses(cls: type) -> Iterator[type]:
@@ -258,6 +259,18 @@ def test_sensors_that_a_file_leaves_out_are_named():
     assert "no rgb, depth, imu, odometry" in absent
     assert "`sensors+` adds" in absent
     assert absent_sensors(load_config()) == ""
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ({"seed": 3}, "tour"),
+        ({"points_m": [[0, 0, 1], [1, 0, 1]]}, "waypoints"),
+        ({"file": "poses.txt"}, "poses"),
+    ],
+)
+def test_the_kind_of_a_path_follows_from_keys_that_one_kind_has(path, kind):
+    assert load_config({"path": path}).path.kind == kind
 
 
 def test_the_kind_of_a_scene_follows_from_its_keys(tmp_path):

@@ -56,7 +56,7 @@ def test_an_example_ends_on_its_number(name, capsys):
 def test_examples_are_short_and_tested():
     names = {file.stem for file in EXAMPLES.glob("*.py")}
     assert len(names) >= 10
-    for name in NUMBERS:
+    for name in names:
         assert len((EXAMPLES / f"{name}.py").read_text(encoding="utf-8").splitlines()) <= 80
     assert set(NUMBERS) <= names
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,43 +25,46 @@ SPEAKS_DDS = {f"cortex_ros2_bridge.backend.{name}" for name in ("cyclone", "dds"
 """They are about cyclonedds from their first line to the last; others import them where they are used."""
 
 
-def modules(package: str) -> dict[str, ast.Module]:
+@functools.cache
+def modules(package: str) -> dict[str, list[tuple[str, str, bool]]]:
+    """What each module imports: module, name in it ("": the module itself), and whether at top level.
+
+    At top level is what is not inside functions. What is behind `if TYPE_CHECKING` is not imported.
+    """
     found = {}
     for path in sorted((ROOT / package).rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+        found[name] = list(statements(ast.parse(path.read_text(encoding="utf-8")), top_level=True))
     return found
 
 
-def imports(tree: ast.AST, *, top_level: bool, modules: Collection[str] = ()) -> set[str]:
-    """Modules that a module imports; at top level only: not inside functions or `if TYPE_CHECKING`.
+def statements(tree: ast.AST, *, top_level: bool) -> Iterator[tuple[str, str, bool]]:
+    for child in ast.iter_child_nodes(tree):
+        if isinstance(child, ast.Import):
+            yield from ((alias.name, "", top_level) for alias in child.names)
+        elif isinstance(child, ast.ImportFrom) and child.module:
+            yield from ((child.module, alias.name, top_level) for alias in child.names)
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
+            continue
+        elif isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
+            is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+            yield from statements(child, top_level=top_level and not is_function)
 
-    `from package import submodule` counts as the submodule if that is among the known `modules`.
-    """
-    names: set[str] = set()
-    queue: list[ast.AST] = [tree]
-    while queue:
-        node = queue.pop()
-        for child in ast.iter_child_nodes(node):
-            if top_level and isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-                continue
-            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-                continue
-            if isinstance(child, ast.Import):
-                names.update(alias.name for alias in child.names)
-            elif isinstance(child, ast.ImportFrom) and child.module:
-                for alias in child.names:
-                    submodule = f"{child.module}.{alias.name}"
-                    names.add(submodule if submodule in modules else child.module)
-            queue.append(child)
-    return names
+
+def imports(rows: list[tuple[str, str, bool]], *, top_level: bool, modules: Collection[str] = ()) -> set[str]:
+    """`from package import submodule` counts as the submodule if that is among the known `modules`."""
+    return {
+        f"{module}.{name}" if f"{module}.{name}" in modules else module
+        for module, name, outside in rows
+        if outside or not top_level
+    }
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_package_imports_only_what_it_may(package):
-    for name, tree in modules(package).items():
-        used = {n.split(".")[0] for n in imports(tree, top_level=False)}
+    for name, rows in modules(package).items():
+        used = {n.split(".")[0] for n in imports(rows, top_level=False)}
         streams = name.startswith(tuple(f"neurosim_core.{part}" for part in ("live", "data", "io", "learn")))
         allowed = {"cortex"} if streams else set()
         allowed |= {"rotorpy"} if name == "neurosim_core.bench.rotorpy_peer" else set()
@@ -70,8 +74,8 @@ def test_package_imports_only_what_it_may(package):
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_heavy_libraries_are_imported_where_they_are_used(package):
-    for name, tree in modules(package).items():
-        used = imports(tree, top_level=True, modules=SPEAKS_DDS)
+    for name, rows in modules(package).items():
+        used = imports(rows, top_level=True, modules=SPEAKS_DDS)
         heavy = {n.split(".")[0] for n in used} & LAZY | used & SPEAKS_DDS
         if name.startswith("neurosim_core.learn."):  # what is there is imported on use
             heavy -= {"torch", "gymnasium"}
@@ -80,10 +84,10 @@ def test_heavy_libraries_are_imported_where_they_are_used(package):
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_there_is_no_import_cycle(package):
-    trees = modules(package)
+    known = modules(package)
     graph = {
-        name: {n for n in imports(tree, top_level=True, modules=trees) if n in trees and n != name}
-        for name, tree in trees.items()
+        name: {n for n in imports(rows, top_level=True, modules=known) if n in known and n != name}
+        for name, rows in known.items()
     }
     done: set[str] = set()
 

@@ -14,12 +14,13 @@ possible within a window; see `matching`.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import warp as wp
@@ -31,7 +32,6 @@ from neurosim_core.bench.engine import (
     EventCamera,
     EventCameraConfig,
     Flown,
-    LightingConfig,
     PinholeConfig,
     Poses,
     RenderConfig,
@@ -80,13 +80,15 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         raise ValueError(f"samples must be in [1, {REFERENCE_SAMPLES}], got {list(samples)}")
     on_cuda = wp.get_device(device).is_cuda
 
-    def lens(on_cpu: int) -> PinholeConfig:
-        columns = options.width or (346 if on_cuda else on_cpu // 2 if quick else on_cpu)
-        rows = options.height or round(0.75 * columns)
+    def lens(columns: int) -> PinholeConfig:
+        rows = options.height or round((9 / 16 if columns == 1280 else 3 / 4) * columns)
         return PinholeConfig(width=columns, height=rows, horizontal_fov_rad=1.5)
 
-    time_rows = _sample_in_time(lens(64), options.scene, device, quick, progress)
-    space_rows = _sample_in_space(lens(120), options.scene, device, quick, samples, progress)
+    columns = options.width or (346 if on_cuda else 32 if quick else 64)
+    time_rows = _sample_in_time(lens(columns), options.scene, device, quick, progress)
+    wanted = (options.width,) if options.width else (60,) if quick else (120, 346, 640, 1280)
+    lenses = [lens(columns) for columns in (wanted if on_cuda else wanted[:2])]
+    space_rows = _sample_in_space(lenses, options.scene, device, quick, samples, progress)
     return _chapter(time_rows, space_rows, quick)
 
 
@@ -260,14 +262,14 @@ def saving(rows: Sequence[Row], cost: str) -> dict[float, float]:
 
 
 def _sample_in_space(
-    lens: PinholeConfig,
+    lenses: Sequence[PinholeConfig],
     scene: Path | None,
     device: str,
     quick: bool,
     samples: Sequence[int],
     progress: Progress,
 ) -> list[Row]:
-    """Return a row for each scene, motion and number of rays per pixel."""
+    """Return a row for each scene, motion, size and number of rays per pixel, the default among them."""
     seconds = 0.06 if quick else 0.2
     progress("plan a flight")
     settings = {"duration_s": 2.0 + seconds, "device": device, **scene_settings(scene)}
@@ -280,14 +282,16 @@ def _sample_in_space(
     for shown, start in ((flown.model.scene, flown.states[0, :3]), (thin_structures(), np.zeros(3))):
         for rate_deg_s in (200.0,) if quick else (30.0, 200.0):
             views.append((shown, f"yaw at {rate_deg_s:g} deg/s", _turn(start, rate_deg_s, seconds)))
+    lit = {id(shown): upload_scene(shown, RenderConfig(), device=device) for shown, _, _ in views}
     rows = []
-    for shown, motion, poses in views:
-        for count in dict.fromkeys((REFERENCE_SAMPLES, *samples)):
-            progress(f"{shown.name}, {motion}, {count} rays per pixel")
-            row, events = _space_row(shown, lens, poses, device, count)
+    for (shown, motion, poses), lens in itertools.product(views, lenses):
+        pixels = f"{lens.width}x{lens.height}"
+        for count in dict.fromkeys((REFERENCE_SAMPLES, *samples, RenderConfig().samples_per_pixel)):
+            progress(f"{shown.name}, {motion}, {pixels}, {count} rays per pixel")
+            row, events = _space_row(lit[id(shown)], lens, poses, count)
             if count == REFERENCE_SAMPLES:
-                progress(f"{shown.name}, {motion}, another pattern of {count} rays")
-                other, its = _space_row(shown, ShiftedLens(lens, (0.382, 0.618)), poses, device, count)
+                progress(f"{shown.name}, {motion}, {pixels}, another pattern of {count} rays")
+                other, its = _space_row(lit[id(shown)], ShiftedLens(lens, (0.382, 0.618)), poses, count)
                 truth, row, events = events, {**other, "rays per pixel": f"{count}, another pattern"}, its
             windows = {
                 window: match(truth, events, width=lens.width, window_us=1e3 * window)
@@ -298,8 +302,7 @@ def _sample_in_space(
                 row[f"spurious, {w:g} ms [%]"] = 100.0 * found.spurious_count / max(len(events.t), 1)
             for w, found in windows.items():
                 row[f"missed, {w:g} ms [%]"] = 100.0 * found.missing_count / max(len(truth.t), 1)
-            case = {"scene": shown.name, "motion": motion, "pixels": f"{lens.width}x{lens.height}"}
-            rows.append({**case, **row})
+            rows.append({"scene": shown.name, "motion": motion, "pixels": pixels, **row})
     return rows
 
 
@@ -309,10 +312,12 @@ def _turn(position: NDArray[Any], rate_deg_s: float, seconds: float) -> Poses:
     return camera_poses(np.tile(position, (len(yaw), 1)), Rotation.from_euler("z", yaw[:, None]))
 
 
-def _space_row(scene: Scene, lens: Any, poses: Poses, device: str, count: int) -> tuple[Row, EventArrays]:
-    """Render poses with a number of rays per pixel; return a row and the events."""
-    render = RenderConfig(samples_per_pixel=count, lighting=LightingConfig(mode="unshadowed"), exposure=1.0)
-    view = View(upload_scene(scene, render, device=device), lens, count=16)
+def _space_row(
+    lit: Any, lens: Any, poses: Poses, count: int | Literal["adaptive"]
+) -> tuple[Row, EventArrays]:
+    """Render poses in an uploaded scene with a number of rays per pixel; return a row and the events."""
+    device, config = lit.device, RenderConfig(samples_per_pixel=count)
+    view = View(dataclasses.replace(lit, config=config), lens, count=16)
     camera = EventCamera(EventCameraConfig(), width=lens.width, height=lens.height, device=device)
     stamps_ns = np.rint(np.arange(len(poses[0])) * (1e9 / SPACE_HZ)).astype(np.int64)
     camera.reset(view.render((poses[0][:1], poses[1][:1]))[0])  # compiles, too
@@ -356,7 +361,7 @@ def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapte
     )
     space_note = (
         "Spurious events are a share of those of the row, missed ones of those of the reference. Rendered at "
-        "500 Hz, in light without shadows. The row with another pattern is the floor."
+        "500 Hz. The row with another pattern is the floor."
     )
     return Chapter(
         name="events",
@@ -416,21 +421,23 @@ def _time_claims(rows: Sequence[Row], fewer: dict[float, float], quick: bool) ->
     ]
 
 
+def _case(row: Row) -> tuple[str, ...]:
+    return row["scene"], row["motion"], row["pixels"]
+
+
 def _space_claims(rows: Sequence[Row]) -> list[Claim]:
     """Judge the default: each share within its limit, or twice that of another pattern of 64 rays."""
     claims = []
     for row in (row for row in rows if row["rays per pixel"].endswith("(default)")):
-        case = (row["scene"], row["motion"])
-        floor = next(
-            r for r in rows if "pattern" in r["rays per pixel"] and (r["scene"], r["motion"]) == case
-        )
+        case = _case(row)
+        floor = next(r for r in rows if "pattern" in r["rays per pixel"] and _case(r) == case)
         limits = {20.0: 5.0, 5.0: 8.0}
         if int(row["pixels"].partition("x")[0]) < 346:
             limits = dict.fromkeys(limits, 12.0)
         shares = {(kind, w): f"{kind}, {w:g} ms [%]" for kind in ("spurious", "missed") for w in limits}
         claims.append(
             Claim(
-                f"default rays per pixel, {', '.join(case)}, {row['pixels']}: spurious and missed events are "
+                f"default rays per pixel, {', '.join(case)}: spurious and missed events are "
                 f"<= {limits[20.0]:g} % within 20 ms and <= {limits[5.0]:g} % within 5 ms, or twice the "
                 "floor",
                 "the box filter of a pixel's area by 64 rays; floor: another pattern of 64",
@@ -467,8 +474,8 @@ def _time_plot(rows: list[Row]) -> Plot:
 def _space_plot(rows: list[Row]) -> Plot:
     """Draw shares against the time of a picture, from 0 %, with the floor as a line."""
     panels = []
-    for case in dict.fromkeys((row["scene"], row["motion"]) for row in rows):
-        mine = [row for row in rows if (row["scene"], row["motion"]) == case]
+    for case in dict.fromkeys(map(_case, rows)):
+        mine = [row for row in rows if _case(row) == case]
         floor, plain = mine[0], [row for row in mine if "pattern" not in row["rays per pixel"]]
         series = [
             Series(

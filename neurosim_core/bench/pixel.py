@@ -44,6 +44,7 @@ _GAIN_THRESHOLD, _GAIN_AMPLITUDE = 1e-3, 0.1
 _FRAMES_PER_CYCLE = 128
 _PHOTORECEPTORS = ("dvs128", "v2e_noisy")
 """Presets with a low-pass."""
+_NOISE_NOTE = "Rates are means over the pixels of a still scene [Hz]; sources are in event_presets.py."
 _STEP_S = 1e-6
 """Rise time of a step."""
 
@@ -57,7 +58,18 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         curves += pattern(bench)
     progress("presets")
     presets = pixel_noise.measure_presets(bench)
+    progress("noise of presets")
+    figures = pixel_noise.measure_noise_figures(bench)
     claims = [*(_claim(rule, curves) for rule in _RULES), _preset_claim(presets, options.quick)]
+    within = [row["within"] for row in figures]
+    claims.append(
+        Claim(
+            "presets: the noise of a still scene is that of their sources, within the spread these have",
+            "sources of the presets",
+            f"{sum(within)} of {len(within)} figures",
+            all(within),
+        )
+    )
     met = sum(claim.met is True for claim in claims)
     note = (
         "C is the threshold in natural log radiance, from the intervals on a ramp: mean and standard "
@@ -72,6 +84,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         claims=claims,
         tables=[
             Table("pixel-presets", "Presets on the bench", presets, note),
+            Table("pixel-noise", "Noise of presets beside their sources", figures, _NOISE_NOTE),
             Table("pixel-deviations", "Deviation from the closed forms", [c.row() for c in curves], worst),
         ],
         plots=[_plot(curves)],

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
-from neurosim_core.bench.engine import PRESETS, EventCameraConfig
+from neurosim_core.bench.engine import PRESETS, EventArrays, EventCameraConfig
 from neurosim_core.bench.pixel_bench import (
     Curve,
     Floats,
@@ -186,7 +186,9 @@ def _preset_threshold(bench: TestBench, config: EventCameraConfig, sign: float) 
     refractory time is taken off.
     """
     side, slope, seconds = bench.pick(64, 24), 20.0, 1.0
-    plain = config.model_copy(update={"shot_noise": None, "leak": None, "hot_pixels": None})
+    plain = config.model_copy(
+        update={"shot_noise": None, "measured_noise": None, "leak": None, "hot_pixels": None}
+    )
     first, last = (0, 1) if sign > 0.0 else (1, 0)
     log = still(0.0, side)
     log[last] = slope * seconds
@@ -200,22 +202,93 @@ def _preset_threshold(bench: TestBench, config: EventCameraConfig, sign: float) 
 
 
 def _expected_noise(config: EventCameraConfig) -> tuple[float, float]:
-    """Return the rates of ON and OFF events of a still pixel by theory [Hz].
+    """Return the rates of ON and OFF events of a still pixel by theory [Hz], mean over log-normal pixels.
 
-    Leak alone has the mean of log-normal rates. Shot noise comes at l / (1 + l t_ref), and leaves the leak
-    no time if it comes far more often.
+    After each event the leak begins anew: it fires if noise of rate l does not come within its time d, which
+    is with probability exp(-l d), and an event is after t_ref + (1 - exp(-l d)) / l on average.
     """
     if config.stochastic is not None:
         return _passage_rates(config, _PRESET_RADIANCE)
-    leak_hz = 0.0
-    if config.leak is not None:
-        leak_hz = config.leak.rate_hz * math.exp((math.log(10.0) * config.leak.spread_decades) ** 2 / 2.0)
-    if (shot := config.shot_noise) is None:
-        return leak_hz, 0.0
-    rate_hz = shot.rate_hz * (1.0 + (shot.bright_factor - 1.0) * _PRESET_RADIANCE)
-    leak_hz = rate_hz / math.expm1(rate_hz / leak_hz) if leak_hz else 0.0
-    rate_hz /= 1.0 + rate_hz * config.refractory_s
-    return leak_hz + rate_hz * shot.on_fraction, rate_hz * (1.0 - shot.on_fraction)
+    node, weight = np.polynomial.hermite_e.hermegauss(21)
+    weight = np.outer(weight, weight) / weight.sum() ** 2  # of noise, of leak
+    on_hz, off_hz = _noise_rates(config, _PRESET_RADIANCE, node[:, None])
+    leak, hot = config.leak, config.hot_pixels
+    leak_hz = np.zeros((1, len(node)))
+    if leak is not None:
+        growth = 1.0 + (leak.bright_factor - 1.0) * _PRESET_RADIANCE
+        leak_hz = leak.rate_hz * growth * 10.0 ** (leak.spread_decades * node[None])
+    total = np.zeros(2)
+    for share, more_hz in ((1.0 - hot.fraction, 0.0), (hot.fraction, hot.rate_hz)) if hot else ((1.0, 0.0),):
+        noise_hz = np.maximum(on_hz + off_hz + more_hz, 1e-12)
+        with np.errstate(divide="ignore"):
+            leaks = np.exp(-noise_hz / leak_hz)
+        every_s = config.refractory_s + (1.0 - leaks) / noise_hz
+        on_share = (on_hz + more_hz * (hot.on_fraction if hot else 0.0)) / noise_hz
+        by_noise = weight * (1.0 - leaks) / every_s
+        on = by_noise * on_share + weight * leaks / every_s
+        off = by_noise * (off_hz + more_hz * (1.0 - hot.on_fraction if hot else 0.0)) / noise_hz
+        total += share * np.array([on.sum(), off.sum()])
+    return float(total[0]), float(total[1])
+
+
+def _noise_rates(config: EventCameraConfig, radiance: float, rank: Floats) -> tuple[Floats, Floats]:
+    """Return rates of ON and OFF shot noise [Hz] at a radiance, of pixels by rank (standard normal)."""
+    if (shot := config.shot_noise) is not None:
+        median_hz = shot.rate_hz * (1.0 + (shot.bright_factor - 1.0) * radiance)
+        rate_hz = median_hz * 10.0 ** (shot.spread_decades * rank)
+        more = [1.0, 1.0]
+        if shot.by_threshold and (mismatch := config.threshold_spread) is not None:
+            normal = np.linspace(-6.0, 6.0, 6001)
+            nominal = (
+                (config.threshold_on, mismatch.sigma_on),
+                (config.threshold_off, mismatch.sigma_off),
+            )
+            drawn = [np.maximum(mean + sigma * normal, mismatch.minimum) / mean for mean, sigma in nominal]
+            more = [float(np.average(1.0 / one, weights=np.exp(-0.5 * normal**2))) for one in drawn]
+        return rate_hz * shot.on_fraction * more[0], rate_hz * (1.0 - shot.on_fraction) * more[1]
+    if (measured := config.measured_noise) is None:
+        return np.zeros_like(rank), np.zeros_like(rank)
+    place = math.log(radiance * measured.white_lux)
+    light = [math.log(level.lux) for level in measured.levels]
+    share = np.array([np.interp(place, light, one) for one in np.eye(len(light))])  # of each level
+    spread = [10.0 ** (level.spread_decades * rank) for level in measured.levels]
+    factor = share[:, None, None] * np.array(spread)
+    medians = np.array([(level.on_hz, level.off_hz) for level in measured.levels])
+    return (factor * medians[:, :1, None]).sum(axis=0), (factor * medians[:, 1:, None]).sum(axis=0)
+
+
+def measure_noise_figures(bench: TestBench) -> list[Row]:
+    """Return a row for each figure that the source of a preset has of noise, beside what the preset does."""
+    names = ("davis346", "gen3") if bench.quick else tuple(name for name in PRESETS if PRESETS[name].noise)
+    side, seconds = bench.pick(96, 48), bench.pick(60, 20)
+    rows: list[Row] = []
+    for name in names:
+        found: dict[float, dict[str, float]] = {}
+        config = make_preset(name, readout=None)
+        white_lux = config.measured_noise.white_lux if config.measured_noise else 1000.0
+        for figure in PRESETS[name].noise:
+            if figure.lux not in found:
+                log = still(math.log(config.white_radiance * figure.lux / white_lux), side)
+                events = bench.expose(config, log, [0.0, float(seconds)])
+                found[figure.lux] = _noise_statistics(events, side, seconds)
+            value = found[figure.lux][figure.quantity]
+            row: Row = {"preset": name, "light [lux]": figure.lux, "quantity": figure.quantity}
+            row |= {"preset's": value, "source's": figure.value, "its spread": figure.spread}
+            rows.append({**row, "within": abs(value - figure.value) <= figure.spread})
+    return rows
+
+
+def _noise_statistics(events: EventArrays, side: int, seconds: float) -> dict[str, float]:
+    count = events_per_pixel(events, side, side * side)
+    on = int(events.polarity.sum())
+    fires = count[count > 0]
+    rates = {"ON rate": on, "OFF rate": len(events.t) - on, "rate": len(events.t)}
+    spread = math.log1p(max(float(count.var() - count.mean()), 0.0) / max(float(count.mean()), 1e-9) ** 2)
+    return {
+        **{name: number / (side * side * seconds) for name, number in rates.items()},
+        "ON share": on / max(len(events.t), 1),
+        "spread": math.sqrt(spread) / math.log(10.0) if len(fires) else 0.0,
+    }
 
 
 def _passage_rates(config: EventCameraConfig, radiance: float) -> tuple[float, float]:

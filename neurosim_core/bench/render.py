@@ -89,7 +89,8 @@ def _settings(samples: Sequence[int], quick: bool) -> list[dict[str, Any]]:
     biases = (-2.0, 0.0) if quick else (-2.0, -1.0, 0.0, 1.0, 2.0)
     filters = [{"texture_filter": _DEFAULT, "mip_bias": bias} for bias in biases]
     filters += [{"texture_filter": name} for name in ("bilinear", _POINT)]
-    return [{"samples_per_pixel": count, **chosen} for chosen in filters for count in samples]
+    counts = dict.fromkeys((*samples, RenderConfig().samples_per_pixel))
+    return [{"samples_per_pixel": count, **chosen} for chosen in filters for count in counts]
 
 
 def _title(settings: dict[str, Any]) -> str:
@@ -151,9 +152,12 @@ def _pan(
     poses = _looking(_above(len(stamps_ns)), 0.1 + rate_rad_s * 1e-9 * stamps_ns, _PITCH_RAD)
     scene = _checkerboard(lens)
     window_us = 1e6 * 0.5 / _SPEED_PX_S  # half a pixel
-    few: list[dict[str, Any]] = [{"texture_filter": _POINT}, {"texture_filter": "bilinear"}, {}]
+    few: list[dict[str, Any]] = [
+        {"samples_per_pixel": 1, "texture_filter": name} for name in (_POINT, "bilinear", _DEFAULT)
+    ]
+    few.append({})
     if not quick:
-        few += [{"mip_bias": bias} for bias in (-2.0, -1.0, 1.0, 2.0)]
+        few += [{"samples_per_pixel": 1, "mip_bias": bias} for bias in (-2.0, -1.0, 1.0, 2.0)]
         few += [
             {"samples_per_pixel": n, **more}
             for more in ({}, {"texture_filter": _POINT})
@@ -167,7 +171,8 @@ def _pan(
         progress(f"a pan over the checkerboard, {settings}")
         events, seen, picture_s = _pan_events(scene, lens, poses, stamps_ns, device, **settings)
         aligned = match(truth, events, width=lens.width, window_us=window_us)
-        title = f"{_title(settings)}, {settings.get('samples_per_pixel', 1)} rays"
+        rays = settings.get("samples_per_pixel", RenderConfig().samples_per_pixel)
+        title = f"{_title(settings)}, {rays} rays"
         if settings in few[:1] or not settings:
             pictures.append(Picture(title=f"log radiance, {title}", values=seen.tolist()))
         row: Row = {"setting": title, "events": len(events.t), "of the reference": len(truth.t)}
@@ -244,9 +249,9 @@ def _chapter(rows: list[Row], pan: list[Row], pictures: list[Picture], device: s
         f"{device_title(device)}; an event is {threshold:g}.\n\n"
         + "\n\n".join(said)
         + f"\n\nA pan at {_SPEED_PX_S:g} px/s over squares of at most {CHECK_PX:g} px: of "
-        f"{point['of the reference']:,} true events the default misses {default['missing']:,} and adds "
-        f"{default['false']:,} false ones; point sampling misses {point['missing']:,} and adds "
-        f"{point['false']:,}.",
+        f"{point['of the reference']:,} true events one ray with the default filter misses "
+        f"{default['missing']:,} and adds {default['false']:,} false ones; point sampling misses "
+        f"{point['missing']:,} and adds {point['false']:,}.",
         claims=[
             Claim(
                 "with one ray per pixel the default filter gives at least 10 times fewer false events than "

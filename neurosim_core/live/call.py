@@ -15,8 +15,7 @@ from rich.markup import escape
 from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
-from neurosim_core.live.services import STEP_DEADLINE_S
-from neurosim_core.live.topics import SERVICES, STATUS
+from neurosim_core.live.topics import SERVICES, STATUS, STEP_DEADLINE_S
 
 _TABLE_WIDTH = 100
 GRACE_S = 1.0

@@ -167,6 +167,8 @@ class PathController:
             self._rotor_speeds.wait_for_publisher(self._wait_s)
             mode = self._follower.mode
             self._commands = self._node.publisher(command_topic(self.vehicle, mode), COMMANDS[mode])
+            if self._closed.is_set():  # since this began: `close` has not seen them
+                self._commands.close()
         return self._commands.wait_for_subscribers(timeout_s=timeout_s)
 
     def _rotor_speed_of(self, odometry: Odometry) -> NDArray[np.float64]:

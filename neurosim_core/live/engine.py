@@ -38,6 +38,7 @@ from neurosim_core.sim import (
     select_cameras,
     settle,
     skip_batch,
+    warm_flight,
     warm_up,
 )
 from neurosim_core.sim.schedule import batch_end_ns
@@ -56,6 +57,7 @@ __all__ = [
     "make_fleet",
     "packet_type",
     "plan_paths",
+    "warm_flight",
     "warm_up",
 ]
 

@@ -14,12 +14,10 @@ from typing import Any
 from cortex import Node
 from cortex.messages import Parameters, SimulatorReply, Step
 from neurosim_core.config import ConfigError, SimulationConfig, load_config
-from neurosim_core.live.topics import SERVICES
+from neurosim_core.live.topics import SERVICES, STEP_DEADLINE_S
 
 ANSWER_DEADLINE_S = 30.0
 """How long a request waits for its answer [s]."""
-STEP_DEADLINE_S = 60.0
-"""Longest wait of a request for steps, which may need the commands of a controller [s]."""
 ENDED = "the simulator has ended"
 
 CHANGEABLE = (

@@ -19,7 +19,7 @@ from neurosim_core.clock import to_ns
 from neurosim_core.config import SimulationConfig
 from neurosim_core.live.cameras import CameraThread
 from neurosim_core.live.commands import Command
-from neurosim_core.live.engine import Model, make_fleet, warm_up
+from neurosim_core.live.engine import Model, make_fleet, warm_flight, warm_up
 from neurosim_core.live.pacing import Pacer
 from neurosim_core.live.recorder import Recorder, open_folders
 from neurosim_core.live.services import Request, Services, Steps
@@ -79,7 +79,7 @@ class Simulator:
             folders = open_folders(record, list(config.vehicles), overwrite=overwrite)
         self.config = config
         if models is None:
-            models = make_fleet(config, on_phase=on_phase)
+            models = make_fleet(config, on_phase=on_phase, meanwhile=warm_flight)
             if on_phase is not None:
                 on_phase("kernels (compiled on the first run, then cached)")
             for model in models.values():

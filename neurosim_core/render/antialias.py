@@ -1,7 +1,7 @@
 # mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
 # mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc,valid-type"
 # mypy: allow-untyped-calls, allow-untyped-decorators
-# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
+# ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
 """Antialiasing: a pixel is the mean of the faces that it shows, weighed by how much of it each covers.
 
 1. The first pass casts one ray per pixel and notes the face that it hits. The rays of neighbouring pixels go
@@ -33,7 +33,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernel
+from neurosim_core.render.antialias_groups import group_kernels, make_lists
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.coverage import (
@@ -42,6 +42,7 @@ from neurosim_core.render.coverage import (
     RAY_WIDTH,
     SAMPLE_COUNT,
     SHARPNESS,
+    footprint_width,
     ray_point,
 )
 from neurosim_core.render.embree import packet_caster
@@ -53,7 +54,7 @@ from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
+from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _CELLS = 4
 _SIDE = 4
@@ -145,9 +146,9 @@ def _cover_pixel(
 
 def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are pixels, for all terms."""
-    find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
     requested = requested_outputs(outputs)
+    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
     write_radiance = radiance_writer(outputs, supersampled=False)
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
@@ -166,31 +167,17 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         index = first + wp.tid()
         # 64 indices are a tile of 8 x 8 pixels, and 16 side by side a block of 4 x 4
         in_tile = index % 64
-        block = index // 64
-        instant = block % view.instant_count
-        world, _tile, left, top = find_tile(block // view.instant_count, view.width, view.height)
-        first_ray = int(0)
-        if wp.static(terms.worlds):
-            instant += world * worlds.stride
-            if worlds.active[world] == 0:
-                return
+        place = locate_tile(index // 64 // view.instant_count, index // 64 % view.instant_count, view, worlds)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[world]]
-        if wp.static(terms.world_lenses):
-            first_ray = worlds.lens[world] * view.width * view.height
-        col = left + 4 * (in_tile // 16 % 2) + in_tile % 4
-        row = top + 4 * (in_tile // 32) + in_tile // 4 % 4
-        if col >= view.width or row >= view.height:
+            scene = worlds.scenes[worlds.scene[place.world]]
+        col = place.left + 4 * (in_tile // 16 % 2) + in_tile % 4
+        row = place.top + 4 * (in_tile // 32) + in_tile // 4 % 4
+        if not place.rendered or col >= view.width or row >= view.height:
             return
-        slot = int(-1)
-        if wp.static(requested.images):
-            slot = view.image_slot[instant]
-            if wp.static(not requested.log):
-                if slot < 0:
-                    return
+        instant = place.instant
         origin = view.p_WC[instant]
         q = view.q_WC[instant]
-        pixel = first_ray + row * view.width + col
+        pixel = place.first_ray + row * view.width + col
         center = wp.vec3(rays[0, pixel][0], rays[0, pixel][1], rays[0, pixel][2])
         across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
         down = wp.vec3(rays[2, pixel][0], rays[2, pixel][1], rays[2, pixel][2])
@@ -198,7 +185,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         face = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=int)
         number = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=float)
         ray = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
-        place = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
+        met = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
         normal = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
         count = _cover_pixel(
             scene,
@@ -215,7 +202,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             face,
             number,
             ray,
-            place,
+            met,
             normal,
         )
         total = wp.vec3(0.0)
@@ -223,13 +210,12 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         for entry in range(count):
             hit = Hit()
             hit.face = face[entry]
-            hit.t = place[entry][0]
-            hit.u = wp.clamp(place[entry][1], 0.0, 1.0)
-            hit.v = wp.clamp(place[entry][2], 0.0, 1.0 - hit.u)
+            hit.t = met[entry][0]
+            hit.u = wp.clamp(met[entry][1], 0.0, 1.0)
+            hit.v = wp.clamp(met[entry][2], 0.0, 1.0 - hit.u)
             hit.normal = normal[entry]
-            light = radiance_of(
-                scene, bodies, instant, -1, q, ray[entry], origin, SHARPNESS * spread_rad, hit
-            )
+            width_rad = footprint_width(number[entry]) * spread_rad
+            light = radiance_of(scene, bodies, instant, -1, q, ray[entry], origin, width_rad, hit)
             total += number[entry] * light
             whole += number[entry]
         if count < 0:
@@ -268,7 +254,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 total += radiance_of(
                     scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
-        write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
+        write_radiance(scene, total / whole, 1, instant, place.slot, row, col, out)
 
     return average_pixels
 
@@ -316,8 +302,8 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
 
 def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
-    find_tile = tile_finder(terms)
     requested = requested_outputs(outputs)
+    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
     write_radiance = radiance_writer(outputs, supersampled=False)
     cast_packet = packet_caster(terms.embree)
     shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
@@ -336,34 +322,19 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         out: RenderOutputs,
     ) -> None:
         index = first + wp.tid()
-        in_tile = index % 4
-        block = index // 4
-        instant = block % view.instant_count
-        world, _tile, left, top = find_tile(block // view.instant_count, view.width, view.height)
-        first_ray = int(0)
-        if wp.static(terms.worlds):
-            instant += world * worlds.stride
-            if worlds.active[world] == 0:
-                return
+        place = locate_tile(index // 4 // view.instant_count, index // 4 % view.instant_count, view, worlds)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[world]]
-        if wp.static(terms.world_lenses):
-            first_ray = worlds.lens[world] * view.width * view.height
-        left += (in_tile % 2) * _SIDE
-        top += (in_tile // 2) * _SIDE
-        if left >= view.width or top >= view.height:
+            scene = worlds.scenes[worlds.scene[place.world]]
+        left = place.left + (index % 2) * _SIDE
+        top = place.top + (index // 2 % 2) * _SIDE
+        if not place.rendered or left >= view.width or top >= view.height:
             return
-        slot = int(-1)
-        if wp.static(requested.images):
-            slot = view.image_slot[instant]
-            if wp.static(not requested.log):
-                if slot < 0:
-                    return
+        instant = place.instant
         origin = view.p_WC[instant]
         q = view.q_WC[instant]
         rows = wp.min(view.height - top, _SIDE)
         columns = wp.min(view.width - left, _SIDE)
-        first_ray += top * view.width + left
+        first_ray = place.first_ray + top * view.width + left
         radiance = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
         unresolved_bits = wp.zeros(shape=(1,), dtype=int)
         shade_block(
@@ -413,14 +384,18 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     radiance[lane] = total[lane] / float(RAY_COUNT)
         for y in range(rows):
             for x in range(columns):
-                write_radiance(scene, radiance[_SIDE * y + x], 1, instant, slot, top + y, left + x, out)
+                write_radiance(scene, radiance[_SIDE * y + x], 1, instant, place.slot, top + y, left + x, out)
 
     return average_blocks
 
 
 @cache
-def antialiasing_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, is_cuda: bool) -> wp.Kernel:
-    """Return the kernel of the second pass.
+def antialiasing_kernels(
+    outputs: tuple[str, ...], terms: RenderTerms, *, is_cuda: bool
+) -> tuple[wp.Kernel, ...]:
+    """Return the kernels of the second pass: one on a CPU, three on CUDA (`antialias_groups.py`).
+
+    Their parameters: the index of the first thread; what `Antialiasing.launch` takes.
 
     Args:
         outputs: Outputs of the renderer, of which those in `RADIANCE` are written.
@@ -430,8 +405,8 @@ def antialiasing_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, is_cuda
     written = tuple(name for name in RADIANCE if name in outputs)
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
     if is_cuda:
-        return group_kernel(written, plain)
-    return (_block_kernel if _in_blocks(terms) else _pixel_kernel)(written, plain)
+        return group_kernels(written, plain)
+    return ((_block_kernel if _in_blocks(terms) else _pixel_kernel)(written, plain),)
 
 
 def _in_blocks(terms: RenderTerms) -> bool:
@@ -449,8 +424,9 @@ class Antialiasing:
         terms: RenderTerms,
         device: str,
         thread_count: int | None,
+        pixel_count: int,
     ) -> None:
-        """Choose the kernel.
+        """Choose the kernels and allocate what they share.
 
         Args:
             rays: `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4].
@@ -458,10 +434,12 @@ class Antialiasing:
             terms: Terms of the first pass.
             device: Where to render.
             thread_count: Threads on a CPU device; all cores if None.
+            pixel_count: The most pixels of a launch.
         """
         self._device, self._thread_count = device, thread_count
         is_cuda = wp.get_device(device).is_cuda
-        self._kernel = antialiasing_kernel(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
+        self._kernels = antialiasing_kernels(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
+        self._lists = make_lists(pixel_count // _LANES, device) if is_cuda else None
         self._pixels_per_thread = _LANES if _in_blocks(terms) else 1
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 
@@ -485,11 +463,17 @@ class Antialiasing:
             out: Outputs of the first pass, which include the faces.
             pixel_count: Pixels of the first pass: those of all tiles, instants and worlds.
         """
-        launch_split(
-            self._kernel,
-            dim=pixel_count // self._pixels_per_thread,
-            inputs=[scene, view, bodies, worlds, self._rays],
-            outputs=[out],
-            device=self._device,
-            thread_count=self._thread_count,
-        )
+        inputs = [scene, view, bodies, worlds, self._rays]
+        if self._lists is None:
+            launch_split(
+                self._kernels[0],
+                dim=pixel_count // self._pixels_per_thread,
+                inputs=inputs,
+                outputs=[out],
+                device=self._device,
+                thread_count=self._thread_count,
+            )
+            return
+        self._lists.count.zero_()
+        for kernel, dim in zip(self._kernels, (pixel_count, *2 * [self._lists.threads]), strict=True):
+            launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)

@@ -1,15 +1,20 @@
 # mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
 # mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc,valid-type"
 # mypy: allow-untyped-calls, allow-untyped-decorators
-# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
-"""The second pass of antialiasing on CUDA: 16 threads share the faces of their block of 4 x 4 pixels.
+# ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
+"""Antialiasing on CUDA: what `antialias.py` describes, in three kernels.
 
-It computes what `antialias.py` describes. The threads of a block list its faces together, and each of them
-prepares some. Each tests the points of its own pixel, and shades what they show. A pixel that has to be
-rendered by rays is rendered by 8 of them, a ray each.
+1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
+   are listed.
+2. A warp is a listed block: its threads list and prepare the faces together, each tests half of the points of
+   a pixel, and then each shades a surface that some pixel shows. Pixels that have to be rendered by rays are
+   listed.
+3. A thread is a ray of such a pixel.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -21,55 +26,65 @@ from neurosim_core.render.coverage import (
     RAY_WIDTH,
     SAMPLE_COUNT,
     SHARPNESS,
+    footprint_width,
     ray_point,
 )
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer, requested_outputs
 from neurosim_core.render.ray_intersection import UNFUSED, Hit, intersect_bodies, intersect_scene
+from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, turn_count
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
+from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
-_NO_LAYER = wp.constant(255.0)
-_ALL_POINTS = wp.constant((1 << SAMPLE_COUNT) - 1)
-_TOGETHER = 16 // RAY_COUNT
-"""Pixels of a block that are rendered by rays together."""
-_BOUNDS = (64, 10)
+_SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
+_RAYS = wp.constant(16 * RAY_COUNT)
+_COVER_BOUNDS = (64, 8)
 """Threads of a block, and blocks of a multiprocessor."""
-Coverage = wp.types.vector(length=7, dtype=int)
-Shown = wp.types.vector(length=5, dtype=float)
+_THREADS_PER_MULTIPROCESSOR = 1280
+"""Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
+Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=6, dtype=float)
+MetPair = wp.types.vector(length=12, dtype=float)
 
 
-@wp.func_native(read_native(__file__, "cover_group", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
-def _cover_group(
-    scene: SceneData,
-    faces: wp.array3d[int],
-    instant: int,
-    row: int,
-    col: int,
-    height: int,
-    width: int,
-    origin: wp.vec3,
-    center: wp.vec3,
-    across: wp.vec3,
-    down: wp.vec3,
-) -> Coverage:
-    """Find what the points of a pixel show; see the file."""
-    ...
+@wp.struct
+class BlockLists:
+    """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
+
+    uneven: wp.array[int]
+    """Those that show several surfaces."""
+    unresolved: wp.array[wp.vec2i]
+    """Those with pixels that have to be rendered by rays, and a bit for each of these."""
+    count: wp.array[int]
+    """Length of the two lists."""
+    threads: int
+    """Threads of the kernels that go through them."""
 
 
-@wp.func_native(read_native(__file__, "samples_of_layer", SAMPLES=SAMPLE_COUNT))
-def _samples_of_layer(coverage: Coverage, left: int) -> Shown:
-    """Return the layer of the first point in `left`, and of its points: bits, number, mean."""
-    ...
+class GroupKernels(NamedTuple):
+    """The three kernels; their parameters are those of `antialias.antialiasing_kernel` and `BlockLists`."""
+
+    even: wp.Kernel
+    uneven: wp.Kernel
+    unresolved: wp.Kernel
 
 
-@wp.func_native(read_native(__file__, "part_of_layer", MOST=FACE_COUNT_MAX))
-def _part_of_layer(
-    scene: SceneData, coverage: Coverage, layer: int, own: int, origin: wp.vec3, toward: wp.vec3
+def make_lists(block_count: int, device: Any) -> BlockLists:
+    """Return empty lists for at most so many blocks."""
+    lists = BlockLists()
+    lists.uneven = wp.zeros(block_count, dtype=int, device=device)
+    lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
+    lists.count = wp.zeros(2, dtype=int, device=device)
+    lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
+    return lists
+
+
+@wp.func_native(read_native(__file__, "classify_block"))
+def _classify_block(
+    scene: SceneData, faces: wp.array3d[int], instant: int, top: int, left: int, height: int, width: int
 ) -> int:
-    """Return the face to shade."""
+    """Tell what the first rays show in and around a block: 0: one surface; others: see the file."""
     ...
 
 
@@ -79,27 +94,78 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@wp.func_native(read_native(__file__, "group_sum"))
-def _group_sum(value: wp.vec3) -> wp.vec3:
-    """Return the sums over threads 0 to 7 and 8 to 15 of a block of pixels, to even and to odd threads."""
+@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _cover_block(
+    scene: SceneData,
+    faces: wp.array3d[int],
+    instant: int,
+    top: int,
+    left: int,
+    height: int,
+    width: int,
+    outside: wp.bool,
+    origin: wp.vec3,
+    center: wp.vec3,
+    across: wp.vec3,
+    down: wp.vec3,
+) -> Coverage:
+    """Find what the points of the pixels of a block show; see the file."""
     ...
 
 
-@wp.func_native(read_native(__file__, "group_votes"))
-def _group_votes(vote: wp.bool) -> int:
-    """Return a bit for each thread of a block of pixels."""
+@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _meet_pair(
+    scene: SceneData,
+    place: int,
+    pair: int,
+    faces: wp.array3d[int],
+    instant: int,
+    top: int,
+    left: int,
+    origin: wp.vec3,
+) -> MetPair:
+    """Return what a pixel sees of a surface; see the file."""
     ...
 
 
-def group_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
-    """Return the kernel, whose threads are pixels; see `antialias.antialiasing_kernel`."""
-    find_tile = tile_finder(terms)
-    radiance_of = pixel_shader(terms)
+@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _store_pair(place: int, pair: int, light: wp.vec3):
+    """Keep the light of a pair."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _sum_pairs(place: int, first: int, count: int) -> wp.vec3:
+    """Return the light of consecutive pairs."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "ray_sum"))
+def _ray_sum(value: wp.vec3) -> wp.vec3:
+    """Return the sum over the threads of a pixel's rays."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "warp_votes"))
+def _warp_votes(vote: wp.bool) -> int:
+    """Return a bit for each thread of a warp."""
+    ...
+
+
+@wp.func
+def _xyz(ray: wp.vec4) -> wp.vec3:
+    return wp.vec3(ray[0], ray[1], ray[2])
+
+
+def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
+    """Return the kernels; see `antialias.antialiasing_kernel`."""
     requested = requested_outputs(outputs)
+    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
+    radiance_of = pixel_shader(terms)
     write_radiance = radiance_writer(outputs, supersampled=False)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=_BOUNDS)
-    def average_groups(
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    def shade_even_blocks(
         first: int,
         # In:
         scene: SceneData,
@@ -109,104 +175,194 @@ def group_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
+        lists: BlockLists,
     ) -> None:
-        # All threads of a block of pixels reach the functions that they call together.
+        # The threads of a warp reach the functions that they call together: 64 are a tile in one instant.
         index = first + wp.tid()
-        in_tile = index % 64
-        block = index // 64
-        instant = block % view.instant_count
-        world, _tile, left, top = find_tile(block // view.instant_count, view.width, view.height)
-        first_ray = int(0)
-        if wp.static(terms.worlds):
-            instant += world * worlds.stride
-            if worlds.active[world] == 0:
-                return
+        block = index // 16
+        place = locate_tile(index // 64 // view.instant_count, index // 64 % view.instant_count, view, worlds)
+        if not place.rendered:
+            return
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[world]]
-        if wp.static(terms.world_lenses):
-            first_ray = worlds.lens[world] * view.width * view.height
-        left += 4 * (in_tile // 16 % 2)
-        top += 4 * (in_tile // 32)
+            scene = worlds.scenes[worlds.scene[place.world]]
+        left = place.left + 4 * (block % 2)
+        top = place.top + 4 * (block // 2 % 2)
+        kind = _classify_block(scene, out.face, place.instant, top, left, view.height, view.width)
         if left >= view.width or top >= view.height:
             return
-        slot = int(-1)
-        if wp.static(requested.images):
-            slot = view.image_slot[instant]
-            if wp.static(not requested.log):
-                if slot < 0:
-                    return
-        lane = in_tile % 16
+        lane = index % 16
+        if lane == 0 and kind == _SEVERAL:
+            lists.uneven[wp.atomic_add(lists.count, 0, 1)] = block
+        if lane == 0 and kind == _BODY:
+            columns = (1 << wp.min(view.width - left, 4)) - 1
+            pixels = int(0)
+            for row in range(wp.min(view.height - top, 4)):
+                pixels = pixels | (columns << (4 * row))
+            lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, pixels)
         col = left + lane % 4
         row = top + lane // 4
-        outside = col >= view.width or row >= view.height
-        if outside:
-            col = left
-            row = top
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
-        pixel = first_ray + row * view.width + col
-        center_C = rays[0, pixel]
-        center = wp.quat_rotate(q, wp.vec3(center_C[0], center_C[1], center_C[2]))
-        across_C = rays[1, pixel]
-        across = wp.quat_rotate(q, wp.vec3(across_C[0], across_C[1], across_C[2]))
-        down_C = rays[2, pixel]
-        down = wp.quat_rotate(q, wp.vec3(down_C[0], down_C[1], down_C[2]))
-        coverage = _cover_group(
-            scene, out.face, instant, row, col, view.height, view.width, origin, center, across, down
-        )
-        total = wp.vec3(0.0)
-        whole = float(0.0)
-        remaining = int(0)
-        if coverage[0] >= 0:
-            remaining = _ALL_POINTS
-        while remaining != 0:
-            shown = _samples_of_layer(coverage, remaining)
-            remaining = remaining & ~int(shown[1])
-            if shown[0] == _NO_LAYER:
-                if coverage[1] != 0:
-                    total += shown[2] * scene.sky
-                    whole += shown[2]
-            else:
-                toward = center + shown[3] * across + shown[4] * down
-                part = out.face[instant, row, col]
-                if coverage[0] > 0:
-                    part = _part_of_layer(scene, coverage, int(shown[0]), part, origin, toward)
-                met = _meet_part(scene, part, origin, toward)
-                hit = Hit()
-                hit.face = part
-                hit.t = met[0]
-                hit.u = wp.clamp(met[1], 0.0, 1.0)
-                hit.v = wp.clamp(met[2], 0.0, 1.0 - hit.u)
-                hit.normal = wp.vec3(met[3], met[4], met[5])
-                light = radiance_of(
-                    scene, bodies, instant, -1, q, wp.normalize(toward), origin, SHARPNESS * center_C[3], hit
-                )
-                total += shown[2] * light
-                whole += shown[2]
-        unresolved = _group_votes(coverage[0] < 0 and not outside)
-        if unresolved != 0:
-            point = ray_point(lane % RAY_COUNT)
-            for turn in range(wp.static(16 // _TOGETHER)):
-                if (unresolved >> (_TOGETHER * turn)) & 3:
-                    member = _TOGETHER * turn + lane // RAY_COUNT
-                    if not ((unresolved >> member) & 1):
-                        member = member ^ 1
-                    pixel = first_ray + (top + member // 4) * view.width + left + member % 4
-                    sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
-                    direction_C = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                    direction = wp.quat_rotate(q, direction_C)
-                    hit = intersect_scene(scene, origin, direction)
-                    body = int(-1)
-                    if wp.static(terms.bodies):
-                        hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
-                    light = radiance_of(
-                        scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * rays[0, pixel][3], hit
-                    )
-                    light = _group_sum(light)
-                    if lane // _TOGETHER == turn and coverage[0] < 0:
-                        total = light
-                        whole = float(RAY_COUNT)
-        if not outside:
-            write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
+        even = kind != _SEVERAL and kind != _BODY
+        if not even or col >= view.width or row >= view.height:
+            return
+        radiance = scene.sky
+        if kind != _SKY:
+            origin = view.p_WC[place.instant]
+            q = view.q_WC[place.instant]
+            ray_C = rays[0, place.first_ray + row * view.width + col]
+            toward = wp.quat_rotate(q, _xyz(ray_C))
+            part = out.face[place.instant, row, col]
+            met = _meet_part(scene, part, origin, toward)
+            hit = Hit()
+            hit.face = part
+            hit.t = met[0]
+            hit.u = wp.clamp(met[1], 0.0, 1.0)
+            hit.v = wp.clamp(met[2], 0.0, 1.0 - hit.u)
+            hit.normal = wp.vec3(met[3], met[4], met[5])
+            radiance = radiance_of(
+                scene, bodies, place.instant, -1, q, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit
+            )
+        write_radiance(scene, radiance, 1, place.instant, place.slot, row, col, out)
 
-    return average_groups
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=_COVER_BOUNDS)
+    def cover_uneven_blocks(
+        first: int,
+        # In:
+        scene: SceneData,
+        view: ViewData,
+        bodies: BodyData,
+        worlds: WorldData,
+        rays: wp.array2d[wp.vec4],
+        # Out:
+        out: RenderOutputs,
+        lists: BlockLists,
+    ) -> None:
+        # The threads of a warp reach the functions that they call together.
+        begin = (first + wp.tid()) // 32
+        lane = (first + wp.tid()) % 32
+        pixel_lane = lane % 16
+        for turn in range(turn_count(begin, lists.count[0], lists.threads // 32)):
+            block = lists.uneven[begin + turn * (lists.threads // 32)]
+            place = locate_tile(
+                block // 4 // view.instant_count, block // 4 % view.instant_count, view, worlds
+            )
+            if wp.static(terms.world_scenes):
+                scene = worlds.scenes[worlds.scene[place.world]]
+            left = place.left + 4 * (block % 2)
+            top = place.top + 4 * (block // 2 % 2)
+            col = left + pixel_lane % 4
+            row = top + pixel_lane // 4
+            outside = col >= view.width or row >= view.height
+            pixel = place.first_ray + row * view.width + col
+            corner = place.first_ray + top * view.width + left
+            if outside:
+                pixel = corner
+            origin = view.p_WC[place.instant]
+            q = view.q_WC[place.instant]
+            covered = _cover_block(
+                scene,
+                out.face,
+                place.instant,
+                top,
+                left,
+                view.height,
+                view.width,
+                outside,
+                origin,
+                wp.quat_rotate(q, _xyz(rays[0, pixel])),
+                wp.quat_rotate(q, _xyz(rays[1, pixel])),
+                wp.quat_rotate(q, _xyz(rays[2, pixel])),
+            )
+            for step in range((covered[0] + 31) // 32):
+                pair = 32 * step + lane
+                if pair < covered[0]:
+                    met = _meet_pair(scene, covered[5], pair, out.face, place.instant, top, left, origin)
+                    owner = int(met[0])
+                    spread_rad = rays[0, corner + owner // 4 * view.width + owner % 4][3]
+                    toward = wp.vec3(met[3], met[4], met[5])
+                    hit = Hit()
+                    hit.face = wp.cast(met[2], int)
+                    hit.t = met[6]
+                    hit.u = wp.clamp(met[7], 0.0, 1.0)
+                    hit.v = wp.clamp(met[8], 0.0, 1.0 - hit.u)
+                    hit.normal = wp.vec3(met[9], met[10], met[11])
+                    light = radiance_of(
+                        scene,
+                        bodies,
+                        place.instant,
+                        -1,
+                        q,
+                        wp.normalize(toward),
+                        origin,
+                        footprint_width(met[1]) * spread_rad,
+                        hit,
+                    )
+                    _store_pair(covered[5], pair, met[1] * light)
+            total = _sum_pairs(covered[5], covered[1], covered[2])
+            whole = float(SAMPLE_COUNT)
+            if covered[4] != 0:
+                total += float(covered[3]) * scene.sky
+            else:
+                whole -= float(covered[3])
+            written = lane < 16 and not outside
+            if written and covered[3] >= 0:
+                write_radiance(scene, total / whole, 1, place.instant, place.slot, row, col, out)
+            unresolved = _warp_votes(written and covered[3] < 0)
+            if unresolved != 0 and lane == 0:
+                lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    def cast_unresolved_pixels(
+        first: int,
+        # In:
+        scene: SceneData,
+        view: ViewData,
+        bodies: BodyData,
+        worlds: WorldData,
+        rays: wp.array2d[wp.vec4],
+        # Out:
+        out: RenderOutputs,
+        lists: BlockLists,
+    ) -> None:
+        begin = (first + wp.tid()) // _RAYS
+        index = (first + wp.tid()) % _RAYS
+        for turn in range(turn_count(begin, lists.count[1], lists.threads // _RAYS)):
+            listed = lists.unresolved[begin + turn * (lists.threads // _RAYS)]
+            block = listed[0]
+            place = locate_tile(
+                block // 4 // view.instant_count, block // 4 % view.instant_count, view, worlds
+            )
+            if wp.static(terms.world_scenes):
+                scene = worlds.scenes[worlds.scene[place.world]]
+            lane = index // RAY_COUNT
+            row = place.top + 4 * (block // 2 % 2) + lane // 4
+            col = place.left + 4 * (block % 2) + lane % 4
+            wanted = (listed[1] >> lane) & 1
+            light = wp.vec3(0.0)
+            if wanted != 0:
+                point = ray_point(index % RAY_COUNT)
+                origin = view.p_WC[place.instant]
+                q = view.q_WC[place.instant]
+                pixel = place.first_ray + row * view.width + col
+                toward_C = _xyz(rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel])
+                direction_C = wp.normalize(toward_C)
+                direction = wp.quat_rotate(q, direction_C)
+                hit = intersect_scene(scene, origin, direction)
+                body = int(-1)
+                if wp.static(terms.bodies):
+                    hit, body = intersect_bodies(bodies, place.instant, direction_C, q, hit)
+                light = radiance_of(
+                    scene,
+                    bodies,
+                    place.instant,
+                    body,
+                    q,
+                    direction,
+                    origin,
+                    RAY_WIDTH * rays[0, pixel][3],
+                    hit,
+                )
+            light = _ray_sum(light)
+            if wanted != 0 and index % RAY_COUNT == 0:
+                write_radiance(scene, light / float(RAY_COUNT), 1, place.instant, place.slot, row, col, out)
+
+    return GroupKernels(shade_even_blocks, cover_uneven_blocks, cast_unresolved_pixels)

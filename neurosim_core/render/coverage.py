@@ -15,7 +15,10 @@ RAY_WIDTH = wp.constant(RAY_COUNT**-0.5)
 FACE_COUNT_MAX = 64
 """Most faces of a block of 4 x 4 pixels and the ring around it."""
 SHARPNESS = wp.constant(0.7)
-"""Width of the footprint that a texture is averaged over [px]: a lookup blurs more than a mean does."""
+"""Width of the footprint that a texture is averaged over where a surface fills a pixel [px].
+
+A lookup blurs more than a mean does.
+"""
 
 
 @wp.func_native(read_native(__file__, "sample_point", SAMPLES=SAMPLE_COUNT))
@@ -28,3 +31,9 @@ def sample_point(sample: int) -> wp.vec2:
 def ray_point(ray: int) -> wp.vec2:
     """Return the point of a pixel that a ray goes through, from its centre [px]."""
     return sample_point(2 * ray + (ray + ray // 2 + ray // 4) % 2)
+
+
+@wp.func
+def footprint_width(point_count: float) -> float:
+    """Return the width of the footprint that a texture is averaged over where so many points show it [px]."""
+    return SHARPNESS * wp.sqrt(point_count / float(SAMPLE_COUNT))

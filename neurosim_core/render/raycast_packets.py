@@ -27,14 +27,15 @@ from neurosim_core.render.ray_intersection import (
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
+from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 
 def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Build the kernel; see `raycast.raycast_kernel`."""
     requested = requested_outputs(outputs)
     listed = terms.candidate_group > 0
-    find_tile = tile_finder(terms)
+    every_instant = requested.log or requested.faces
+    locate_tile = tile_locator(terms, images=requested.images, instants=every_instant)
     radiance_of = pixel_shader(terms)
     write_geometry = geometry_writer(outputs, terms)
     write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
@@ -69,27 +70,17 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         in_tile = index % packets
         block = index // packets
         instant = block % view.instant_count
-        tile = block // view.instant_count
-        world, tile, left, top = find_tile(tile, view.width, view.height)
-        first_ray = int(0)
-        if wp.static(terms.worlds):
-            instant += world * worlds.stride
-            if worlds.active[world] == 0:
-                return
+        place = locate_tile(block // view.instant_count, instant, view, worlds)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[world]]
-        if wp.static(terms.world_lenses):
-            first_ray = worlds.lens[world] * view.width * view.height
-        left += (in_tile % 2) * side
-        top += (in_tile // 2) * side
-        if left >= view.width or top >= view.height:
+            scene = worlds.scenes[worlds.scene[place.world]]
+        left = place.left + (in_tile % 2) * side
+        top = place.top + (in_tile // 2) * side
+        if not place.rendered or left >= view.width or top >= view.height:
             return
-        slot = int(-1)
-        if wp.static(requested.images):
-            slot = view.image_slot[instant]
-            if wp.static(not (requested.log or requested.faces)):
-                if slot < 0:
-                    return
+        instant = place.instant
+        tile = place.tile
+        first_ray = place.first_ray
+        slot = place.slot
         origin = view.p_WC[instant]
         q = view.q_WC[instant]
         columns = wp.min(view.width - left, side)

@@ -27,7 +27,7 @@ from neurosim_core.render.ray_intersection import (
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
+from neurosim_core.render.view_data import ViewData, WorldData, tile_finder, tile_locator
 
 PIXEL_BOUNDS = (64, 14)
 """Threads of a block and, on CUDA, blocks of a multiprocessor: registers are limited to fit; fastest on an
@@ -97,7 +97,8 @@ def turn_count(begin: int, end: int, step: int) -> int:
 def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     """Return the function that renders a pixel of one instant by rays that traverse the tree."""
     requested = requested_outputs(outputs)
-    find_tile = tile_finder(terms)
+    every_instant = requested.log or requested.faces
+    locate_tile = tile_locator(terms, images=requested.images, instants=every_instant)
     radiance_of = pixel_shader(terms)
     write_geometry = geometry_writer(outputs, terms)
     write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
@@ -124,29 +125,18 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                 quarter = instant % 4
                 instant += in_tile // 16 - quarter
                 in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
-        world, tile, left, top = find_tile(tile, view.width, view.height)
-        first_ray = int(0)
-        if wp.static(terms.worlds):
-            instant += world * worlds.stride
-            if worlds.active[world] == 0:
-                return
+        place = locate_tile(tile, instant, view, worlds)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[world]]
-        if wp.static(terms.world_lenses):
-            first_ray = worlds.lens[world] * view.width * view.height
-        col = left + in_tile % 8
-        row = top + in_tile // 8
-        if col >= view.width or row >= view.height:
+            scene = worlds.scenes[worlds.scene[place.world]]
+        col = place.left + in_tile % 8
+        row = place.top + in_tile // 8
+        if not place.rendered or col >= view.width or row >= view.height:
             return
-        slot = int(-1)
-        if wp.static(requested.images):
-            slot = view.image_slot[instant]
-            if wp.static(not (requested.log or requested.faces)):
-                if slot < 0:
-                    return
+        instant = place.instant
+        slot = place.slot
         origin = view.p_WC[instant]
         q = view.q_WC[instant]
-        pixel = first_ray + row * view.width + col
+        pixel = place.first_ray + row * view.width + col
         radiance = wp.vec3(0.0)
         for layer in range(view.rays.shape[0]):
             if wp.static(terms.supersampled):
@@ -155,7 +145,7 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                     continue
             pose = instant
             if wp.static(terms.timed):
-                pose = instant * view.pose_count + view.pose[layer, pixel - first_ray]
+                pose = instant * view.pose_count + view.pose[layer, pixel - place.first_ray]
                 origin = view.p_WC[pose]
                 q = view.q_WC[pose]
             ray_C = view.rays[layer, pixel]

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,8 +55,6 @@ class SceneArrays:
     data: SceneData
     exposure: float
     """Factor from linear radiance to the linear value 1.0 of an 8-bit picture."""
-    light_s: float
-    """Wall-clock time that baking took [s]."""
 
     @property
     def mesh_id(self) -> wp.uint64:
@@ -79,33 +77,26 @@ def upload_scene(
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
     """
     baked = config.lighting.mode == "baked"
-    mesh = refine(scene, config.lighting.edge_max_m if baked else None)
     joined = join_bodies(
         bodies, material_count=len(scene.materials), instance_count=len(scene.instance_names)
     )
     materials = (*scene.materials, *joined.materials)
-    packed = pack_textures(materials)
-    material = scene.face_material[mesh.origin]
-    terms = _terms_of(materials, packed, config, device, bodies=bool(bodies))
-    start = time.perf_counter()
     light: NDArray[np.float32] | None = None
-    if baked or config.exposure == "auto":
-        light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(terms.embree))
-    light_s = time.perf_counter() - start
+    with ThreadPoolExecutor(max_workers=2) as aside:
+        packing = aside.submit(pack_textures, materials)
+        embree_width = _embree_width(config, device)
+        mesh = refine(scene, config.lighting.edge_max_m if baked else None)
+        building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
+        if baked or config.exposure == "auto":
+            light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
+        packed = packing.result()
+        tree, embree = building.result()
+    terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
+    material = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
         exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
-
-    points = wp.array(mesh.vertices, dtype=wp.vec3, device=device)
-    indices = wp.array(mesh.faces.reshape(-1), dtype=int, device=device)
-    tree = wp.Mesh(
-        points,
-        indices,
-        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
-        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
-    )
-    embree = EmbreeTree(mesh.vertices, mesh.faces) if terms.embree else None
     data = SceneData()
     data.mesh = tree.id
     if embree is not None:
@@ -144,12 +135,28 @@ def upload_scene(
         terms=terms,
         data=data,
         exposure=exposure,
-        light_s=light_s,
     )
 
 
+def _build_trees(mesh: RefinedMesh, device: str, *, embree: bool) -> tuple[wp.Mesh, EmbreeTree | None]:
+    """Return the tree of a mesh as Warp has it, and as Embree has it if that casts rays."""
+    tree = wp.Mesh(
+        wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        wp.array(mesh.faces.reshape(-1), dtype=int, device=device),
+        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+    return tree, EmbreeTree(mesh.vertices, mesh.faces) if embree else None
+
+
 def _terms_of(
-    materials: Sequence[Material], packed: PackedTextures, config: RenderConfig, device: str, *, bodies: bool
+    materials: Sequence[Material],
+    packed: PackedTextures,
+    config: RenderConfig,
+    device: str,
+    *,
+    embree: int,
+    bodies: bool,
 ) -> RenderTerms:
     """Return what a scene of these materials and its settings need of the ray caster."""
     textured = bool((packed.material_texture[:, 1] > 0).any())
@@ -158,7 +165,7 @@ def _terms_of(
         emissive=any(max(m.emission) > 0.0 for m in materials),
         baked=config.lighting.mode == "baked",
         supersampled=config.samples_per_pixel not in (1, "adaptive"),
-        embree=_embree_width(config, device),
+        embree=embree,
         finest_level=textured and config.texture_filter != "trilinear",
         nearest_texel=textured and config.texture_filter == "nearest",
         bodies=bodies,

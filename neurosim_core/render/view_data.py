@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-def,return-value"
+# mypy: disable-error-code="assignment,no-untyped-def,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """The camera of a launch: rays, poses and worlds, and the layout of tiles of 8 x 8 pixels."""
@@ -82,3 +82,62 @@ def tile_finder(terms: RenderTerms) -> wp.Function:
         return world, tile, (tile % tile_columns) * 8, (tile // tile_columns) * 8
 
     return find_tile
+
+
+@wp.struct
+class TilePlace:
+    """A tile in one instant."""
+
+    rendered: wp.bool
+    """False: its world is inactive, or none of the outputs is wanted of the instant."""
+    world: int
+    tile: int
+    """Its index in the world."""
+    instant: int
+    """Row of the arrays of instants."""
+    left: int
+    """Column of its first pixel."""
+    top: int
+    """Row of its first pixel."""
+    first_ray: int
+    """Index of the first ray of the world's lens in a layer."""
+    slot: int
+    """Where images go, -1: nowhere."""
+
+
+@cache
+def tile_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:
+    """Return the Warp function that locates a tile in one instant.
+
+    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; view and worlds.
+
+    Args:
+        terms: Of the kernel.
+        images: Outputs that have image slots are written.
+        instants: Outputs that all instants have are written.
+    """
+    find_tile = tile_finder(terms)
+
+    @wp.func
+    def locate_tile(tile: int, instant: int, view: ViewData, worlds: WorldData) -> TilePlace:
+        place = TilePlace()
+        world, in_world, left, top = find_tile(tile, view.width, view.height)
+        place.world = world
+        place.tile = in_world
+        place.left = left
+        place.top = top
+        place.rendered = True
+        if wp.static(terms.worlds):
+            instant += world * worlds.stride
+            place.rendered = worlds.active[world] != 0
+        if wp.static(terms.world_lenses):
+            place.first_ray = worlds.lens[world] * view.width * view.height
+        place.instant = instant
+        place.slot = -1
+        if wp.static(images):
+            place.slot = view.image_slot[instant]
+            if wp.static(not instants):
+                place.rendered = place.rendered and place.slot >= 0
+        return place
+
+    return locate_tile

@@ -161,6 +161,7 @@ class WarpRenderer:
                 terms=self.terms,
                 device=device,
                 thread_count=thread_count,
+                pixel_count=worlds.count * instant_count * self._tile_count * TILE * TILE,
             )
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:

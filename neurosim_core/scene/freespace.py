@@ -193,6 +193,8 @@ class FreeSpace:
     """A point in the free space that is meant [m], shape [3]."""
     seed_rule: str
     """How the seed was found, one sentence."""
+    closed: bool
+    """Outside there is nothing to fly in (`Scene.closed`), and no `seed_m` of the configuration says else."""
     notes: tuple[str, ...]
     """What was assumed, one sentence each; shown to the user."""
     arrays: DistanceField
@@ -240,29 +242,35 @@ class FreeSpace:
         return _reachable(self, clearance_m)
 
     def check_start(self, point_m: ArrayLike) -> None:
-        """Refuse to begin inside a solid.
+        """Refuse to begin inside a solid, or outside of a closed scene.
 
         A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
-        (12 m^3). Outside the grid, and where a surface passes, there is no solid to be inside of.
+        (12 m^3). Where a surface passes, there is no solid to be inside of. Outside is what is beyond the
+        grid or open to that, and does not hold the seed.
 
         Args:
             point_m: In the world [m], shape [3].
 
         Raises:
-            ValueError: The point is inside a solid.
+            ValueError: The point is inside a solid, or outside.
         """
         point = np.asarray(point_m, dtype=np.float64)
         voxel = self.voxel_of(point)
-        if (point < self.bounds_m[0]).any() or (point > self.bounds_m[1]).any() or self.occupied[voxel]:
-            return
-        labels, _ = ndimage.label(~self.occupied)
-        region = labels == labels[voxel]
-        ends = [region[side] for side in (0, -1)] + [region[:, side] for side in (0, -1)]
-        open_sides = any(face.any() for face in (*ends, region[:, :, 0], region[:, :, -1]))
-        volume_m3 = float(region.sum()) * self.voxel_m**3
-        if not open_sides and volume_m3 < _ROOM_MIN_M3 and not region[self.voxel_of(self.seed_m)]:
+        where = "outside of the rooms"
+        if (point >= self.bounds_m[0]).all() and (point <= self.bounds_m[1]).all():
+            labels, _ = ndimage.label(~self.occupied)
+            region = labels == labels[voxel]
+            if self.occupied[voxel] or region[self.voxel_of(self.seed_m)]:
+                return
+            ends = [region[side] for side in (0, -1)] + [region[:, side] for side in (0, -1)]
+            if not any(face.any() for face in (*ends, region[:, :, 0], region[:, :, -1])):
+                volume_m3 = float(region.sum()) * self.voxel_m**3
+                if volume_m3 >= _ROOM_MIN_M3:
+                    return
+                where = f"inside a solid of {volume_m3:.2g} m^3"
+        if where.startswith("inside") or self.closed:
             raise ValueError(
-                f"the path begins at {np.round(point, 3).tolist()} m, inside a solid of {volume_m3:.2g} m^3; "
+                f"the path begins at {np.round(point, 3).tolist()} m, {where}; "
                 f"free space is around {np.round(self.seed_m, 3).tolist()} m"
             )
 
@@ -360,6 +368,7 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
         bounds_m=bounds,
         seed_m=bounds.mean(axis=0),
         seed_rule="",
+        closed=scene.closed and config.seed_m is None,
         notes=(),
         arrays=arrays,
         mesh=mesh,

@@ -12,6 +12,7 @@ rounded to 8 bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,16 +27,14 @@ _LEVELS_RG = 2047
 _LEVELS_B = 1023
 _SCALE_RG = wp.constant(1.0 / _LEVELS_RG)
 _SCALE_B = wp.constant(1.0 / _LEVELS_B)
+_CODE = np.arange(256) / 255.0
+_LINEAR = np.where(_CODE <= 0.04045, _CODE / 12.92, ((_CODE + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""Linear light of each 8-bit sRGB code. Reference: IEC 61966-2-1."""
 
 
 def srgb_to_linear(srgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the linear light of 8-bit sRGB values, in [0, 1], the same shape.
-
-    Reference: IEC 61966-2-1.
-    """
-    code = np.arange(256) / 255.0
-    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[srgb]
+    """Return the linear light of 8-bit sRGB values, in [0, 1], the same shape."""
+    return _LINEAR[srgb]
 
 
 def linear_to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -100,29 +99,40 @@ class PackedTextures:
 
 
 def pack_textures(materials: Sequence[Material]) -> PackedTextures:
-    """Decode textures, build their mip chains and pack them; one that materials share is packed once."""
+    """Decode textures, build their mip chains and pack them; one that materials share is packed once.
+
+    Threads share the textures: NumPy releases the interpreter lock.
+    """
+    textures = list({id(m.texture): m.texture for m in materials if m.texture is not None}.values())
+    with ThreadPoolExecutor() as pool:
+        chains = dict(zip(map(id, textures), pool.map(_packed_levels, textures), strict=True))
     chunks: list[NDArray[np.uint32]] = []
     levels: list[tuple[int, int, int]] = []
     rows: dict[int, tuple[int, int]] = {}
-    material_texture = np.zeros((len(materials), 2), dtype=np.int32)
     texel_count = 0
-    for index, material in enumerate(materials):
-        texture: Texture | None = material.texture
-        if texture is None:
-            continue
-        if id(texture) not in rows:
-            chain = mip_chain(srgb_to_linear(texture.srgb))
-            rows[id(texture)] = (len(levels), len(chain))
-            for level in chain:
-                levels.append((texel_count, level.shape[1], level.shape[0]))
-                chunks.append(encode_texels(level).reshape(-1))
-                texel_count += chunks[-1].size
-        material_texture[index] = rows[id(texture)]
+    for key, chain in chains.items():
+        rows[key] = (len(levels), len(chain))
+        for level in chain:
+            levels.append((texel_count, level.shape[1], level.shape[0]))
+            chunks.append(level.reshape(-1))
+            texel_count += level.size
     return PackedTextures(
         texels=np.concatenate(chunks) if chunks else np.zeros(0, dtype=np.uint32),
         levels=np.array(levels, dtype=np.int32).reshape(-1, 3),
-        material_texture=material_texture,
+        material_texture=np.array([rows.get(id(m.texture), (0, 0)) for m in materials], np.int32).reshape(
+            -1, 2
+        ),
     )
+
+
+def _packed_levels(texture: Texture) -> list[NDArray[np.uint32]]:
+    """Return the packed texels of all levels of a texture, shape [H, W] each."""
+    codes = encode_texels(np.repeat(_LINEAR[:, None], 3, axis=1))  # each channel alone, as a table
+    masks = np.array([_LEVELS_RG, _LEVELS_RG << 11, _LEVELS_B << 22], np.uint32)
+    red, green, blue = (codes & mask for mask in masks)
+    srgb = texture.srgb
+    finest = red[srgb[..., 0]] | green[srgb[..., 1]] | blue[srgb[..., 2]]
+    return [finest, *(encode_texels(level) for level in mip_chain(_LINEAR[srgb])[1:])]
 
 
 def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArray[np.float32]:

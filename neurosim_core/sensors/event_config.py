@@ -7,6 +7,7 @@ Every group is optional. What is left out is not compiled and allocates nothing;
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -30,6 +31,28 @@ class ThresholdSpreadConfig(Settings):
     """Smaller thresholds are raised to this one."""
 
 
+class ThresholdJitterConfig(Settings):
+    """Thresholds that are drawn anew after each event, around those of the pixel, as in ESIM."""
+
+    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold upwards, in log radiance."""
+    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold downwards, in log radiance."""
+    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
+    """Smaller thresholds are raised to this one."""
+
+
+class LinLogConfig(Settings):
+    """A logarithm that becomes a line in the dark, as in v2e, where 8-bit pictures have no more steps.
+
+    With DN the radiance in units of white_radiance / 255, the pixel sees ln(DN) above `linear_below`, here D,
+    and DN ln(D) / D below.
+    """
+
+    linear_below: Annotated[float, Field(gt=1.0, le=255.0)] = 20.0
+    """Light at which the logarithm begins [white / 255]."""
+
+
 class LowPassConfig(Settings):
     """The photoreceptor: first order, the slower the darker.
 
@@ -47,9 +70,11 @@ class LeakConfig(Settings):
     """Leak of the reset switch: the reference falls, so that a still pixel fires ON events steadily."""
 
     rate_hz: Annotated[float, Field(ge=0.0, le=1e4)] = 0.1
-    """Events a second and pixel in a still scene [Hz]."""
+    """Events a second and pixel in a still scene, in the dark [Hz]."""
     spread_decades: Decades = 0.1
     """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    bright_factor: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
+    """Factor on the rate at `white_radiance`; light leaks through the switch, so that it grows linearly."""
 
 
 class ShotNoiseConfig(Settings):
@@ -63,6 +88,46 @@ class ShotNoiseConfig(Settings):
     """Share of ON events."""
     spread_decades: Decades = 0.1
     """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    by_threshold: bool = False
+    """Whether the rate of a polarity is inversely proportional to the threshold of the pixel, as in v2e."""
+
+
+class NoiseLevelConfig(Settings):
+    """Events without cause in one light, as they were measured."""
+
+    lux: Annotated[float, Field(ge=1e-6, le=1e7)]
+    """Illuminance of the scene [lux]."""
+    on_hz: Rate
+    """ON events a second of the median pixel [Hz]."""
+    off_hz: Rate
+    """OFF events a second of the median pixel [Hz]."""
+    spread_decades: Decades = 0.25
+    """Standard deviation of the common logarithm of the rates; a pixel has one rank in all lights."""
+
+
+class MeasuredNoiseConfig(Settings):
+    """Events without cause at rates that were measured in several lights, for each polarity.
+
+    Each pixel is a Poisson process. Between two lights rates are linear in the logarithm of light, beyond
+    them they stay. They come from `levels`, or each pixel takes those of a random pixel in `file`.
+    """
+
+    white_lux: Annotated[float, Field(ge=1e-3, le=1e7)] = 1000.0
+    """Illuminance that `white_radiance` stands for [lux]."""
+    levels: tuple[NoiseLevelConfig, ...] = ()
+    """Rates by light, from dark to bright: [{lux: 0.1, on_hz: 5, off_hz: 4}, ...]."""
+    file: Path | None = None
+    """Rates of the pixels of a sensor: .npz with lux [L], on_hz [L, P] and off_hz [L, P], dark to bright.
+    `neurosim fit-sensor --also` makes one."""
+
+    @model_validator(mode="after")
+    def _rates_are_there(self) -> MeasuredNoiseConfig:
+        if (self.file is None) == (not self.levels):
+            raise ValueError("give levels or file, one of them")
+        lux = [level.lux for level in self.levels]
+        if sorted(set(lux)) != lux:
+            raise ValueError(f"levels must go from dark to bright, got lux {lux}")
+        return self
 
 
 class HotPixelConfig(Settings):
@@ -130,6 +195,13 @@ class ReadoutConfig(Settings):
     """Events a second that can be read [Hz]."""
     row_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """`row`: time to reach a row, before its events are read [s]."""
+    handshake: bool = False
+    """Whether a pixel waits in reset until its event is read: what it would have fired meanwhile is lost, and
+    counted in `Events.dropped_count`."""
+    latency_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Time from the readout of an event to its stamp, on average [s]."""
+    jitter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Standard deviation of that time, event by event; no stamp is before the readout [s]."""
     queue_length: Annotated[int, Field(ge=1, le=1 << 26)] = 65_536
     """Most events that wait; those that come while so many do are lost, and counted in
     `Events.dropped_count`. To read them must take 60 s at most."""
@@ -151,8 +223,16 @@ def describe_pixel(pixel: EventCameraConfig) -> str:
         parts.append(f"steps of about {1.0 / pixel.stochastic.k1:.3g}" if pixel.stochastic.k1 else "no steps")
     else:
         parts.append(f"thresholds {pixel.threshold_on:g} on, {pixel.threshold_off:g} off")
-    groups = ("threshold_spread", "low_pass", "leak", "shot_noise", "hot_pixels", "stochastic", "readout")
-    present = [name for name in groups if getattr(pixel, name) is not None]
+    groups = (
+        "threshold_spread",
+        "low_pass",
+        "leak",
+        "shot_noise",
+        "measured_noise",
+        "hot_pixels",
+        "stochastic",
+    )
+    present = [name for name in (*groups, "readout") if getattr(pixel, name) is not None]
     if pixel.refractory_s > 0.0:
         present.append("refractory_s")
     return ", ".join([*parts, *(present or ["ideal"])])
@@ -174,10 +254,15 @@ class EventCameraConfig(Settings):
     threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)
     """Fall of log radiance (natural logarithm) that fires an event of polarity 0."""
     white_radiance: float = Field(default=1.0, gt=0.0, le=1e30)
-    """Radiance that `low_pass`, `shot_noise` and `stochastic` take for white, the brightest of a picture."""
+    """Radiance that all that depends on light takes for white, the brightest of a picture."""
     threshold_spread: ThresholdSpreadConfig | None = None
     """Thresholds that differ from pixel to pixel, and stay: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01},
     standard deviations in log radiance; null: none."""
+    threshold_jitter: ThresholdJitterConfig | None = None
+    """Thresholds drawn anew after each event: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01}; null: they
+    stay."""
+    lin_log: LinLogConfig | None = None
+    """Linear, not logarithmic, in the dark, as v2e: {linear_below: 20}; null: logarithmic everywhere."""
     low_pass: LowPassConfig | None = None
     """Finite bandwidth of the photoreceptor, falling with light: {cutoff_hz: 3000, dark_radiance: 0.08};
     null: infinitely fast."""
@@ -188,11 +273,14 @@ class EventCameraConfig(Settings):
     shot_noise: ShotNoiseConfig | None = None
     """Random events, more of them in the dark: {rate_hz: 1, bright_factor: 0.25, on_fraction: 0.5,
     spread_decades: 0.1}; null: none."""
+    measured_noise: MeasuredNoiseConfig | None = None
+    """Random events at rates measured in several lights, in place of `shot_noise`: {white_lux: 1000, levels:
+    [{lux: .., on_hz: .., off_hz: .., spread_decades: 0.25}, ..]}, or {file: my_camera.npz}; null: none."""
     hot_pixels: HotPixelConfig | None = None
     """Pixels that fire all the time: {fraction: 1e-4, rate_hz: 100, on_fraction: 1}; null: none."""
     stochastic: StochasticConfig | None = None
     """Brownian motion in place of thresholds, DVS-Voltmeter: {k1: .., .. k6: .., random_phase: true}; instead
-    of low_pass, leak and shot_noise. null: thresholds."""
+    of low_pass, leak and noise. null: thresholds."""
     readout: ReadoutConfig | None = None
     """Arbiter with limited bandwidth: {kind: event or row, bandwidth_hz: 12e6, row_s: 0, queue_length:
     65536}; null: all events at once."""
@@ -204,12 +292,17 @@ class EventCameraConfig(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:
-        return fill_from_preset(given, {name: preset.pixel for name, preset in PRESETS.items()})
+        filled = fill_from_preset(given, {name: preset.pixel for name, preset in PRESETS.items()})
+        if "preset" in given and "shot_noise" in given and "measured_noise" not in given:
+            filled["measured_noise"] = None  # the user has said which noise there is
+        return filled
 
     @model_validator(mode="after")
     def _law_is_one(self) -> EventCameraConfig:
         if self.stochastic is not None:
-            for name in ("low_pass", "leak", "shot_noise"):
+            for name in ("threshold_jitter", "lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} must be null where stochastic is given, which has its own")
+        if self.shot_noise is not None and self.measured_noise is not None:
+            raise ValueError("give shot_noise or measured_noise, not both")
         return self

@@ -4,17 +4,25 @@
 time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the
 middle of each piece. One pole is what measurements show (v2e).
 
+**Lin-log** (lin_log). In the dark the pixel sees light itself in place of its logarithm, as in v2e; what it
+sees is linear in time between frames.
+
 **Mismatch** (spread). Thresholds of each pixel are normal numbers, drawn once, at least `minimum`.
 
+**Jitter** (jitter). After each event the thresholds of a pixel are drawn anew, normal around its own ones,
+and count from the level crossed.
+
 **Leak** (leak). The reference falls by rate times ON threshold, so a still pixel fires ON events at `rate`. A
-pixel begins at a random phase, as if it had been on for long.
+pixel begins at a random phase, as if it had been on for long. Where light leaks through the switch (term
+light_leak), the rate grows linearly with it; what has leaked is integrated over each frame.
 
 **Refractory time** (refractory). After an event a pixel is held in reset, and its reference is the signal at
 the end of that: a ramp of slope s fires every t_ref + C / s.
 
 **Shot noise, hot pixels** (spontaneous). One Poisson process for each pixel, drawn as waiting times of its
 largest rate and thinned to the rate at the light of that instant. A noise event resets a pixel like any
-other: its reference becomes the signal.
+other: its reference becomes the signal. Rates that were measured in several lights (term measured) give each
+polarity its own rate.
 
 **First passage** (stochastic). DVS-Voltmeter: voltage is a Brownian motion with constant drift and spread
 between frames. Its increment is drawn, then whether the bridge between its ends touched a threshold, and
@@ -34,7 +42,10 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 
 wp.set_module_options({"enable_backward": False})
 
-TERMS = ("spread", "low_pass", "refractory", "leak", "spontaneous", "stochastic")
+TERMS = (
+    "spread", "jitter", "lin_log", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured",
+    "stochastic",
+)  # fmt: skip
 """All terms that may be compiled in."""
 CAUSE = "cause"
 """A further term: the column of an event is eight times the column plus its cause."""
@@ -50,11 +61,19 @@ class PixelModel:
     threshold_on: wp.float64
     threshold_off: wp.float64
     white_radiance: wp.float64
+    log_white: wp.float64
+    jitter: wp.vec2d  # standard deviations ON, OFF
+    jitter_least: wp.float64
     refractory_ns: wp.float64
+    linear_below: wp.float64  # radiance; 0: logarithmic everywhere
+    linear_level: wp.float64  # its logarithm
+    linear_slope: wp.float64  # log radiance seen over that light
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64
     bright_factor: wp.float64
+    leak_growth: wp.float64  # of the leak from dark to white, as a share
     shot_on_fraction: wp.float64
+    shot_by_threshold: wp.bool
     hot_on_fraction: wp.float64
     k1: wp.float64
     k2: wp.float64
@@ -66,9 +85,12 @@ class PixelModel:
     spontaneous_stream: wp.uint32
     step_stream: wp.uint32
     touch_stream: wp.uint32
+    jitter_stream: wp.uint32
     thresholds: wp.array[wp.vec2d]  # ON, OFF
     leak: wp.array[wp.vec2d]  # cycles per ns, phase in cycles
-    rates: wp.array[wp.vec2d]  # shot noise in the dark and hot pixel, per ns
+    rates: wp.array[wp.vec2d]  # shot noise in the dark, or at most, and hot pixel, per ns
+    noise_light: wp.array[wp.float64]  # log radiance at which noise was measured, rising
+    noise_rates: wp.array2d[wp.vec2]  # ON and OFF, shape [light, pixel], per ns
 
 
 @wp.struct
@@ -76,9 +98,13 @@ class Memory:
     """What pixels remember beside their last sample and the levels they crossed, shape [pixel]."""
 
     reference: wp.array[wp.float64]
-    """What `base` is to an ideal pixel; changes when a pixel is reset (refractory, spontaneous)."""
+    """What `base` is to an ideal pixel; changes at resets (refractory, spontaneous) and events (jitter)."""
+    event_count: wp.array[wp.int32]
+    """Events since the reset, which number the draws of thresholds."""
     filtered: wp.array[wp.float64]
     """Output of the photoreceptor."""
+    exposure_ns: wp.array[wp.float64]
+    """Light since the reset, in units of white, times time."""
     held_ns: wp.array[wp.float64]
     """Time in reset that is left; negative: not in reset."""
     next_ns: wp.array[wp.int64]
@@ -93,10 +119,16 @@ def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
     """Return the terms that a configuration asks for; none: the pixels are ideal."""
     present = {
         "spread": config.threshold_spread is not None,
+        "jitter": config.threshold_jitter is not None,
+        "lin_log": config.lin_log is not None,
         "low_pass": config.low_pass is not None,
         "refractory": config.refractory_s > 0.0,
         "leak": config.leak is not None,
-        "spontaneous": config.shot_noise is not None or config.hot_pixels is not None,
+        "light_leak": config.leak is not None and config.leak.bright_factor != 1.0,
+        "spontaneous": any(
+            noise is not None for noise in (config.shot_noise, config.measured_noise, config.hot_pixels)
+        ),
+        "measured": config.measured_noise is not None,
         "stochastic": config.stochastic is not None,
     }
     return tuple(term for term, asked in present.items() if asked)

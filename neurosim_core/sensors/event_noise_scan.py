@@ -14,9 +14,20 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.random import random_bits, uniform2
 from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, CAUSES, TERMS, Memory, PixelModel
+from neurosim_core.sensors.event_noise_pixel import (
+    NEVER,
+    NoisyPixel,
+    draw_noise,
+    jittered,
+    light_of,
+    mean_light,
+    measured_polarity,
+    noise_polarity,
+    see,
+    wait_ns,
+)
 from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
 from neurosim_core.sensors.event_signal import (
     Crossing,
@@ -35,7 +46,6 @@ _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
 _SIGNAL, _LEAK, _SHOT, _HOT, _NOISE = (wp.constant(wp.int64(number)) for number in range(len(CAUSES)))
-_NEVER = wp.constant(wp.int64(2**62))
 _PIECE = wp.constant(wp.float64(0.125))
 """Change of log radiance over which tau is held constant."""
 _PIECE_COUNT_MAX = wp.constant(1024)
@@ -48,59 +58,11 @@ _BRIGHTEST = wp.constant(wp.float64(255e3))
 _DRAW_BITS = wp.constant(wp.int64(12))
 
 
-@wp.struct
-class _Pixel:
-    """One pixel in registers."""
-
-    on: wp.float64
-    off: wp.float64
-    reference: wp.float64
-    up: wp.int32
-    down: wp.int32
-    fold: wp.int32  # whole cycles of leak: they count against `up`
-    held_ns: wp.float64  # end of reset, since the frame before
-    next_ns: wp.int64
-    noise_count: wp.int32
-    shot_rate: wp.float64
-    hot_rate: wp.float64
-    voltage: wp.float64
-
-
 @wp.func
 def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
     """Return light in units of white / 255."""
     light = _FULL_SCALE / model.white_radiance * wp.exp(wp.float64(sample))
     return wp.clamp(light, _FAINTEST, _BRIGHTEST)
-
-
-@wp.func
-def _wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
-    """Return an exponential waiting time, at least 1 ns."""
-    if rate <= _ZERO:
-        return _NEVER
-    return wp.max(wp.int64(wp.ceil(wp.min(-wp.log(uniform) / rate, wp.float64(1e18)))), wp.int64(1))
-
-
-@wp.func
-def _spontaneous(model: PixelModel, index: wp.int32, state: _Pixel) -> wp.vec2d:
-    """Return two uniform numbers for the wait for a noise event and for what becomes of it."""
-    return uniform2(random_bits(model.seed, model.spontaneous_stream, wp.int64(state.noise_count), index))
-
-
-@wp.func
-def _noise_polarity(
-    model: PixelModel, state: _Pixel, log_radiance: wp.float64, uniform: wp.float64
-) -> wp.int32:
-    """Return the polarity of a noise event that may be; -1: at this light it is none."""
-    place = uniform * (state.shot_rate + state.hot_rate)
-    if place < state.hot_rate:
-        return wp.where(place < state.hot_rate * model.hot_on_fraction, 1, 0)
-    place -= state.hot_rate
-    light = wp.min(wp.exp(log_radiance) / model.white_radiance, _ONE)
-    rate = state.shot_rate * (_ONE + (model.bright_factor - _ONE) * light)
-    if place >= rate:
-        return -1
-    return wp.where(place < rate * model.shot_on_fraction, 1, 0)
 
 
 @functools.cache
@@ -112,29 +74,33 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     if unknown := terms - {*TERMS, CAUSE}:
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
+    jitter = "jitter" in terms
+    lin_log = "lin_log" in terms
     low_pass = "low_pass" in terms
     refractory = "refractory" in terms
     leak = "leak" in terms
+    light_leak = "light_leak" in terms
+    measured = "measured" in terms
     spontaneous = "spontaneous" in terms
     stochastic = "stochastic" in terms
     cause = CAUSE in terms
-    resets = refractory or spontaneous
+    resets = refractory or spontaneous or jitter
     value_at = curve_at if low_pass else line_at
     find_crossing = curve_crossing if low_pass else line_crossing
 
     @wp.func
-    def range_of(state: _Pixel) -> wp.vec2:
+    def range_of(state: NoisyPixel) -> wp.vec2:
         return quiet_range(state.reference, state.up - state.fold, state.down, state.on, state.off)
 
     @wp.func
-    def next_noise(model: PixelModel, pixel: wp.int32, state: _Pixel) -> _Pixel:
+    def next_noise(model: PixelModel, pixel: wp.int32, state: NoisyPixel) -> NoisyPixel:
         state.noise_count += 1
-        wait = _wait_ns(state.shot_rate + state.hot_rate, _spontaneous(model, pixel, state)[0])
-        state.next_ns = wp.min(state.next_ns + wait, _NEVER)
+        wait = wait_ns(state.shot_rate + state.hot_rate, draw_noise(model, pixel, state)[0])
+        state.next_ns = wp.min(state.next_ns + wait, NEVER)
         return state
 
     @wp.func
-    def release(signal: Signal, time_ns: wp.float64, state: _Pixel) -> _Pixel:
+    def release(signal: Signal, time_ns: wp.float64, state: NoisyPixel) -> NoisyPixel:
         """Let the reference be the signal at a time."""
         if wp.static(stochastic):
             state.voltage = _ZERO
@@ -163,12 +129,12 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         frame: wp.int32,
         row_limit: wp.int32,
         tabulate: wp.bool,
-        state: _Pixel,
+        state: NoisyPixel,
         quiet: wp.vec2,
         table: wp.array2d[wp.int32],
         keys: wp.array[wp.int64],
         counters: wp.array[wp.int64],
-    ) -> _Pixel:
+    ) -> NoisyPixel:
         """Take a pixel over one piece of the signal, event by event."""
         now = signal.begin
         draw = wp.int64(0)
@@ -229,8 +195,11 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 if wp.static(spontaneous):  # noqa: SIM102, one of them is for the compiler
                     if noisy:
                         light = first_light + light_slope * now
-                        uniform = _spontaneous(model, pixel, state)[1]
-                        polarity = _noise_polarity(model, state, light, uniform)
+                        uniform = draw_noise(model, pixel, state)[1]
+                        if wp.static(measured):
+                            polarity = measured_polarity(model, pixel, state, light, uniform)
+                        else:
+                            polarity = noise_polarity(model, state, light, uniform)
                         if wp.static(cause):
                             is_hot = uniform * (state.shot_rate + state.hot_rate) < state.hot_rate
                             origin = wp.where(is_hot, _HOT, _SHOT)
@@ -256,6 +225,15 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 if not reset:
                     state.up += polarity
                     state.down += 1 - polarity
+                if wp.static(jitter):
+                    if not reset:
+                        state.reference = level_at(
+                            state.reference, state.up - state.fold, state.down, state.on, state.off
+                        )
+                        state.up = state.fold
+                        state.down = 0
+                    state.event_count += 1
+                    state = jittered(model, pixel, state)
                 if wp.static(refractory):  # noqa: SIM102
                     if model.refractory_ns > _ZERO:
                         state.held_ns = now + model.refractory_ns
@@ -296,21 +274,28 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         if wp.static(cause):
             column = column << wp.int64(CAUSE_BITS)
         place = (wp.int64(row) << wp.int64(row_shift)) | (column << COLUMN_SHIFT)
-        state = _Pixel()
+        state = NoisyPixel()
         state.on = model.threshold_on
         state.off = model.threshold_off
         if wp.static(spread):
             state.on = model.thresholds[pixel][0]
             state.off = model.thresholds[pixel][1]
+        state.steady = wp.vec2d(state.on, state.off)
         if wp.static(stochastic):
             state.on = state.on / model.threshold_on
             state.off = state.off / model.threshold_off
             state.voltage = before.voltage[pixel]
         state.reference = wp.float64(base[pixel])
+        if wp.static(lin_log):
+            state.reference = wp.float64(see(model, base[pixel]))
         if wp.static(resets):
             state.reference = before.reference[pixel]
         state.up = crossed[pixel][0]
         state.down = crossed[pixel][1]
+        if wp.static(jitter):
+            state.fold = state.up  # levels count from the last one crossed
+            state.event_count = before.event_count[pixel]
+            state = jittered(model, pixel, state)
         state.held_ns = -_ONE
         if wp.static(refractory):
             state.held_ns = before.held_ns[pixel]
@@ -322,7 +307,16 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         filtered = _ZERO
         if wp.static(low_pass):
             filtered = before.filtered[pixel]
+        exposure_ns = _ZERO
+        if wp.static(light_leak):
+            exposure_ns = before.exposure_ns[pixel]
         sample_before = last[pixel]
+        seen_last = wp.float64(sample_before)
+        if wp.static(lin_log):
+            seen_last = wp.float64(see(model, sample_before))
+        end_light = _ZERO
+        if wp.static(light_leak):
+            end_light = light_of(model, sample_before)
         dn_end = _ZERO
         if wp.static(stochastic):
             dn_end = _digital(model, sample_before)
@@ -338,14 +332,29 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 span_ns = wp.float64(stamps[frame + 1] - start_ns)
                 light = wp.float64(sample_before)
                 light_slope = (wp.float64(sample) - light) / span_ns
+                seen = seen_last  # as light, where the pixel sees its logarithm
+                seen_last = wp.float64(sample)
+                if wp.static(lin_log):
+                    seen_last = wp.float64(see(model, sample))
+                seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO
                 if wp.static(leak):
                     cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
+                    leak_slope = model.leak[pixel][0] * state.steady[0]
+                    if wp.static(light_leak):
+                        cycles += model.leak[pixel][0] * model.leak_growth * exposure_ns
+                        begin_light = end_light
+                        end_light = light_of(model, sample)
+                        brightness = mean_light(model, sample_before, sample, begin_light, end_light)
+                        leak_slope *= _ONE + model.leak_growth * brightness
+                        exposure_ns += brightness * span_ns
                     whole = wp.floor(cycles)
-                    leaked = (cycles - whole) * state.on
-                    leak_slope = model.leak[pixel][0] * state.on
+                    leaked = (cycles - whole) * state.steady[0]
                     if wp.int32(whole) != state.fold:
+                        if wp.static(jitter):  # a cycle is worth a threshold without jitter
+                            state.reference -= wp.float64(wp.int32(whole) - state.fold) * state.steady[0]
+                            state.up = state.up - state.fold + wp.int32(whole)
                         state.fold = wp.int32(whole)
                         quiet = range_of(state)
                 drift = _ZERO
@@ -360,7 +369,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
 
                 pieces = wp.int32(1)
                 if wp.static(low_pass):
-                    rise = wp.abs(wp.float64(sample) - light)
+                    rise = wp.max(wp.abs(wp.float64(sample) - light), wp.abs(seen_last - seen))
                     pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
                 for piece in range(pieces):
                     signal = Signal()
@@ -369,18 +378,18 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                     busy = wp.bool(True)
                     if wp.static(low_pass):
                         length_ns = signal.end - signal.begin
-                        light_begin = light + light_slope * signal.begin
-                        middle = light_begin + light_slope * length_ns / _TWO
+                        seen_begin = seen + seen_slope * signal.begin
+                        middle = light + light_slope * signal.begin + light_slope * length_ns / _TWO
                         share = (wp.exp(middle) + model.dark_radiance) / (
                             model.white_radiance + model.dark_radiance
                         )
                         signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
-                        decay = filtered - light_begin + light_slope * signal.tau
+                        decay = filtered - seen_begin + seen_slope * signal.tau
                         gain = wp.exp(-length_ns / signal.tau) - _ONE
                         signal.start = filtered + leaked + leak_slope * signal.begin
-                        signal.slope = light_slope + leak_slope
+                        signal.slope = seen_slope + leak_slope
                         signal.decay = decay
-                        filtered += light_slope * length_ns + decay * gain
+                        filtered += seen_slope * length_ns + decay * gain
                         signal.last = filtered + leaked + leak_slope * signal.end
                         steepness = signal.slope - decay / signal.tau
                         turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
@@ -390,8 +399,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                         if wp.static(spontaneous):
                             busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
                     elif wp.static(not stochastic):
-                        signal.start = light + leaked
-                        signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
+                        signal.start = seen + leaked
+                        signal.last = seen_last + leaked + leak_slope * span_ns
                         busy = reached(signal.last, quiet) >= 0
                         if wp.static(refractory):
                             busy = busy or state.held_ns >= _ZERO
@@ -436,8 +445,12 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             crossed_out[pixel] = wp.vec2i(state.up, state.down)
             if wp.static(resets):
                 after.reference[pixel] = state.reference
+            if wp.static(jitter):
+                after.event_count[pixel] = state.event_count
             if wp.static(low_pass):
                 after.filtered[pixel] = filtered
+            if wp.static(light_leak):
+                after.exposure_ns[pixel] = exposure_ns
             if wp.static(refractory):
                 after.held_ns[pixel] = state.held_ns
             if wp.static(spontaneous):
@@ -452,34 +465,3 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
 
     return scan_pixel
-
-
-@wp.func
-def begin_pixel(
-    model: PixelModel,
-    phase_stream: wp.uint32,
-    random_phase: wp.bool,
-    base: wp.array[wp.float32],
-    pixel: wp.int32,
-    memory_out: Memory,
-) -> None:
-    """Let a pixel begin anew at what it sees now."""
-    value = wp.float64(base[pixel])
-    if memory_out.reference.shape[0] > 0:
-        memory_out.reference[pixel] = value
-    if memory_out.filtered.shape[0] > 0:
-        memory_out.filtered[pixel] = value
-    if memory_out.held_ns.shape[0] > 0:
-        memory_out.held_ns[pixel] = -_ONE
-    if memory_out.next_ns.shape[0] > 0:
-        state = _Pixel()
-        rate = model.rates[pixel][0] + model.rates[pixel][1]
-        memory_out.next_ns[pixel] = _wait_ns(rate, _spontaneous(model, pixel, state)[0])
-        memory_out.noise_count[pixel] = 0
-    if memory_out.voltage.shape[0] > 0:
-        voltage = _ZERO
-        if random_phase:
-            voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
-            if model.thresholds.shape[0] > 0:
-                voltage *= model.thresholds[pixel][0] / model.threshold_on
-        memory_out.voltage[pixel] = voltage

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,assignment"
+# mypy: disable-error-code="call-overload,untyped-decorator,assignment,return-value"
 """The arbiter that reads events out of the pixels: a queue with one server.
 
 `event`: events are read in the order in which they come, and the bus is busy for 1 / bandwidth with each. An
@@ -8,8 +8,11 @@ event is stamped when its transfer begins, so an idle bus changes no stamp.
 `row`: rows wait in the order of their oldest event. The first is latched when the bus is free: all its events
 that have come until then get that stamp, and the bus is busy for row_s + n / bandwidth.
 
-At most `queue_length` events wait; one that finds the queue full is lost. A pixel does not wait for its event
-to be read: its refractory time begins at the crossing.
+At most `queue_length` events wait; one that finds the queue full is lost. With a handshake a pixel is in
+reset until its event is read, and what it would have fired meanwhile is lost; its next level counts from the
+last all the same. Without, a pixel does not wait. A refractory time begins at the crossing.
+
+Stamps may be late, by a normal number for each event that is at least 0.
 
 It is a sequence by its nature, so one thread of the CPU does it, also for a camera on a GPU, where one thread
 takes half a microsecond for each event: keys come sorted by time to the nanosecond, then row, column and
@@ -27,9 +30,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
+from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.runtime.cuda import Fence
 from neurosim_core.sensors.event_config import ReadoutConfig
 from neurosim_core.sensors.event_levels import SUB_BITS
+from neurosim_core.sensors.event_noise import mix_seed
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,6 +45,8 @@ _SUB_MASK = wp.constant(wp.int64(1023))
 _SUB_SHIFT = wp.constant(wp.int64(SUB_BITS - 1))
 _US = wp.constant(wp.int64(NS_PER_US))
 _ONE = wp.constant(wp.int64(1))
+_WAITS = wp.constant(wp.int64(2**62))
+"""An event of the pixel waits, nobody knows how long."""
 
 # places in `counters`: events read, events that wait, events lost; first row that waits, rows that wait;
 # first free place for an event
@@ -61,8 +68,15 @@ class _Bus:
     queue_length: wp.int32
     row_shift: wp.int32
     time_shift: wp.int32
+    latency_ticks: wp.float64
+    jitter_ticks: wp.float64
+    seed: wp.uint64
+    stream: wp.uint32
+    pixel_shift: wp.int32
     free: wp.array[wp.int64]
     """When the bus is free, shape [1]."""
+    ready: wp.array[wp.int64]
+    """With a handshake: when the event of a pixel is read, shape [pixel]; else empty."""
     # by rows only
     place: wp.array[wp.int64]
     """Row, column and polarity of events that wait, shape [queue_length]."""
@@ -86,6 +100,30 @@ def _key_at(ticks: wp.int64, origin_ns: wp.int64, place: wp.int64, time_shift: w
         up_ns += _ONE
     time_us = down_ns // _US
     return (time_us << wp.int64(time_shift)) | place | (up_ns - time_us * _US)
+
+
+@wp.func
+def _stamped(bus: _Bus, ticks: wp.int64, place: wp.int64) -> wp.int64:
+    """Return when an event is stamped that is read at a time."""
+    if bus.latency_ticks == wp.float64(0.0) and bus.jitter_ticks == wp.float64(0.0):
+        return ticks
+    normal = normal2(random_bits(bus.seed, bus.stream, ticks, wp.int32(place >> wp.int64(SUB_BITS - 1))))
+    late = bus.latency_ticks + bus.jitter_ticks * normal[0]
+    return ticks + wp.int64(wp.max(late, wp.float64(0.0)))
+
+
+@wp.func
+def _in_reset(bus: _Bus, came: wp.int64, place: wp.int64) -> wp.bool:
+    """Return whether the pixel of an event still waits for another to be read."""
+    if bus.ready.shape[0] == 0:
+        return False
+    return came < bus.ready[wp.int32(place >> wp.int64(bus.pixel_shift))]
+
+
+@wp.func
+def _set_ready(bus: _Bus, ticks: wp.int64, place: wp.int64) -> None:
+    if bus.ready.shape[0] > 0:
+        bus.ready[wp.int32(place >> wp.int64(bus.pixel_shift))] = ticks
 
 
 @wp.kernel
@@ -156,14 +194,16 @@ def _read_events(
         waiting = wp.int64(0)
         if free > came:  # those that begin later, one every event_ticks, the last at free - event_ticks
             waiting = (free - came + bus.event_ticks - _ONE) // bus.event_ticks - _ONE
-        if waiting >= wp.int64(bus.queue_length):
+        place = _place(key, bus.time_shift)
+        if waiting >= wp.int64(bus.queue_length) or _in_reset(bus, came, place):
             dropped_ns_out[dropped] = arrival_ns
             dropped += 1
         else:
             begin = wp.max(free, came)
             free = begin + bus.event_ticks
+            _set_ready(bus, begin, place)
             keys_out[first_out + read] = _key_at(
-                begin, origin_ns, _place(key, bus.time_shift), bus.time_shift
+                _stamped(bus, begin, place), origin_ns, place, bus.time_shift
             )
             read += 1
     bus.free[0] = free
@@ -189,7 +229,9 @@ def _serve(
         node = bus.head[row]
         count = wp.int32(0)
         while node >= 0:
-            keys_out[first_out + counters[_READ]] = _key_at(begin, origin_ns, bus.place[node], bus.time_shift)
+            stamp = _stamped(bus, begin, bus.place[node])
+            keys_out[first_out + counters[_READ]] = _key_at(stamp, origin_ns, bus.place[node], bus.time_shift)
+            _set_ready(bus, begin, bus.place[node])
             counters[_READ] = counters[_READ] + 1
             following = bus.following[node]
             bus.following[node] = counters[_FREE_NODE]
@@ -226,11 +268,12 @@ def _read_rows(
         arrival_ns = _arrival_ns(key, bus.time_shift)
         came = (arrival_ns + origin_ns) << _TICK_BITS
         _serve(bus, came, origin_ns, first_out, keys_out, counters)
-        if counters[_WAITING] >= bus.queue_length:
+        place = _place(key, bus.time_shift)
+        if counters[_WAITING] >= bus.queue_length or _in_reset(bus, came, place):
             dropped_ns_out[counters[_DROPPED]] = arrival_ns
             counters[_DROPPED] = counters[_DROPPED] + 1
         else:
-            place = _place(key, bus.time_shift)
+            _set_ready(bus, _WAITS, place)
             row = wp.int32(place >> wp.int64(bus.row_shift))
             node = counters[_FREE_NODE]
             counters[_FREE_NODE] = bus.following[node]
@@ -257,14 +300,26 @@ class Readout:
         height: Rows of the sensor [px].
         row_shift: Bits of a key below its row.
         time_shift: Bits of a key below its microseconds.
+        pixel_shift: Bits of a key below its column, without what is not of the place of the pixel.
         device: Where the keys are.
+        seed: Seed of the run, for late stamps.
+        sensor: Name of the camera, likewise.
 
     Attributes:
         waiting_count: Events that wait now.
     """
 
     def __init__(
-        self, config: ReadoutConfig, *, height: int, row_shift: int, time_shift: int, device: Any
+        self,
+        config: ReadoutConfig,
+        *,
+        height: int,
+        row_shift: int,
+        time_shift: int,
+        pixel_shift: int,
+        device: Any,
+        seed: int,
+        sensor: str,
     ) -> None:
         self._rowwise = config.kind == "row"
         self._device = wp.get_device(device)
@@ -275,7 +330,13 @@ class Readout:
         bus.queue_length = config.queue_length
         bus.row_shift = row_shift
         bus.time_shift = time_shift
+        bus.latency_ticks = config.latency_s * 1e9 * _TICKS_PER_NS
+        bus.jitter_ticks = config.jitter_s * 1e9 * _TICKS_PER_NS
+        self._seed, bus.stream = seed, stream_id(f"{sensor}/events/late")
+        bus.pixel_shift = pixel_shift
         bus.free = wp.zeros(1, dtype=wp.int64, device="cpu")
+        pixels = height << (row_shift - pixel_shift) if config.handshake else 0
+        bus.ready = wp.zeros(pixels, dtype=wp.int64, device="cpu")
         places = config.queue_length if self._rowwise else 0
         rows = height if self._rowwise else 0
         bus.place = wp.empty(places, dtype=wp.int64, device="cpu")
@@ -295,7 +356,9 @@ class Readout:
     def reset(self, stamp_ns: int) -> None:
         """Forget all events and be free from a stamp on [ns]."""
         self._reset_ns = stamp_ns
+        self._bus.seed = mix_seed(self._seed, stamp_ns)
         self._bus.free.zero_()
+        self._bus.ready.zero_()
         self._counters.zero_()
         self._bus.head.fill_(-1)
         if self._rowwise:

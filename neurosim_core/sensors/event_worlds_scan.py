@@ -19,7 +19,8 @@ import warp as wp
 from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_cut import take_apart
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_scan import begin_pixel, make_pixel_scan
+from neurosim_core.sensors.event_noise_pixel import begin_pixel
+from neurosim_core.sensors.event_noise_scan import make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
     CLOSE,

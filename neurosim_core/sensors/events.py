@@ -154,7 +154,10 @@ class EventCamera:
                 height=height,
                 row_shift=self._row_shift,
                 time_shift=self._time_shift,
+                pixel_shift=SUB_BITS + (CAUSE_BITS if CAUSE in pixel_terms else 0),
                 device=self.device,
+                seed=seed,
+                sensor=sensor,
             )
         wp.load_module(event_cut, device=self.device)
 

@@ -22,6 +22,7 @@ from neurosim_core.sim.rollout import (
     skip_batch,
     start,
     step,
+    warm_flight,
     warm_up,
 )
 from neurosim_core.sim.simulation import Simulation
@@ -61,5 +62,6 @@ __all__ = [
     "skip_batch",
     "start",
     "step",
+    "warm_flight",
     "warm_up",
 ]

@@ -7,6 +7,7 @@ import functools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -64,6 +65,7 @@ def make_model(
     *,
     scene: Scene | None = None,
     on_phase: Callable[[str], None] | None = None,
+    meanwhile: Callable[[Model], None] | None = None,
 ) -> Model:
     """Load or generate the scene, plan the path and decide what has to be computed.
 
@@ -71,6 +73,7 @@ def make_model(
         config: What to fly; one vehicle.
         scene: Where to fly, in place of what `config` says; None: as it says.
         on_phase: Told the name of each part of the work when it begins.
+        meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`).
 
     Raises:
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
@@ -80,7 +83,7 @@ def make_model(
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
         )
-    return next(iter(make_fleet(config, scene=scene, on_phase=on_phase).values()))
+    return next(iter(make_fleet(config, scene=scene, on_phase=on_phase, meanwhile=meanwhile).values()))
 
 
 def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
@@ -111,6 +114,7 @@ def make_fleet(
     *,
     scene: Scene | None = None,
     on_phase: Callable[[str], None] | None = None,
+    meanwhile: Callable[[Model], None] | None = None,
 ) -> dict[str, Model]:
     """Return a model for each vehicle by name; they share the scene, its free space and its light.
 
@@ -129,20 +133,28 @@ def make_fleet(
         seeing = any(plan_render_groups(member.sensors) for member in members.values())
         scene = config.scene.load(pictures=seeing) if scene is None else scene
         bodies = make_bodies(config.bodies) if seeing else ()
-    with phase("free space"):
-        free_space = make_free_space(scene, config.free_space, device=device)
-    with phase("path"):
-        paths = {name: _plan(member, free_space) for name, member in members.items()}
-    with phase("light"):
-        scene_on_device = (
-            upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
-            if seeing
-            else None
+    with ThreadPoolExecutor(max_workers=1) as aside:  # light needs no path: both at once
+        light = functools.partial(
+            upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
         )
-    return {
-        name: _make_member(member, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s)
-        for name, member in members.items()
-    }
+        lit = aside.submit(light) if seeing else None
+        with phase("free space"):
+            free_space = make_free_space(scene, config.free_space, device=device)
+        with phase("path"):
+            paths = {name: _plan(member, free_space) for name, member in members.items()}
+
+        def model_of(name: str, config: SimulationConfig, scene_on_device: Any) -> Model:
+            return _make_member(
+                config, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s
+            )
+
+        with phase("light"):
+            if meanwhile is not None and lit is not None:
+                name, first = next(iter(members.items()))
+                blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
+                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None))
+            scene_on_device = None if lit is None else lit.result()
+    return {name: model_of(name, config, scene_on_device) for name, config in members.items()}
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:

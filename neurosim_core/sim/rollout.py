@@ -44,7 +44,8 @@ def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = N
     Raises:
         DynamicsError: The integration failed; all packets before its stamp have been yielded.
     """
-    model = make_model(config if isinstance(config, SimulationConfig) else load_config(config))
+    config = config if isinstance(config, SimulationConfig) else load_config(config)
+    model = make_model(config, meanwhile=warm_flight)
     yield from run_model(model, make_state(model))
 
 
@@ -150,6 +151,16 @@ def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
 def warm_up(model: Model) -> None:
     """Compile and load the kernels of all sensors: fly one control period of an episode that nobody sees."""
     step(model, make_state(model), None)
+
+
+def warm_flight(model: Model) -> None:
+    """Compile and load the kernels of motion and control: fly one control period without cameras.
+
+    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device.
+    """
+    state = make_state(model, in_flight=1)
+    start(model, state)
+    advance(model, state, batch_end_ns(model.schedule, 0, _period_end_ns(model, state)))
 
 
 def integrate_period(

@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from neurosim_core.config import load_config
-from neurosim_core.packets import Events, Image, Odometry, join_events
+from neurosim_core.packets import Events, Image, Odometry
 from neurosim_core.record import Recording
 from neurosim_core.scene.scene import Scene
 from neurosim_core.view.pictures import event_picture
@@ -21,7 +21,7 @@ from neurosim_core.view.plan import cut_plan
 SUFFIXES = (".webp", ".gif")
 _HEIGHT_PX = 220
 _GAP_PX = 6
-_EVENT_WINDOW_US = 20_000
+_EVENT_WINDOW_S = 0.02
 _PATH_SRGB = (240, 110, 20)
 
 
@@ -38,48 +38,35 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
         OSError: The file cannot be written.
     """
     with Recording(recorded) as flight:
-        packets = list(flight.packets())
         scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()
-    pictures = [p for p in packets if isinstance(p, Image) and p.data.ndim == 3]
-    if not pictures:
-        raise ValueError(
-            f"a film needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
-        )
-    pictures = [p for p in pictures if p.sensor == pictures[0].sensor]
-    events = [p for p in packets if isinstance(p, Events)]
-    poses = [p for p in packets if isinstance(p, Odometry)]
-    pose_stamps_ns = [p.stamp_ns for p in poses]
-    way = _Way(scene, np.array([pose.position for pose in poses]).reshape(-1, 3))
-    last_ns = pictures[-1].stamp_ns
-    frames = []
-    for stamp_ns in np.arange(0, last_ns + 1, round(1e9 / rate_hz)):
-        picture = min(pictures, key=lambda p: abs(p.stamp_ns - int(stamp_ns)))
-        panels = [_scaled(picture.data), *_seen(events, int(stamp_ns))]
-        if poses:
-            panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
-        frames.append(_beside(panels))
+        first = {name: next(flight.packets(name), None) for name in flight.sensors}
+        colored = [name for name, p in first.items() if isinstance(p, Image) and p.data.ndim == 3]
+        if not colored:
+            raise ValueError(
+                f"a film needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
+            )
+        pictures = list(flight.packets(colored[0]))
+        events = next((p for p in first.values() if isinstance(p, Events)), None)
+        tracked = [name for name, p in first.items() if isinstance(p, Odometry)]
+        poses = [p for p in (flight.packets(*tracked) if tracked else ()) if isinstance(p, Odometry)]
+        pose_stamps_ns = [p.stamp_ns for p in poses]
+        way = _Way(scene, np.array([pose.position for pose in poses]).reshape(-1, 3))
+        frames = []
+        for stamp_ns in range(0, pictures[-1].stamp_ns + 1, round(1e9 / rate_hz)):
+            picture = min(pictures, key=lambda p: abs(p.stamp_ns - stamp_ns))
+            assert isinstance(picture, Image)
+            panels = [_scaled(picture.data)]
+            if events is not None:
+                end_s = (stamp_ns // 1000 + 1) * 1e-6
+                window = flight.events(events.sensor, end_s - _EVENT_WINDOW_S, end_s)
+                panels.append(_scaled(event_picture(window, width=events.width, height=events.height)))
+            if poses:
+                panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
+            frames.append(_beside(panels))
     options: dict[str, Any] = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
     frames[0].save(
         out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
     )
-
-
-def _seen(events: list[Events], stamp_ns: int) -> list[Pillow.Image]:
-    """Return the events of the window that ends at a stamp, if there is an event camera."""
-    if not events:
-        return []
-    first = events[0]
-    low_us = stamp_ns // 1000 - _EVENT_WINDOW_US
-    near = [
-        p
-        for p in events
-        if p.sensor == first.sensor and p.stamp_ns // 1000 > low_us and p.start_ns <= stamp_ns
-    ]
-    if not near:
-        return [_scaled(np.full((first.height, first.width, 3), 255, np.uint8))]
-    window = join_events([p.numpy() for p in near])
-    window = window.rows((window.t > low_us) & (window.t <= stamp_ns // 1000))
-    return [_scaled(event_picture(window, width=first.width, height=first.height))]
 
 
 def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:

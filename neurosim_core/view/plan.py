@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
-from trimesh.intersections import mesh_plane
 
 from neurosim_core.scene.materials import mip_chain, srgb_to_linear
 from neurosim_core.scene.scene import Scene
@@ -43,8 +41,7 @@ def cut_plan(scene: Scene, *, height_m: float) -> Plan:
     """
     corners = scene.vertices[scene.faces].astype(np.float64)
     floor_m = float(corners[:, :, 2].min())
-    mesh = trimesh.Trimesh(scene.vertices, scene.faces, process=False)
-    outlines = _slice(mesh, height_m)
+    outlines = _slice(scene, height_m)
     normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
     below = (corners[:, :, 2].max(axis=1) < height_m) & (np.abs(normal_z) > 1e-9)
     faces = np.flatnonzero(below)
@@ -56,16 +53,20 @@ def cut_plan(scene: Scene, *, height_m: float) -> Plan:
     return Plan(
         height_m=height_m,
         outlines=outlines,
-        low_outlines=_slice(mesh, floor_m + 0.3 * (height_m - floor_m)),
+        low_outlines=_slice(scene, floor_m + 0.3 * (height_m - floor_m)),
         triangles=triangles,
         colors=face_colors(scene, faces),
         bounds=np.stack([shown.min(axis=0), shown.max(axis=0)]),
     )
 
 
-def _slice(mesh: trimesh.Trimesh, height_m: float) -> NDArray[np.float64]:
-    """Return where the plane z = height_m cuts a mesh: segments of two points (x, y), shape [n, 2, 2]."""
+def _slice(scene: Scene, height_m: float) -> NDArray[np.float64]:
+    """Return where the plane z = height_m cuts a scene: segments of two points (x, y), shape [n, 2, 2]."""
+    import trimesh  # takes a third of a second
+    from trimesh.intersections import mesh_plane
+
     slice_mesh: Any = mesh_plane  # trimesh has no annotations
+    mesh = trimesh.Trimesh(scene.vertices, scene.faces, process=False)
     segments: NDArray[np.float64] = slice_mesh(mesh, (0.0, 0.0, 1.0), (0.0, 0.0, height_m))
     return segments.reshape(-1, 2, 3)[..., :2]
 

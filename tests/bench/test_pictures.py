@@ -35,11 +35,14 @@ def test_events_in_time_and_space():
     for row in in_time:  # found = reference - missing + spurious
         balance = row["events more or fewer [%]"] + row["missing [%]"] - row["spurious [%]"]
         assert balance == pytest.approx(0.0, abs=1e-9)
-    assert len(in_space) == 9
-    for floor, one, eight in zip(in_space[::3], in_space[1::3], in_space[2::3], strict=True):
+    assert len(in_space) == 12
+    for begin in range(0, 12, 4):
+        floor, one, eight, default = in_space[begin : begin + 4]
         assert "pattern" in floor["rays per pixel"]
+        assert default["rays per pixel"] == "adaptive (default)"
         shares = [row["spurious, 20 ms [%]"] + row["missed, 20 ms [%]"] for row in (floor, eight, one)]
         assert shares == sorted(shares)
+        assert default["spurious, 20 ms [%]"] < one["spurious, 20 ms [%]"]
         assert one["spurious, 1 ms [%]"] >= one["spurious, 5 ms [%]"] >= one["spurious, 20 ms [%]"]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from neurosim_core.bench import pixel, pixel_noise
 from neurosim_core.bench.options import Options
-from neurosim_core.bench.pixel_bench import TestBench, make_pixel, rates_hz
+from neurosim_core.bench.pixel_bench import TestBench, make_pixel, make_preset, rates_hz
 
 BENCH = TestBench(device="cpu", quick=True)
 
@@ -25,7 +25,9 @@ def test_the_chapter_meets_its_claims():
     assert [claim.text for claim in chapter.claims if not claim.met] == []
     presets = {row["preset"]: row for row in chapter.tables[0].rows}
     assert presets["v2e_noisy"]["C on"] == pytest.approx(0.2, rel=0.02)
-    assert len(chapter.plots[0].panels) == len({row["pattern"] for row in chapter.tables[1].rows})
+    tables = {table.name: table.rows for table in chapter.tables}
+    assert len(chapter.plots[0].panels) == len({row["pattern"] for row in tables["pixel-deviations"]})
+    assert {row["light [lux]"] for row in tables["pixel-noise"]} == {0.1, 161.0, 1000.0, 3000.0}
 
 
 @pytest.mark.parametrize(
@@ -42,6 +44,13 @@ def test_a_planted_fault_is_seen(module, pattern, fault, monkeypatch):
     assert all(verdicts(pattern(BENCH)))
     monkeypatch.setattr(module, "make_pixel", lambda **settings: make_pixel(**{**settings, **fault}))
     assert not all(verdicts(pattern(BENCH)))
+
+
+def test_noise_that_its_source_does_not_have_is_seen(monkeypatch):
+    assert all(row["within"] for row in pixel_noise.measure_noise_figures(BENCH))
+    plain = make_preset("gen3", shot_noise={"rate_hz": 5.0}, readout=None)
+    monkeypatch.setattr(pixel_noise, "make_preset", lambda *_, **__: plain)
+    assert not all(row["within"] for row in pixel_noise.measure_noise_figures(BENCH))
 
 
 def test_rates_are_from_the_first_to_the_last_event_of_a_pixel():

@@ -229,9 +229,7 @@ def test_a_flood_of_events_neither_stalls_nor_grows_and_is_accounted_for(ros, st
             longest_s = max(longest_s, time.monotonic() - begin_s)
             peak = bridge.resident_bytes if n else 0
         wait_for(lambda: accounted(health, packets))
-        found = diagnostics(health)["/drone/events -> /drone/events"]
-        assert int(found["sent"]) + int(found["lost"]) == packets
-        assert int(found["refused"]) == 0
+        assert int(diagnostics(health)["/drone/events -> /drone/events"]["refused"]) == 0
         assert longest_s < STALL_S
         assert max(peak, bridge.resident_bytes) < 700_000_000  # 128 packets of 1.3 MB may wait
         sent.publish(packet(packets))
@@ -239,8 +237,10 @@ def test_a_flood_of_events_neither_stalls_nor_grows_and_is_accounted_for(ros, st
 
 
 def accounted(health: Listener, count: int) -> bool:
+    """Return whether all packets were received, and each was sent or lost: the last one may be on its way."""
     values = diagnostics(health).get("/drone/events -> /drone/events", {})
-    return values.get("received") == str(count)
+    received, sent, lost = (int(values.get(name, 0)) for name in ("received", "sent", "lost"))
+    return received == sent + lost == count
 
 
 def test_noise_on_a_command_topic_is_refused_and_the_next_command_flies(ros, start):

@@ -279,7 +279,7 @@ def test_the_summary_says_what_the_pixels_are(tmp_path, capsys):
     for preset, said in (
         (
             "davis346",
-            "davis346, thresholds 0.1337 on, 0.2029 off, threshold_spread, leak, readout, dark floor",
+            "davis346, thresholds 0.1337 on, 0.2029 off, threshold_spread, leak, measured_noise, readout",
         ),
         ("voltmeter_dvs346", "voltmeter_dvs346, steps of about 0.19, stochastic, dark floor"),
     ):
@@ -348,7 +348,7 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
         ),
         (
             ["--set", "pixel.leak.rate=1"],
-            "pixel.leak.rate: unknown key; did you mean 'rate_hz'? known: rate_hz",
+            "pixel.leak.rate: unknown key; did you mean 'rate_hz'? known: bright_factor",
         ),
         (["--set", "pixel.leak=1"], "pixel.leak: must be keys with values, such as {rate_hz: 0.1"),
         (["--transfer", "log"], "neurosim: transfer: must be one of auto, srgb"),

@@ -157,7 +157,7 @@ def test_first_rays():
 
 
 def test_settings():
-    assert RenderConfig().samples_per_pixel == 1
+    assert RenderConfig().samples_per_pixel == "adaptive"
     for bad in ("all", 0, 65):
         with pytest.raises(ValueError, match="samples_per_pixel"):
             RenderConfig(samples_per_pixel=bad)

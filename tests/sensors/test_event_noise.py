@@ -107,6 +107,7 @@ def test_what_is_off_is_not_there(device):
         ("spread", "refractory", "leak", "spontaneous"),
         ("low_pass",),
         ("spread", "refractory", "leak", "spontaneous", "low_pass"),
+        ("lin_log", "leak", "light_leak", "spontaneous", "measured"),
     ],
 )
 def test_terms_with_zero_coefficients_change_no_bit(terms, device):
@@ -161,6 +162,31 @@ def test_thresholds_are_normal_and_stay(device):
     for seed, sensor in ((6, "a"), (5, "b")):
         other = feed(make_camera(128, 128, device, seed=seed, sensor=sensor, **config), frames, [0, S])
         assert abs(np.corrcoef(measured[0], first_event_s(other, 128**2, 128))[0, 1]) < 4.9 / 128
+
+
+def test_thresholds_that_are_drawn_for_each_event(device):
+    """On a ramp the intervals of a pixel are independent normal numbers over the slope, up and down."""
+    jitter = {"sigma_on": 0.02, "sigma_off": 0.01, "minimum": 0.05}
+    for sign, mean, sigma in ((1.0, 0.2, 0.02), (-1.0, 0.15, 0.01)):
+        camera = make_camera(40, 30, device, threshold_jitter=jitter, threshold_off=0.15)
+        frames = np.stack([np.zeros((30, 40)), np.full((30, 40), sign * 20.0)])
+        found = feed(camera, frames, [0, 20 * S])  # 1 / s
+        steps = 1e-6 * intervals_us(found, 40)
+        assert len(steps) > 100_000
+        worst = stats.kstest(steps, stats.norm(mean, sigma).cdf).statistic  # ends are cut off: 1 of 100
+        assert worst < 0.01 + stats.kstwobign.isf(ALARM) / math.sqrt(len(steps))
+        mine = np.diff(of_pixel(found, 7, 5).t)
+        assert abs(np.corrcoef(mine[1:], mine[:-1])[0, 1]) < 5.0 / math.sqrt(len(mine))
+
+
+def test_jitter_leaks_as_thresholds_without(device):
+    """The leak is that of the own threshold: intervals have its mean, and the spread of the jitter."""
+    jitter = {"sigma_on": 0.02, "sigma_off": 0.02, "minimum": 0.05}
+    leak = {"rate_hz": 2.0, "spread_decades": 0.0}
+    found = still(make_camera(40, 30, device, threshold_jitter=jitter, leak=leak), 0.0, [0, 7 * S, 40 * S])
+    steps = 1e-6 * intervals_us(found, 40)
+    assert steps.mean() == pytest.approx(0.5, rel=0.003)
+    assert steps.std() == pytest.approx(0.05, rel=0.03)
 
 
 def test_thresholds_are_clipped_to_their_minimum(device):
@@ -379,6 +405,21 @@ def test_leak_keeps_time_for_days(device):
         np.testing.assert_allclose(np.diff(mine.t[-8:]), 1e6, atol=5.0)
 
 
+def test_leak_that_grows_with_light(device):
+    """It fires at rate (1 + (factor - 1) I), and on a ramp of log light what has leaked is the integral."""
+    leak = {"rate_hz": 1.0, "bright_factor": 5.0, "spread_decades": 0.0}
+    for light in (0.0, 0.25, 1.0, 3.0):
+        found = still(make_camera(3, 1, device, leak=leak), math.log(max(light, 1e-9)), [0, 3 * S, 20 * S])
+        for col in range(3):
+            np.testing.assert_allclose(np.diff(of_pixel(found, col).t), 1e6 / (1.0 + 4.0 * light), atol=5.0)
+    # log light from -3 to 0 in 3 s: 3 / 0.2 levels, and 3 + 4 (1 - exp(-3)) cycles, of a frame or of many
+    for count in (1, 30):
+        frames = np.repeat(np.linspace(-3.0, 0.0, count + 1)[:, None, None], 50, axis=2)
+        found = feed(make_camera(50, 1, device, leak=leak), frames, np.linspace(0, 3 * S, count + 1))
+        events = len(found.t) / 50.0
+        assert events == pytest.approx(15.0 + 3.0 + 4.0 * (1.0 - math.exp(-3.0)), abs=0.5)
+
+
 # ---- shot noise and hot pixels
 
 
@@ -397,6 +438,75 @@ def test_shot_noise_is_poisson_and_falls_with_light(light, factor, device):
     on_low, on_high = stats.binom(len(found.t), 0.3).interval(1.0 - ALARM)
     assert on_low <= found.polarity.sum() <= on_high
     assert stats.kstest(found.t / (duration_s * 1e6), stats.uniform.cdf).pvalue > ALARM
+
+
+LEVELS = [
+    {"lux": 1.0, "on_hz": 6.0, "off_hz": 3.0, "spread_decades": 0.0},
+    {"lux": 100.0, "on_hz": 2.0, "off_hz": 0.0, "spread_decades": 0.0},
+    {"lux": 1000.0, "on_hz": 4.0, "off_hz": 0.0, "spread_decades": 0.0},
+]
+
+
+@pytest.mark.parametrize(
+    ("lux", "on_hz", "off_hz"),
+    [
+        (0.01, 6.0, 3.0),
+        (1.0, 6.0, 3.0),
+        (10.0, 4.0, 1.5),
+        (100.0, 2.0, 0.0),
+        (316.2278, 3.0, 0.0),
+        (1e5, 4.0, 0.0),
+    ],
+)
+def test_measured_noise_is_linear_in_log_light(lux, on_hz, off_hz, device):
+    noise = {"white_lux": 500.0, "levels": LEVELS}
+    camera = make_camera(96, 64, device, seed=4, measured_noise=noise)
+    found = still(camera, math.log(lux / 500.0), [0, S // 3, 2 * S])
+    pixels = 96 * 64
+    assert_poisson(int(found.polarity.sum()), 2.0 * on_hz * pixels, resolves=0.05)
+    if off_hz:
+        assert_poisson(int((found.polarity == 0).sum()), 2.0 * off_hz * pixels, resolves=0.05)
+    else:
+        assert found.polarity.all()
+
+
+def test_measured_noise_of_a_table_is_that_of_its_pixels(device, tmp_path):
+    """Each pixel does what some measured pixel did, in all lights: one in four fires in the dark alone."""
+    lux, on = np.array([1.0, 100.0]), np.array([[40.0, 0.0, 10.0, 0.0], [0.0, 0.0, 20.0, 0.0]])
+    np.savez(tmp_path / "noise.npz", lux=lux, on_hz=on, off_hz=on / 2.0)
+    noise = {"white_lux": 100.0, "file": tmp_path / "noise.npz"}
+    camera = make_camera(64, 64, device, seed=5, measured_noise=noise)
+    counts = []
+    for light in (0.01, 1.0):
+        found = still(camera, math.log(light), [0, 4 * S])
+        counts.append(np.bincount(found.y.astype(int) * 64 + found.x, minlength=64 * 64))
+    dark, bright = counts
+    low, high = stats.binom(64 * 64, 0.25).interval(1.0 - ALARM)
+    loud, medium = dark > 150, (dark > 20) & (dark <= 150)  # Poisson of 240, of 60
+    assert low <= loud.sum() <= high
+    assert low <= medium.sum() <= high
+    assert not bright[loud].any()
+    assert_poisson(int(bright[medium].sum()), 120.0 * medium.sum(), resolves=0.05)
+    assert not dark[~loud & ~medium].any()
+    assert camera.terms == ("spontaneous", "measured")
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ({}, "give levels or file"),
+        ({"levels": LEVELS[::-1]}, "from dark to bright"),
+        ({"levels": LEVELS, "file": "x.npz"}, "give levels or file"),
+    ],
+)
+def test_measured_noise_that_is_not_one_is_refused(noise, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        EventCameraConfig(measured_noise=noise)
+    with pytest.raises(ValueError, match="not both"):
+        EventCameraConfig(measured_noise={"levels": LEVELS}, shot_noise={})
+    np.savez(tmp_path / "noise.npz", lux=[1.0], on_hz=[1.0], off_hz=[1.0])
+    with pytest.raises(ValueError, match="must hold lux"):
+        make_camera(4, 4, "cpu", measured_noise={"file": tmp_path / "noise.npz"})
 
 
 def test_waiting_times_of_noise_are_exponential(device):
@@ -558,7 +668,17 @@ def test_voltmeter_random_phase(device):
 
 @pytest.mark.parametrize(
     "config",
-    [NOISY, {**NOISY, "low_pass": {"cutoff_hz": 80.0}}, {"preset": "voltmeter_dvs240", "refractory_s": 1e-3}],
+    [
+        NOISY,
+        {**NOISY, "low_pass": {"cutoff_hz": 80.0}},
+        {"preset": "voltmeter_dvs240", "refractory_s": 1e-3},
+        {
+            "threshold_jitter": {},
+            "lin_log": {"linear_below": 60.0},
+            "leak": {"rate_hz": 500.0, "bright_factor": 3.0},
+            "measured_noise": {"levels": [{"lux": 500.0, "on_hz": 90.0, "off_hz": 40.0}]},
+        },
+    ],
 )
 def test_split_into_calls_does_not_change_a_bit(config, device):
     """One stack, single frames, and stacks under way together: the same packets."""

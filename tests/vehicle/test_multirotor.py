@@ -257,6 +257,7 @@ def test_terms_that_are_not_needed_are_left_out(device):
     assert Multirotor(preset("hummingbird"), device=device).terms == (
         "motor_lag", "rotor_drag", "translational_lift", "parasitic_drag",
     )  # fmt: skip
+    assert preset("crazyflie").terms() == preset("hummingbird").terms()  # one set of kernels
     assert Multirotor(preset("racer", motor_time_constant_s=0.0), device=device).terms == ()
 
 

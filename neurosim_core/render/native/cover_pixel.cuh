@@ -14,21 +14,12 @@ for (int layer = 0; layer < layer_count; ++layer) {
     if (number[layer][0] == 0.0f) continue;
     const wp::vec3 toward = center + middle[0][layer][0] * across + middle[1][layer][0] * down;
     const int part = part_of(layer, *wp::address(faces, instant, row, col), toward);
-    const int* index = &mesh.indices[3 * (size_t)part];
-    float function[3][3], corner[3];
-    const float volume = functions_of(mesh.points[index[0]] - origin, mesh.points[index[1]] - origin,
-                                      mesh.points[index[2]] - origin, function);
-    for (int side = 0; side < 3; ++side)
-        corner[side] = function[side][0] * toward[0] + function[side][1] * toward[1] + function[side][2] * toward[2];
-    const float near = 1.0f / wp::max(corner[0] + corner[1] + corner[2], NEARNESS_MIN), length = wp::length(toward);
-    wp::vec3 normal;
-    for (int axis = 0; axis < 3; ++axis)
-        normal[axis] = (volume < 0.0f ? -1.0f : 1.0f) * (function[0][axis] + function[1][axis] + function[2][axis]);
+#include "meet_plane.cuh"
     face_out.data[found] = part;
     number_out.data[found] = number[layer][0];
     ray_out.data[found] = toward / length;
     hit_out.data[found] = wp::vec3(length * near, corner[0] * near, corner[1] * near);
-    normal_out.data[found++] = wp::normalize(normal);
+    normal_out.data[found++] = normal;
     whole += (int)number[layer][0];
 }
 if (sky && whole < SAMPLES) {

@@ -37,6 +37,9 @@ for (int lane = 0; lane < LANES; ++lane) {
         for (int channel = 0; channel < 3; ++channel)
             total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
 }
+auto footprint_width = [](float points_shown) { // as in `coverage.py`
+    return 0.01f * SHARPNESS * __builtin_sqrtf(points_shown / SAMPLES);
+};
 alignas(64) float direction[3][N], corner[3][N], normal[3][N], spread[N], share[N];
 alignas(64) int faces_of[N], owner[N];
 int filled = 0;
@@ -96,7 +99,7 @@ for (int layer = 0; layer < layer_count; ++layer)
         }
         faces_of[filled] = part;
         owner[filled] = lane;
-        spread[filled] = SHARPNESS * 0.01f * pixel_spread[lane];
+        spread[filled] = footprint_width(number[layer][lane]) * pixel_spread[lane];
         share[filled] = number[layer][lane] * weight[lane];
         for (int axis = 0; axis < 3; ++axis) {
             direction[axis][filled] = toward[axis];

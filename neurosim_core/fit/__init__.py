@@ -1,0 +1,1 @@
+"""The settings of an event camera from recordings of a real one."""

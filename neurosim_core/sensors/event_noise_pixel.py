@@ -1,0 +1,175 @@
+# mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
+# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var"
+"""One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
+
+What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
+"""
+
+import warp as wp
+
+from neurosim_core.random import normal2, random_bits, uniform2
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+
+wp.set_module_options({"enable_backward": False})
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+NEVER = wp.constant(wp.int64(2**62))
+_GLARE = wp.constant(wp.float64(6.9))
+"""Logarithm of the most light that leaks, in units of white: 1000."""
+
+
+@wp.struct
+class NoisyPixel:
+    """One pixel in registers."""
+
+    on: wp.float64
+    off: wp.float64
+    steady: wp.vec2d  # thresholds ON and OFF without jitter
+    event_count: wp.int32
+    reference: wp.float64
+    up: wp.int32
+    down: wp.int32
+    fold: wp.int32  # whole cycles of leak: they count against `up`
+    held_ns: wp.float64  # end of reset, since the frame before
+    next_ns: wp.int64
+    noise_count: wp.int32
+    shot_rate: wp.float64
+    hot_rate: wp.float64
+    voltage: wp.float64
+
+
+@wp.func
+def jittered(model: PixelModel, index: wp.int32, state: NoisyPixel) -> NoisyPixel:
+    """Draw the thresholds until the next event."""
+    normal = normal2(random_bits(model.seed, model.jitter_stream, wp.int64(state.event_count), index))
+    state.on = wp.max(state.steady[0] + model.jitter[0] * normal[0], model.jitter_least)
+    state.off = wp.max(state.steady[1] + model.jitter[1] * normal[1], model.jitter_least)
+    return state
+
+
+@wp.func
+def see(model: PixelModel, log_radiance: wp.float32) -> wp.float32:
+    """Return what a pixel sees of log radiance: a line below some light, with the same value there."""
+    if model.linear_below > _ZERO:
+        radiance = wp.exp(wp.float64(log_radiance))
+        if radiance < model.linear_below:
+            rise = model.linear_slope * (radiance / model.linear_below - _ONE)
+            return wp.float32(model.linear_level + rise)
+    return log_radiance
+
+
+@wp.func
+def wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
+    """Return an exponential waiting time, at least 1 ns."""
+    if rate <= _ZERO:
+        return NEVER
+    return wp.max(wp.int64(wp.ceil(wp.min(-wp.log(uniform) / rate, wp.float64(1e18)))), wp.int64(1))
+
+
+@wp.func
+def draw_noise(model: PixelModel, index: wp.int32, state: NoisyPixel) -> wp.vec2d:
+    """Return two uniform numbers for the wait for a noise event and for what becomes of it."""
+    return uniform2(random_bits(model.seed, model.spontaneous_stream, wp.int64(state.noise_count), index))
+
+
+@wp.func
+def noise_polarity(
+    model: PixelModel, state: NoisyPixel, log_radiance: wp.float64, uniform: wp.float64
+) -> wp.int32:
+    """Return the polarity of a noise event that may be; -1: at this light it is none."""
+    place = uniform * (state.shot_rate + state.hot_rate)
+    if place < state.hot_rate:
+        return wp.where(place < state.hot_rate * model.hot_on_fraction, 1, 0)
+    place -= state.hot_rate
+    light = wp.min(wp.exp(log_radiance) / model.white_radiance, _ONE)
+    rate = state.shot_rate * (_ONE + (model.bright_factor - _ONE) * light)
+    if place >= rate:
+        return -1
+    share = model.shot_on_fraction
+    if model.shot_by_threshold:
+        on = share * model.threshold_on / state.steady[0]
+        share = on / (on + (_ONE - share) * model.threshold_off / state.steady[1])
+    return wp.where(place < rate * share, 1, 0)
+
+
+@wp.func
+def measured_polarity(
+    model: PixelModel, pixel: wp.int32, state: NoisyPixel, log_radiance: wp.float64, uniform: wp.float64
+) -> wp.int32:
+    """Do what `noise_polarity` does, at rates that were measured in several lights."""
+    if model.noise_light.shape[0] == 0:
+        return noise_polarity(model, state, log_radiance, uniform)
+    place = uniform * (state.shot_rate + state.hot_rate)
+    if place < state.hot_rate:
+        return wp.where(place < state.hot_rate * model.hot_on_fraction, 1, 0)
+    place -= state.hot_rate
+    brightest = model.noise_light.shape[0] - 1
+    level = wp.int32(0)
+    while level < brightest and log_radiance >= model.noise_light[level + 1]:
+        level += 1
+    above = wp.min(level + 1, brightest)
+    share = _ZERO
+    if above > level:
+        step = model.noise_light[above] - model.noise_light[level]
+        share = wp.clamp((log_radiance - model.noise_light[level]) / step, _ZERO, _ONE)
+    dim = model.noise_rates[level, pixel]
+    bright = model.noise_rates[above, pixel]
+    on = wp.float64(dim[0]) + share * (wp.float64(bright[0]) - wp.float64(dim[0]))
+    off = wp.float64(dim[1]) + share * (wp.float64(bright[1]) - wp.float64(dim[1]))
+    if place >= on + off:
+        return -1
+    return wp.where(place < on, 1, 0)
+
+
+@wp.func
+def light_of(model: PixelModel, log_radiance: wp.float32) -> wp.float64:
+    """Return light in units of white, at most 1000."""
+    return wp.exp(wp.min(wp.float64(log_radiance) - model.log_white, _GLARE))
+
+
+@wp.func
+def mean_light(
+    model: PixelModel, first: wp.float32, last: wp.float32, begin: wp.float64, end: wp.float64
+) -> wp.float64:
+    """Return the mean of light whose logarithm goes linearly from first to last, from what it is there."""
+    rise = wp.min(wp.float64(last) - model.log_white, _GLARE)
+    rise -= wp.min(wp.float64(first) - model.log_white, _GLARE)
+    if wp.abs(rise) < wp.float64(1e-6):
+        return wp.float64(0.5) * (begin + end)
+    return (end - begin) / rise
+
+
+@wp.func
+def begin_pixel(
+    model: PixelModel,
+    phase_stream: wp.uint32,
+    random_phase: wp.bool,
+    base: wp.array[wp.float32],
+    pixel: wp.int32,
+    memory_out: Memory,
+) -> None:
+    """Let a pixel begin anew at what it sees now."""
+    value = wp.float64(see(model, base[pixel]))
+    if memory_out.reference.shape[0] > 0:
+        memory_out.reference[pixel] = value
+    if memory_out.event_count.shape[0] > 0:
+        memory_out.event_count[pixel] = 0
+    if memory_out.filtered.shape[0] > 0:
+        memory_out.filtered[pixel] = value
+    if memory_out.exposure_ns.shape[0] > 0:
+        memory_out.exposure_ns[pixel] = _ZERO
+    if memory_out.held_ns.shape[0] > 0:
+        memory_out.held_ns[pixel] = -_ONE
+    if memory_out.next_ns.shape[0] > 0:
+        state = NoisyPixel()
+        rate = model.rates[pixel][0] + model.rates[pixel][1]
+        memory_out.next_ns[pixel] = wait_ns(rate, draw_noise(model, pixel, state)[0])
+        memory_out.noise_count[pixel] = 0
+    if memory_out.voltage.shape[0] > 0:
+        voltage = _ZERO
+        if random_phase:
+            voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
+            if model.thresholds.shape[0] > 0:
+                voltage *= model.thresholds[pixel][0] / model.threshold_on
+        memory_out.voltage[pixel] = voltage
