@@ -39,7 +39,7 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
-_COVER_BOUNDS = (64, 12)
+_COVER_BOUNDS = (64, 16)
 """Threads of a block, and blocks of a multiprocessor."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""

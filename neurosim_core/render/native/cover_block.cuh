@@ -142,7 +142,7 @@ if (listed) {
             for (int side = 0; side < 3; ++side) shown[side] = fmaf(y, value[side][2], fmaf(x, value[side][1], value[side][0]));
             const float near = shown[0] + shown[1] + shown[2];
             const float least = fminf(fminf(shown[0], shown[1]), shown[2]);
-            const bool nearer = least >= -OVERLAP * near && near > best[sample];
+            const bool nearer = least >= -OVERLAP * near && near > NEARER * best[sample];
             best[sample] = nearer ? near : best[sample];
             const unsigned byte = sample % 4, selector = 0x3210u ^ ((byte ^ 4u) << (4 * byte));
             nearest[sample / 4] = nearer ? __byte_perm(nearest[sample / 4], first, selector) : nearest[sample / 4];

@@ -1,3 +1,4 @@
+constexpr float NEARER = 1.0f + 4e-6f; // faces that coincide are in the order of their list, whatever the rounding
 constexpr float OVERLAP = 1e-5f; // of a triangle's size: no point falls between two that share an edge
 // Functions of a direction whose values are the weights of a triangle's corners over the distance to its plane along it.
 auto functions_of = [&](const wp::vec3& a, const wp::vec3& b, const wp::vec3& c, auto& function) {
