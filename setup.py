@@ -8,6 +8,7 @@ from setuptools import Extension, setup
 
 SUBJECTS = [
     "arrival",
+    "broadcast",
     "coder",
     "construct",
     "gate",
@@ -15,20 +16,21 @@ SUBJECTS = [
     "items",
     "native",
     "pack",
-    "pipe",
-    "relay",
     "ring",
     "socket",
     "unpack",
 ]
-HEADERS = ("coder", "inlet", "items", "native", "numpy", "ring")
+HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy", "ring")
 
 setup(
     ext_modules=[
         Extension(
             "cortex._native",
             [f"cortex/_{name}.c" for name in SUBJECTS],
-            depends=[f"cortex/_{name}.h" for name in HEADERS],
+            depends=[
+                *(f"cortex/_{name}.h" for name in HEADERS),
+                *(f"cortex/cpp/include/cortex/{name}.h" for name in ("broadcast", "broadcast_os")),
+            ],
             libraries=["dl"] if sys.platform == "linux" else [],
             include_dirs=[numpy.get_include()],
             optional=True,

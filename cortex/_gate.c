@@ -1,8 +1,10 @@
 /* The way of a message out; see `gate.py`. A large one is written into a slot of shared memory, whose account
    `_ring.c` keeps. */
 
+#include "_broadcast.h"
 #include "_coder.h"
 #include "_ring.h"
+#include "cpp/include/cortex/broadcast.h"
 
 #include <structmember.h>
 
@@ -74,15 +76,21 @@ static PyObject *gate_send_frame(Gate *gate, PyObject *frame) {
     PyObject *sends = Py_NewRef(gate->sends); /* who comes or goes meanwhile replaces it */
     int on_time = 1;
     for (Py_ssize_t place = 0; on_time >= 0 && place < PyTuple_GET_SIZE(sends); ++place) {
-        PyObject *arguments[3] = {NULL, frame, dont_wait};
-        PyObject *sent = PyObject_Vectorcall(
-            PyTuple_GET_ITEM(sends, place), arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
-        if (sent == NULL && PyErr_ExceptionMatches(gate->again)) {
-            PyErr_Clear();
-            sent = PyObject_CallFunction(gate->retry, "OO", frame, PyTuple_GET_ITEM(sends, place));
-            if (sent == Py_False) on_time = 0;
+        PyObject *send = PyTuple_GET_ITEM(sends, place), *sent;
+        const int found = broadcast_put(send, PyBytes_AS_STRING(frame), PyBytes_GET_SIZE(frame));
+        if (found == CORTEX_WRITTEN) continue;
+        if (found < 0) {
+            PyObject *arguments[3] = {NULL, frame, dont_wait};
+            sent = PyObject_Vectorcall(send, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+            if (sent == NULL && PyErr_ExceptionMatches(gate->again)) PyErr_Clear();
+            else if (sent != NULL) {
+                Py_DECREF(sent);
+                continue;
+            } else on_time = -1;
         }
-        if (sent == NULL) on_time = -1;
+        if (on_time < 0) break;
+        sent = PyObject_CallFunction(gate->retry, "OO", frame, send);
+        on_time = sent == NULL ? -1 : on_time && sent != Py_False;
         Py_XDECREF(sent);
     }
     Py_DECREF(sends);

@@ -19,12 +19,11 @@ enum {
 
 /* Each adds its names to the module; 0, or -1 with an error set. */
 int add_arrival(PyObject *module);
+int add_broadcast(PyObject *module);
 int add_coder(PyObject *module);
 int add_construct(PyObject *module);
 int add_gate(PyObject *module);
 int add_inlet(PyObject *module);
-int add_pipe(PyObject *module);
-int add_relay(PyObject *module);
 int add_socket(PyObject *module);
 
 /* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
@@ -38,9 +37,6 @@ PyObject *socket_take(PyObject *socket, int may_wait);
 
 /* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);
-
-/* The frame of a call with a frame and flags; NULL with an error set if it is none. */
-PyObject *frame_argument(PyObject *const *arguments, Py_ssize_t count);
 
 static inline Py_ssize_t align_to(Py_ssize_t position, Py_ssize_t alignment) {
     return (position + alignment - 1) & -alignment;

@@ -8,12 +8,12 @@ from typing import Any
 
 import zmq
 
+from cortex.broadcast import Broadcast
 from cortex.gate import Gate
 from cortex.large import LargeSender, Reader
 from cortex.outlet import DONTWAIT, Outlet, Outlets
 from cortex.patience import Patience
-from cortex.pipes import Pipes
-from cortex.wire import REST, AttachAnswer, AttachKey, answer_frame
+from cortex.wire import REST, AttachKey
 
 READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
@@ -24,10 +24,11 @@ TELL_AGAIN_S = 0.02
 
 
 class Fanout:
-    """Sends frames to all readers, through pipes and sockets. The caller holds the outlets' lock.
+    """Sends frames to all readers, through the ring and sockets. The caller holds the outlets' lock.
 
     Args:
         topic: For what is logged.
+        source: The publisher's number.
         batch_head: What a batch begins with: one of nothing tells how many messages there have been.
         gate: Sends where this says, if nothing special is to be done.
         large: Sends large messages, and knows who reads them.
@@ -41,6 +42,7 @@ class Fanout:
     def __init__(
         self,
         topic: str,
+        source: int,
         batch_head: bytes,
         *,
         gate: Gate,
@@ -61,7 +63,7 @@ class Fanout:
         self._max_wait_ms = round(max_wait_s * 1000.0)
         self._next_sequence = next_sequence
         self.readers: dict[bytes, Reader] = {}
-        self.pipes = Pipes(self._await_room, patience.is_over)
+        self.ring = Broadcast(source, self._await_room, patience.is_over)
         self.late: dict[Outlet, int] = {}
         """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
 
@@ -93,15 +95,10 @@ class Fanout:
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
-        reader = self._large.admit(key, request, outlet)
-        self.readers[key] = reader
         sequence = self._next_sequence()
+        reader = self._large.admit(key, request, outlet, lambda reader: self.ring.admit(reader, sequence))
+        self.readers[key] = reader
         self._large.reserve(reader, sequence)
-        if reader.pipe is not None:
-            reader.pipe.offer(self._news(sequence))  # this tells the reader that all else comes there
-            self.pipes.admit(reader)
-            if not self._patience.is_waiting:
-                self.pipes.settle()
         self.route()
         answer = self._large.answer(reader, sequence, self.latched)
         if outlet.strict:
@@ -116,7 +113,7 @@ class Fanout:
             if reader.request.reader == request.reader and reader.outlet is outlet:
                 del self.readers[key]
                 self._large.dismiss(reader)
-                self.pipes.dismiss(reader)
+                self.ring.dismiss(reader)
                 self.late.pop(outlet, None)
                 self.route()
                 return
@@ -133,14 +130,14 @@ class Fanout:
     def route(self) -> None:
         """Work out where messages go, when readers or what is sent have changed."""
         readers = self.readers.values()
-        outlets = {reader.outlet for reader in readers if reader.pipe is None}
+        outlets = {reader.outlet for reader in readers if reader.member is None}
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
         self._lossy_sends = tuple(sends)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
         usual = self._plain and not self.late
         retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
-        self._retries = retries | self.pipes.strict
-        self._gate.sends = (*self._lossy_sends, *self.pipes.lossy, *self._retries) if usual else ()
+        self._retries = retries | self.ring.sends
+        self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
         self.arm()
 
     def arm(self) -> None:
@@ -148,12 +145,9 @@ class Fanout:
         self._gate.ledger = self._large.short_cut if self._plain and not self.late else None
 
     def tick(self, now_ns: int) -> None:
-        """Write what did not fit, see who writes the pipes, end a burst; called now and then."""
-        self.pipes.flush()
+        """End a burst; called now and then."""
         if self._patience.is_waiting:
             return
-        if self.pipes.settle():
-            self.route()
         sequence, silent_ns = self._gate.sequence, now_ns - self._gate.refresh_ns
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
@@ -174,7 +168,7 @@ class Fanout:
                 outlet.send(frame, DONTWAIT)
             except zmq.Again:
                 on_time &= self.send_strict(outlet, frame, 0)
-        on_time &= self.pipes.send(frame)
+        on_time &= self.ring.send(frame)
         if not on_time:
             self.timeouts += 1
         return on_time
@@ -196,7 +190,7 @@ class Fanout:
         def send() -> bool:
             return outlet.try_send(frame, flags)
 
-        readers = [r for r in self.readers.values() if r.outlet is outlet and r.pipe is None]
+        readers = [r for r in self.readers.values() if r.outlet is outlet and r.member is None]
         if send() or self._await_room(send, max((r.timeout_s for r in readers), default=0.0)):
             return True
         self.late[outlet] = self._gate.sequence
@@ -225,15 +219,16 @@ class Fanout:
             send(frame, DONTWAIT)
         for outlet in self._strict_outlets:
             outlet.try_send(frame)
-        self.pipes.offer(frame)
+        self.ring.offer(frame)
 
     def stop(self) -> None:
-        """Take in no reader any more; `finish` follows."""
+        """Take in no reader any more, and end the ring; `finish` follows."""
         self.closed = True
+        self.ring.end(self._news(self._gate.sequence))
         self._untold = list(self._strict_outlets)
 
     def finish(self, waited_s: float, linger_s: float) -> bool:
-        """Write what is left, and to each reader which sequence would come next; called again and again.
+        """Tell each reader of a socket which sequence would come next; called again and again.
 
         Args:
             waited_s: For how long this has gone on [s].
@@ -243,18 +238,16 @@ class Fanout:
             Whether each has all of it, or has had its time.
         """
         last = self._news(self._gate.sequence)
-        written = self.pipes.finish(last, waited_s, linger_s)
         # Libzmq drops it while a reader is late: it is sent now and then, until that one says that it reads.
         if waited_s >= self._tell_again_s:
             self._tell_again_s = waited_s + TELL_AGAIN_S
             self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
         behind = [r for r in self.readers.values() if r.outlet in self._untold or self._owes(r)]
-        told = not (self._untold or behind) or waited_s >= max([linger_s, *(r.timeout_s for r in behind)])
-        return written and told
+        return not (self._untold or behind) or waited_s >= max([linger_s, *(r.timeout_s for r in behind)])
 
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
-        confirms = reader.request.confirms and reader.outlet.strict and reader.pipe is None
+        confirms = reader.request.confirms and reader.outlet.strict and reader.member is None
         return confirms and reader.confirmed < self._gate.sequence
 
     def give_up(self) -> None:
@@ -262,12 +255,7 @@ class Fanout:
         sequence = self._gate.sequence
         for outlet in self._untold:
             outlet.send_anyway(self._news(sequence))
-        unfinished = self.pipes.unfinished()
-        for reader in unfinished:  # their pipes are full, their sockets are not
-            answer = AttachAnswer(sequence, reader.column, (), b"")
-            reader.outlet.try_send(answer_frame(reader.key, answer))
-        unconfirmed = sum(map(self._owes, self.readers.values()))
-        count = unconfirmed + sum(reader.request.strict for reader in unfinished)
+        count = sum(map(self._owes, self.readers.values()))
         if count:
             self._outlets.note(
                 f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"
@@ -275,6 +263,6 @@ class Fanout:
 
     def close(self) -> None:
         """Send no more."""
-        self.pipes.close()
+        self.ring.close()
         self.readers.clear()
         self.route()

@@ -7,7 +7,6 @@ node is stale when nobody holds the node's lock, which the kernel lets go of how
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import hashlib
 import os
@@ -290,24 +289,7 @@ def sweep(directory: Path) -> list[int]:
         _remove_files(directory, stem)
         lock.close(remove=True)
         swept.append(int(stem, 16))
-    _sweep_pipes(directory)
     return swept
-
-
-def pipe_path(directory: Path, reader: int) -> Path:
-    """Where a reader offers a pipe to a publisher, for as long as that takes to open it."""
-    return directory / f"pipe.{reader:016x}"
-
-
-def _sweep_pipes(directory: Path) -> None:
-    """Remove pipes that nobody reads any more."""
-    for path in directory.glob("pipe.*"):
-        try:
-            os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC))
-        except OSError as error:
-            if error.errno == errno.ENXIO:
-                with contextlib.suppress(FileNotFoundError):
-                    path.unlink()
 
 
 def _remove_files(directory: Path, stem: str) -> None:

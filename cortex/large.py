@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import zmq
 
-from cortex.native import NativeRelay
 from cortex.outlet import DONTWAIT, SNDMORE, Backoff, Outlet, Outlets
-from cortex.pipe import Writer, open_writer
 from cortex.shm import Ring, ShmUnavailable
 from cortex.wire import (
     HEADER_SIZE,
@@ -48,8 +46,6 @@ PRIVATE_BYTES = 64 << 20
 RINGS_ALIVE = 4
 RINGS_KEPT = 8
 """Rings with those that are written no more, but not yet read by a reliable reader."""
-PIPES_MAX = 2
-"""So many pipes a publisher writes itself; more are written by a thread in C, or without C not used."""
 RETRY_S = 5.0
 """After a ring could not be made, none is tried for so long."""
 _SLOT_REST = struct.Struct(REST.format + "Q")
@@ -64,14 +60,8 @@ class Reader:
     request: AttachKey
     outlet: Outlet
     column: int | None
-    pipe: Writer | None = None
-    """Where its frames go; None: to the outlet."""
     member: int | None = None
-    """Its number in the relay that writes the pipe, if one does."""
-    late: bool = False
-    """Its pipe was full for too long: it holds up nothing until it has room again."""
-    has_last: bool = False
-    """The last frame of all was given to its pipe."""
+    """Its number in the publisher's ring, through which its frames go; None: through the outlet."""
     confirmed: int = 0
     """It has accounted for all messages below this."""
 
@@ -152,7 +142,7 @@ class LargeSender:
         self._has_strict = False
         self._timeout_s = 0.0
         self._slot_outlets: list[Outlet] = []
-        self._piped = 0
+        self._has_members = False
         self._inline_outlets: list[Outlet] = []
 
     def _plan(self) -> None:
@@ -176,8 +166,10 @@ class LargeSender:
         self._has_strict = any(r.request.strict for r in (*self._columns.values(), *self._inline))
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
-        self._slot_outlets = list({reader.outlet for reader in self._columns.values() if reader.pipe is None})
-        self._piped = sum(reader.pipe is not None for reader in self._columns.values())
+        self._slot_outlets = list(
+            {reader.outlet for reader in self._columns.values() if reader.member is None}
+        )
+        self._has_members = any(reader.member is not None for reader in self._columns.values())
         self._inline_outlets = list({reader.outlet for reader in self._inline})
 
     def _wanted(self, slot_bytes: int) -> int:
@@ -185,18 +177,17 @@ class LargeSender:
         wanted = 2 * self._shares + 2
         return max(wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // slot_bytes)) if self._is_deep else wanted
 
-    def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
-        """Take a reader in, with a column of the lease table if it can map memory."""
+    def admit(self, key: bytes, request: AttachKey, outlet: Outlet, join: Callable[[Reader], None]) -> Reader:
+        """Take a reader in; with a column of the lease table and a try to `join` if it can map memory."""
         column = None
         if request.shared_memory and outlet.local:
             column = next((c for c in range(COLUMNS) if c not in self._columns), None)
-        piped = column is not None and (NativeRelay is not None or self._piped < PIPES_MAX)
-        pipe = open_writer(outlet.directory, request.reader) if piped else None
-        reader = Reader(key, request, outlet, column, pipe)
+        reader = Reader(key, request, outlet, column)
         if column is None:
             self._inline.append(reader)
         else:
             self._columns[column] = reader
+            join(reader)
         self._plan()
         return reader
 
@@ -373,7 +364,7 @@ class LargeSender:
         mask: int,
         stamps: Stamps,
         send_strict: Callable[[Outlet, bytes, int], bool],
-        send_piped: Callable[[bytes], bool],
+        send_to_ring: Callable[[bytes], bool],
     ) -> tuple[bool, bool]:
         """Hand a written slot to all readers; the caller holds the lock.
 
@@ -383,7 +374,7 @@ class LargeSender:
             mask: The columns that get a lease, from `grant`.
             stamps: Number and times of the message.
             send_strict: Sends one frame over a strict outlet with these flags, waiting for room.
-            send_piped: Writes one frame into all pipes, waiting for room in those of reliable readers.
+            send_to_ring: Writes one frame into the ring, waiting for reliable readers.
 
         Returns:
             Whether every reliable reader was served in time, and whether some inline one was passed over.
@@ -395,9 +386,9 @@ class LargeSender:
                 sent = self._send_joined(outlet, slot, size, stamps, send_strict)
                 passed_over |= not sent
                 on_time &= sent or not outlet.strict
-            if self._piped:
+            if self._has_members:
                 frame = self._message_head + REST.pack(*stamps, size, 0) + slot.buffer[:size].tobytes()
-                on_time &= send_piped(frame)
+                on_time &= send_to_ring(frame)
             return on_time, passed_over
         ring.commit(slot.number, stamps.sequence, size, mask)
         if self._columns:
@@ -409,7 +400,7 @@ class LargeSender:
                     outlet.send(frame, DONTWAIT)
                 elif not outlet.try_send(frame) and not send_strict(outlet, frame, 0):
                     on_time = False
-            on_time &= send_piped(frame)
+            on_time &= send_to_ring(frame)
         for outlet in self._inline_outlets:
             sent = self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
             passed_over |= not sent

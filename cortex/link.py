@@ -7,16 +7,15 @@ import re
 import secrets
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
 
 from cortex.codec import Codec, MalformedMessage
+from cortex.compiled import native
 from cortex.context import Frames, new_socket
 from cortex.packer import make_reader
-from cortex.pipe import Offer, Reader
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
@@ -129,11 +128,6 @@ class Link:
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
-        self._directory = (
-            Path(address.removeprefix("ipc://")).parent if address.startswith("ipc://") else None
-        )
-        self._offer: Offer | None = None
-        """A pipe; stays open until the end, as its descriptor is waited for."""
         self.socket = new_socket(
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
         )
@@ -141,7 +135,10 @@ class Link:
         self._frames = Frames(self.socket)
         self._receive_socket = self._frames.receive
         self.receive: Callable[[int], bytes] = self._receive_socket
-        self._pipe: Reader | None = None
+        self._end: Any = None
+        """Our end of the ring, if we have asked for it; open until the end, as others wait for its bell."""
+        self._ring: Any = None
+        """That which brings all messages; None: they come through the socket."""
         try:
             if secure is not None:
                 secure(self.socket)
@@ -155,7 +152,7 @@ class Link:
         except BaseException:
             self._frames.close()
             self.socket.close(0)
-            self._close_offer()
+            self._close_end()
             raise
 
     def _ask(self, *, shared_memory: bool) -> None:
@@ -163,11 +160,20 @@ class Link:
         self._reader = secrets.randbits(64) or 1
         # What is in our own process cannot get lost on its way.
         self._confirms = policy.reliable and not self.address.startswith("inproc:")
-        if shared_memory and self._directory is not None:
+        if shared_memory and native is not None and self.address.startswith("ipc://"):
+            path = self.address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
             try:
-                self._offer = Offer(self._directory, self._reader)
+                self._end = native.RingReader(
+                    path,
+                    self.source,
+                    self._reader,
+                    self._socket_fd,
+                    self._receive_socket,
+                    zmq.Again,
+                    BLOCK_MS,
+                )
             except OSError as error:
-                logger.info("%s: no pipe: %s", self.record.topic, error)
+                logger.info("%s: no ring: %s", self.record.topic, error)
         key = AttachKey(
             self.source,
             self._reader,
@@ -187,8 +193,8 @@ class Link:
         if text not in self._complained and len(self._complained) < 16:
             self._complained.add(text)
             logger.warning("%s: rejected a frame of %s: %s", self.record.topic, self.address, reason)
-        if self._pipe is not None and self._pipe.broken:
-            self._do_without_shared_memory("its pipe carries something that is no frame")
+        if self._ring is not None and self._ring.broken:
+            self._do_without_shared_memory("its ring carries something that is no frame")
 
     def handle(self, frame: bytes) -> list[Item]:
         """Take in a frame that is not a plain small message."""
@@ -242,7 +248,7 @@ class Link:
         """The publisher says which sequence comes next."""
         if self.advance(sequence, 0):
             self._told = sequence
-            if self._confirms and self._pipe is None:
+            if self._confirms and self._ring is None:
                 self._confirm(sequence)
 
     def _check(self, fingerprint: int, size: int) -> None:
@@ -402,27 +408,32 @@ class Link:
                 self.socket.unsubscribe(self._large_head)
                 self._large_subscribed = False
                 self._shorten()
-        if first and self._offer is not None and self._offer.taken():
-            self._use_pipe(self._offer)
-        if self.expected >= 0:
+        known = self.expected >= 0
+        if first:
+            self._use_ring()
+        if known:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
         return items
 
-    def _use_pipe(self, offer: Offer) -> None:
-        """The publisher sends all that follows through our pipe."""
-        self._pipe = offer.reader(self._socket_fd, self._receive_socket, BLOCK_MS)
-        self.receive = self._pipe.receive
+    def _use_ring(self) -> None:
+        """If the publisher has taken us in, it sends all that follows through its ring."""
+        first = None if self._end is None else self._end.welcomed()
+        if first is None:
+            return
+        self._ring = self._end
+        self.receive = self._ring.receive
+        self.attached = True
+        if self.expected < 0:  # what is lost counts from there on, also if the answer never comes
+            self.expected = first
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.unsubscribe(head)
 
     def _use_socket(self) -> None:
         """What follows comes through the socket again, as we shall be another reader to the publisher."""
         self.receive = self._receive_socket
-        self._pipe = None
-        if self._offer is not None:
-            self._offer.silence()
+        self._ring = None
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.subscribe(head)
 
@@ -430,19 +441,19 @@ class Link:
     def carrier(self) -> str:
         """How messages come: the transport, and what carries them on this host."""
         parts = [self.address.partition("://")[0]]
-        parts += ["pipe"] if self._pipe is not None else []
+        parts += ["ring"] if self._ring is not None else []
         parts += ["shared memory"] if self._column is not None else []
         return ", ".join(parts)
 
     @property
     def fds(self) -> tuple[int, ...]:
         """Descriptors that become readable when something may have come."""
-        return (self._socket_fd,) if self._offer is None else (self._socket_fd, self._offer.fd)
+        return (self._socket_fd,) if self._end is None else (self._socket_fd, self._end.fd)
 
     def _take_rings(self, places: tuple[RingPlace, ...]) -> bool:
         """Map the newest ring that is announced, and forget those that are given up.
 
-        An announcement comes through the socket, descriptors through a pipe: what it says may be old news.
+        An announcement comes through the socket, descriptors through a ring: what it says may be old news.
 
         Returns:
             False if there is no shared memory from now on.
@@ -510,10 +521,8 @@ class Link:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
         self._close_rings()  # before the publisher can learn that our column is free
         self._newest_ring = -1
-        if self._pipe is not None:
+        if self._ring is not None:
             self._use_socket()
-        elif self._offer is not None:  # the publisher may have written there
-            self._offer.silence()
         if not self._large_subscribed:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
@@ -523,10 +532,9 @@ class Link:
         self._ask(shared_memory=False)
 
     def leave(self) -> None:
-        """The publisher has left: what it wrote into our pipe counts, also if its answer never came."""
-        if not self.attached and self._offer is not None and self._offer.taken():
-            self.attached = True
-            self._use_pipe(self._offer)
+        """The publisher has left: what it wrote into its ring counts, also if its answer never came."""
+        if not self.attached:
+            self._use_ring()
 
     def end(self) -> None:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""
@@ -544,11 +552,11 @@ class Link:
         self._close_rings()
         self._frames.close()
         self.socket.close(0)
-        self._close_offer()
+        self._close_end()
 
-    def _close_offer(self) -> None:
-        if self._offer is not None:
-            self._offer.close()
+    def _close_end(self) -> None:
+        if self._end is not None:
+            self._end.close()
 
     def _close_rings(self) -> None:
         if self.coder is not None:

@@ -140,9 +140,9 @@ class Matcher:
         """Return where the control socket of a node is.
 
         Raises:
-            ConnectionError: It cannot be reached from here.
+            ConnectionError: It cannot be reached from here, or has none.
         """
         place = reach(node, self._host, self._keys, insecure=self._insecure)
-        if place is None:
-            raise ConnectionError(f"node {node.name!r} cannot be reached from here")
+        if place is None or not place.address:
+            raise ConnectionError(f"node {node.name!r} cannot be {'asked' if place else 'reached from here'}")
         return place

@@ -40,11 +40,6 @@ NativeGate: Any = native and native.Gate
 NativeInlet: Any = native and native.Inlet
 NativeArrivals: Any = native and native.Arrivals
 """Take messages one at a time; see `inlet.py`."""
-NativePipeWriter: Any = native and native.PipeWriter
-NativePipeReader: Any = native and native.PipeReader
-"""The ends of a pipe; see `pipe.py`."""
-NativeRelay: Any = native and native.Relay
-"""Writes the pipes of many readers; see `pipes.py`."""
 _NUMBER, _BOOL, _ENUM, _FIXED, _VARIABLE, _STR, _BYTES, _OPTIONAL, _LIST, _MESSAGE = range(10)
 _NAMES_MAX = 64
 """More dimensions of one message that must agree are left to Python."""

@@ -327,6 +327,7 @@ class Node:
 
         Raises:
             KeyError: There is no such node.
+            ConnectionError: It cannot be reached from here, or answers nobody.
             TimeoutError: It did not answer in time.
         """
         if node == self.id:

@@ -8,13 +8,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import zmq
 
 from cortex.context import Frames, new_socket
 from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
+
+if TYPE_CHECKING:
+    from cortex.broadcast import Listener
 
 logger = logging.getLogger(__name__)
 
@@ -53,8 +55,8 @@ class Outlet:
     strict: bool
     local: bool
     """Over ipc or inproc: readers may share memory."""
-    directory: Path | None = None
-    """Where its unix socket lies, and readers offer pipes."""
+    listener: Listener | None = None
+    """Where its readers ask for rings."""
 
     def __post_init__(self) -> None:
         self._frames = Frames(self.socket)
@@ -93,6 +95,7 @@ def open_outlet(
     *,
     strict: bool,
     local: bool,
+    listener: Listener | None = None,
     secure: Callable[[zmq.Socket[bytes]], None] | None = None,
 ) -> Outlet:
     """Bind an XPUB socket.
@@ -101,6 +104,7 @@ def open_outlet(
         addresses: Where to bind; a tcp address may end in `:*`.
         strict: Whether full queues hold up the sender.
         local: Whether the addresses are ipc or inproc.
+        listener: Where its readers ask for rings.
         secure: Sets up CURVE on the socket before it binds.
     """
     socket = new_socket(zmq.XPUB, tcp=not local)
@@ -114,8 +118,7 @@ def open_outlet(
     except zmq.ZMQError:
         socket.close(0)
         raise
-    paths = [Path(address.removeprefix("ipc://")) for address in addresses if address.startswith("ipc://")]
-    return Outlet(socket, strict, local, paths[0].parent if paths else None)
+    return Outlet(socket, strict, local, listener)
 
 
 class Outlets:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import zmq
 
+from cortex.broadcast import Listener, make_listener
 from cortex.context import context, new_socket
 from cortex.host import NodeFiles
 from cortex.outlet import Outlets, open_outlet
@@ -50,6 +51,7 @@ class Places:
         self.routers: list[zmq.Socket[bytes]] = []
         self.endpoints: list[Endpoint] = []
         self._authenticator: Authenticator | None = None
+        self._listener: Listener | None = None
         if listen is not None:
             check_address(f"tcp://{_bracket(listen)}:0", keys=keys, insecure=insecure)
         self._files = NodeFiles(domain, node)
@@ -64,9 +66,10 @@ class Places:
 
     def _open_local(self, node: int, outlets: Outlets) -> None:
         path = self._files.endpoint
+        listener = self._listener = make_listener(self._files.path("ring"))
         for role, strict in (("lossy", False), ("strict", True)):
             addresses = [path(role), _inproc(node, os.getpid(), role)]
-            outlets.add(open_outlet(addresses, strict=strict, local=True))
+            outlets.add(open_outlet(addresses, strict=strict, local=True, listener=listener))
         router = self._router(tcp=False)
         router.bind(path("control"))
         self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
@@ -114,6 +117,9 @@ class Places:
         if self._authenticator is not None:
             self._authenticator.release()
             self._authenticator = None
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         self._files.close()
 
 

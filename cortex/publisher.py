@@ -116,6 +116,7 @@ class Publisher(Generic[T]):
         )
         self._fanout = Fanout(
             topic,
+            self.source,
             batch_head,
             gate=self._gate,
             large=self._large,
@@ -138,7 +139,8 @@ class Publisher(Generic[T]):
             False if a reliable subscriber lost it, because it held up the publisher for too long: the longest
             `timeout_s` of the topic's reliable subscribers for small messages, its own for those in shared
             memory. True otherwise, also if there is no subscriber. A subscriber that was too late once
-            holds up no further messages, and loses them, until it has read about half of what waits for it.
+            holds up no further messages, and loses them, until it has read about half of what waits for it;
+            where others read on meanwhile, it may lose what waits for it, too. It counts what it has lost.
 
         Raises:
             TypeError: The message is of another type.
@@ -376,7 +378,7 @@ class Publisher(Generic[T]):
             head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
             fanout.latched = head + slot.buffer[:size].tobytes()
         sent, inline_passed_over = self._large.send(
-            slot, size, mask, stamps, fanout.send_strict, fanout.pipes.send
+            slot, size, mask, stamps, fanout.send_strict, fanout.ring.send
         )
         self._skipped += passed_over or inline_passed_over
         on_time &= sent and not fanout.late
@@ -482,12 +484,12 @@ class Publisher(Generic[T]):
     def close(self, linger_s: float = LINGER_S) -> None:
         """Send what is held back, tell readers how many messages there were, and leave the topic.
 
-        What `publish` has taken reaches every local reliable subscriber that makes room for it within its
-        `timeout_s`, counted from here. The others, and what goes through sockets, have `linger_s`.
+        What `publish` has taken is there for local subscribers to read, however long they take. What goes
+        through sockets reaches reliable subscribers that confirm it within their `timeout_s`.
 
         Args:
-            linger_s: How long to wait for lossy subscribers, and for large messages that are on their way to
-                be taken in [s].
+            linger_s: How long to wait for other subscribers of sockets, and for large messages that are on
+                their way to be taken in [s].
         """
         close_publishers([self], linger_s=linger_s)
 

@@ -549,7 +549,7 @@ class Subscriber(Generic[T]):
 
     @property
     def carriers(self) -> list[str]:
-        """How the messages of each publisher come, such as "ipc, pipe, shared memory" or "tcp"."""
+        """How the messages of each publisher come, such as "ipc, ring, shared memory" or "tcp"."""
         with self._turn:
             return [link.carrier for link in self._links if link.attached]
 

@@ -1,6 +1,6 @@
-"""Test vectors of the wire format: types with their schemas, bodies with their values, and malformed bodies.
+"""Test vectors of the wire format: schemas, bodies with their values, frames, and malformed ones.
 
-Each JSON file holds one type:
+Each JSON file but two holds one type:
 
 - `schema`: the canonical text; `fingerprint`: 16 hexadecimal digits of the u64;
 - `fixed_size`: bytes of every body, or null;
@@ -12,7 +12,8 @@ Values are JSON: integers in full; floats as numbers or "nan", "inf", "-inf"; by
 name; null for an absent optional; messages as objects; arrays as `{"dtype", "shape", "items"}` with the
 little-endian items in hexadecimal.
 
-`types.json` lists names, schemas and fingerprints of the standard and the control messages.
+`types.json` lists names, schemas and fingerprints of the standard and the control messages, `frames.json`
+frames and what is in them (see `wire_frames.py`).
 `python -m cortex.vectors` writes all of them anew.
 """
 
@@ -32,7 +33,8 @@ DIRECTORY = Path(__file__).parent
 
 def load_vectors() -> dict[str, dict[str, Any]]:
     """Return the contents of all files of one type, by name."""
-    paths = sorted(path for path in DIRECTORY.glob("*.json") if path.name != "types.json")
+    others = {"types.json", "frames.json"}
+    paths = sorted(path for path in DIRECTORY.glob("*.json") if path.name not in others)
     return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
 
 

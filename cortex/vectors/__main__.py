@@ -10,7 +10,7 @@ from cortex import messages, records
 from cortex.codec import codec_of
 from cortex.message import is_message
 from cortex.schema import schema_of
-from cortex.vectors import DIRECTORY, message_to_plain
+from cortex.vectors import DIRECTORY, message_to_plain, wire_frames
 from cortex.vectors.catalogue import CATALOGUE, Entry, Malformed
 
 
@@ -59,6 +59,7 @@ def files() -> dict[str, str]:
     """Return the text of all files by name."""
     contents: dict[str, Any] = {f"{name}.json": vector_of(entry) for name, entry in CATALOGUE.items()}
     contents["types.json"] = types()
+    contents["frames.json"] = wire_frames.contents()
     return {
         name: json.dumps(content, ensure_ascii=False, indent=1) + "\n" for name, content in contents.items()
     }

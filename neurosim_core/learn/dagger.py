@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
+from neurosim_core.learn.descent import Descent
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
 from neurosim_core.learn.task import MIRROR_ACTION
@@ -22,15 +24,26 @@ class DaggerConfig:
 
     worlds: int = 96
     iterations: int = 130
-    horizon: int = 20
+    horizon: int = 40
     """Steps of each world in an iteration, and how far back gradients go."""
-    epochs: int = 2
-    minibatches: int = 4
+    replay: int = 3
+    """Iterations that are learnt from: this one and those before."""
+    updates: int = 16
+    """Gradient steps in an iteration."""
+    batch: int = 48
+    """Stretches of flight (`horizon` steps of a world) in a gradient step."""
     learning_rate: float = 1.5e-3
-    """At first; it falls to a twentieth."""
-    lead: float = 0.2
-    """Share of the training in which the teacher flies less and less often."""
-    hint_weight: float = 1.0
+    """At first; it falls to zero as a cosine."""
+    lead: float = 0.3
+    """Share of the training in which the teacher flies less and less often,"""
+    lead_last: float = 0.2
+    """and share of the worlds that it flies from then on."""
+    disturbance: float = 0.2
+    """What is added to the teacher's actions where it flies: it shows how to recover. Mean over the worlds of
+    the standard deviation, which is between 0 and twice as much."""
+    disturbance_s: float = 0.25
+    """Correlation time of it [s]."""
+    hint_weight: float = 2.0
     """Of the error of the estimated velocity, against that of the action."""
     gradient_max: float = 1.0
 
@@ -52,18 +65,22 @@ class Dagger:
         self._now, _ = env.reset()
         vector = env.group(self._now, "student")
         _, channels, height, width = self._now["events"].shape
-        hints = self._now["velocity"].shape[1] if "velocity" in self._now else 0
+        hints = self._now["velocity"].shape[1]
         self.policy = EventPolicy(channels, height, width, vector.shape[1], hint_count=hints).to(env.device)
-        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=config.learning_rate)
+        self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
+        self._pushed = torch.zeros((env.num_envs, 4), device=env.device)
         self._make_mirrors()
+        self._make_replay(vector.shape[1], hints)
 
     def begin(self, seed: int) -> None:
-        """Begin anew in all worlds, at different times of their episodes."""
+        """Begin anew in all worlds, at different times of their episodes, with nothing to learn from."""
         self._now, _ = self.env.reset(seed=seed, spread=True)
         self._memory.zero_()
+        self._pushed.zero_()
         self._begun.fill_(1.0)
+        self._flown = 0
 
     def iterate(self, done: float) -> dict[str, float]:
         """Fly some steps and learn from them.
@@ -74,27 +91,28 @@ class Dagger:
         Returns:
             What to log.
         """
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * (1.0 - 0.95 * done)
-        memory = self._memory.clone()
+        config = self.config
+        rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0)))
+        lead = 1.0 - (1.0 - config.lead_last) * min(done / max(config.lead, 1e-9), 1.0)
+        lead = max(lead, 1e-9)
         with torch.no_grad():
-            batch, log = self._fly(lead=max(0.0, 1.0 - done / max(self.config.lead, 1e-9)))
-        return log | self._learn(batch, memory)
+            log = self._fly(lead=lead)
+        return log | self._learn(rate)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training goes on from."""
-        return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {"policy": self.policy.state_dict(), "optimizer": self._descent.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.policy.load_state_dict(state["policy"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self._descent.optimizer.load_state_dict(state["optimizer"])
 
     def _make_mirrors(self) -> None:
         """Let half of the worlds be seen in a mirror, if the task says how."""
         env, signs = self.env, self.env.task.mirror
         vectors = [name for name in env.obs_groups["student"] if name != "events"]
-        known = all(name in signs for name in (*vectors, *(["velocity"] if "velocity" in self._now else [])))
+        known = all(name in signs for name in (*vectors, "velocity"))
         self._mirrored = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self._mirrored[: env.num_envs // 2] = known
 
@@ -104,62 +122,85 @@ class Dagger:
 
         self._vector_sign = rows([sign for name in vectors for sign in signs[name]] if known else [1.0])
         self._action_sign = rows(MIRROR_ACTION)
-        self._hint_sign = rows(signs["velocity"] if known and "velocity" in signs else [1.0])
+        self._hint_sign = rows(signs["velocity"] if known else [1.0])
 
-    def _fly(self, *, lead: float) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
-        """Fly the horizon; in a share `lead` of the worlds the teacher acts."""
-        env, config = self.env, self.config
-        shape = (config.horizon, env.num_envs)
-        batch = {
-            "surface": torch.empty((*shape, *self._now["events"].shape[1:]), device=env.device),
-            "begun": torch.empty(shape, device=env.device),
+    def _make_replay(self, vector_size: int, hint_count: int) -> None:
+        """Make room for stretches of flight: [iteration, world, step, ...]; surfaces in half precision."""
+        config, env = self.config, self.env
+        stretches, steps = (config.replay, env.num_envs), (config.horizon,)
+        sizes = {"vector": vector_size, "label": 4, "hint": hint_count}
+        self._kept = {
+            name: torch.zeros((*stretches, *steps, n), device=env.device) for name, n in sizes.items()
         }
-        rows: dict[str, list[torch.Tensor]] = {"vector": [], "label": [], "hint": []}
+        self._kept["begun"] = torch.zeros((*stretches, *steps), device=env.device)
+        self._kept["memory"] = torch.zeros((*stretches, self.policy.memory_size), device=env.device)
+        self._kept["surface"] = torch.zeros(
+            (*stretches, *steps, *self._now["events"].shape[1:]), dtype=torch.float16, device=env.device
+        )
+        self._rows = torch.zeros(config.batch, dtype=torch.int64, device=env.device)
+        self._losses = torch.zeros(2, device=env.device)
+        self._flown = 0
+
+    def _fly(self, *, lead: float) -> dict[str, float]:
+        """Fly the horizon, and keep it; in a share `lead` of the worlds a disturbed teacher acts."""
+        env, config = self.env, self.config
+        kept = {name: value[self._flown % config.replay] for name, value in self._kept.items()}
+        kept["memory"].copy_(self._memory)
         ended = torch.zeros(3, device=env.device)
         draw = torch.rand(env.num_envs, generator=self._generator, device=env.device)
         led = (draw < lead)[:, None]
+        push = 2.0 * config.disturbance * (draw / lead)[:, None]
+        decay = math.exp(-1.0 / (env.task.rate_hz * config.disturbance_s))
         for step in range(config.horizon):
             now = self._now
             surface = now["events"]
             surface = torch.where(self._mirrored[:, None, None, None], surface.flip(-1), surface)
-            batch["surface"][step] = surface
-            batch["begun"][step] = self._begun
             vector = env.group(now, "student") * self._vector_sign
             label = self.teacher(env.group(now, "teacher")).clamp(-1.0, 1.0) * self._action_sign
-            rows["vector"].append(vector)
-            rows["label"].append(label)
-            if "velocity" in now:
-                rows["hint"].append(now["velocity"] * self._hint_sign)
+            for name, value in (
+                ("surface", surface),
+                ("begun", self._begun),
+                ("vector", vector),
+                ("label", label),
+                ("hint", now["velocity"] * self._hint_sign),
+            ):
+                kept[name][:, step] = value
             memory = self._memory * (1.0 - self._begun)[:, None]
             action, self._memory = self.policy(surface, vector, memory)
-            action = torch.where(led, label, action) * self._action_sign
+            noise = torch.randn(action.shape, generator=self._generator, device=env.device)
+            self._pushed.mul_(decay).add_(noise, alpha=math.sqrt(1.0 - decay**2))
+            action = torch.where(led, label + push * self._pushed, action) * self._action_sign
             self._now, _, terminated, truncated, info = env.step(action)
             self._begun = (terminated | truncated).float()
-            counted = (info["metrics"][name] * self._begun for name in ("success", "crash"))
-            ended += torch.stack([self._begun.sum(), *(each.sum() for each in counted)])
-        batch |= {name: torch.stack(values) for name, values in rows.items() if values}
+            counted = self._begun * ~led[:, 0]
+            ended += torch.stack([counted.sum(), *((info["metrics"][n] * counted).sum() for n in _COUNTED)])
+        self._flown += 1
         episodes, successes, crashes = ended.tolist()
-        log = {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
-        return batch, log
+        return {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
 
-    def _learn(self, batch: dict[str, torch.Tensor], memory: torch.Tensor) -> dict[str, float]:
-        config, worlds = self.config, self.env.num_envs
-        losses, misses = [], []
-        for _ in range(config.epochs):
-            order = torch.randperm(worlds, generator=self._generator, device=memory.device)
-            for rows in order.chunk(config.minibatches):
-                action, hint = self.policy.unroll(
-                    batch["surface"][:, rows], batch["vector"][:, rows], batch["begun"][:, rows], memory[rows]
-                )
-                loss = (action - batch["label"][:, rows]).square().mean()
-                losses.append(loss.detach())
-                if "hint" in batch:
-                    missed = (hint - batch["hint"][:, rows]).square().mean()
-                    misses.append(missed.detach())
-                    loss = loss + config.hint_weight * missed
-                self.optimizer.zero_grad(set_to_none=True)
-                loss.backward()
-                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), config.gradient_max)
-                self.optimizer.step()
-        log = {"imitation": float(torch.stack(losses).mean())}
-        return log | ({"hint": float(torch.stack(misses).mean())} if misses else {})
+    def _learn(self, rate: float) -> dict[str, float]:
+        """Learn from stretches of flight that are drawn from those kept."""
+        config = self.config
+        stretches = min(self._flown, config.replay) * self.env.num_envs
+        self._losses.zero_()
+        for _ in range(config.updates):
+            rows = torch.randint(
+                stretches, (config.batch,), generator=self._generator, device=self.env.device
+            )
+            self._rows.copy_(rows)
+            self._descent.step(rate)
+        imitation, hint = (self._losses / config.updates).tolist()
+        return {"imitation": imitation, "hint": hint}
+
+    def _loss(self) -> torch.Tensor:
+        """Return the loss of the stretches that `_rows` names; adds to `_losses`."""
+        part = {name: value.flatten(0, 1).index_select(0, self._rows) for name, value in self._kept.items()}
+        memory = part.pop("memory")
+        part = {name: value.transpose(0, 1).float() for name, value in part.items()}
+        action, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
+        errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()
+        self._losses += torch.stack(errors).detach()
+        return errors[0] + self.config.hint_weight * errors[1]
+
+
+_COUNTED = ("success", "crash")

@@ -10,8 +10,15 @@ from typing import Any, Literal
 import torch
 import warp as wp
 
-from neurosim_core.learn.episodes import COLUMN_COUNT, COLUMNS, Episodes, free_points, look_at_vehicles
-from neurosim_core.learn.surfaces import EventSurface, LeakySurface, SurfaceConfig
+from neurosim_core.learn.episodes import (
+    COLUMN_COUNT,
+    COLUMNS,
+    PARAMETERS,
+    Episodes,
+    free_points,
+    look_at_vehicles,
+)
+from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
@@ -20,6 +27,9 @@ from neurosim_core.sim.simulation import Simulation
 
 CAMERA = "front"
 """Name of the event camera."""
+
+_EVENTS_PER_PIXEL = 8
+"""Room for the events of a step, in the mean of a picture: turns of 1 rad/s give up to three."""
 
 Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
 """Scenes, or those of a task to train in (`seen`) or to test in (`unseen`)."""
@@ -47,7 +57,7 @@ def make_env(
         worlds: N.
         device: Where everything is: auto, cpu, cuda:0.
         observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
-        surface: How events are shown; None: sums that decay with 20 ms and 200 ms.
+        surface: How events are shown; None: as the task says.
         scenes: Where to fly.
         models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
         randomise: Draw parameters anew in each episode; as the task says, or as told.
@@ -57,9 +67,7 @@ def make_env(
     Raises:
         ValueError: There is no such task, or a setting is not for worlds.
     """
-    import neurosim_core.learn.tasks  # noqa: F401  (registers)
-
-    chosen = find("task", task)() if isinstance(task, str) else task
+    chosen = find_task(task) if isinstance(task, str) else task
     if pixels is not None:
         chosen.camera = {**chosen.camera, "width": pixels, "height": pixels}
     return Env(
@@ -73,6 +81,18 @@ def make_env(
         randomise=randomise,
         seed=seed,
     )
+
+
+def find_task(name: str) -> Task:
+    """Return a task by its name in the registry.
+
+    Raises:
+        ValueError: There is none.
+    """
+    import neurosim_core.learn.tasks  # noqa: F401  (registers)
+
+    task: Task = find("task", name)()
+    return task
 
 
 class Env:
@@ -114,17 +134,18 @@ class Env:
         sees = observe is None or "events" in observe
         if isinstance(scenes, str):
             scenes = task.scenes(unseen=scenes == "unseen")
+        self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
+        if randomise is False:
+            self.randomisation = NO_RANDOMISATION
         self.sim = Simulation(
-            _settings(task, device, sees),
+            _settings(task, device, sees, wind=self.randomisation.wind_m_s > 0.0),
             worlds=worlds,
             seeds=seed,
+            event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
             sorted=False,
             **({"scenes": scenes} if models is None else {"models": models}),
         )
         self.num_envs, self.action_count = worlds, 4
-        self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
-        if randomise is False:
-            self.randomisation = NO_RANDOMISATION
         wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(wp_device))
         self._points = free_points(
@@ -139,7 +160,7 @@ class Env:
         self._surface: EventSurface | None = None
         if sees:
             self._surface = EventSurface(
-                LeakySurface(tau_s=(0.02, 0.2)) if surface is None else surface,
+                task.surface if surface is None else surface,
                 world_count=worlds,
                 width=task.camera["width"],
                 height=task.camera["height"],
@@ -166,6 +187,22 @@ class Env:
     def obs_groups(self) -> Mapping[str, Sequence[str]]:
         """Names of the observations that each group sees: actor, critic, teacher, student."""
         return self.task.groups
+
+    @property
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """What differs between the worlds in their present episodes, by name of `Randomisation`, [N, ...].
+
+        They are tensors of the device; what `step` returned as `seed` gives them again.
+        """
+        rows = wp.to_torch(self._episodes.parameters)
+        found = {name: rows[:, columns].clone() for name, columns in PARAMETERS.items()}
+        low, high = self.randomisation.thrust_factor
+        found["thrust_factor"] = low + (high - low) * self.view.draws[:, -1]
+        found["latency_steps"] = self._latency()
+        if self._surface is not None:
+            thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
+            found["threshold_factor"] = thresholds / self.task.threshold
+        return found
 
     @property
     def surface_card(self) -> dict[str, Any]:
@@ -206,7 +243,8 @@ class Env:
         Returns:
             Observations (of worlds whose episode ended: of their new one), rewards, terminated, truncated,
             and a dictionary: `final_obs` (what was seen last where an episode ended), `metrics` of all
-            worlds, which count there, and `seed`, from which each episode can be played again.
+            worlds, which count there, `seed`, from which each episode can be played again, and `dropped`,
+            the events that there was no room for.
         """
         view = self.view
         view.last_action.copy_(view.action)
@@ -225,6 +263,8 @@ class Env:
         torch.logical_or(terminated, truncated, out=self._mask)
         final = self._observations()
         info = {"final_obs": final, "metrics": task.metrics(view), "seed": self._seeds.clone()}
+        if self._surface is not None:
+            info["dropped"] = wp.to_torch(observation.events[CAMERA].dropped)
         if self.device.type == "cpu" and not self._mask.any():
             return final, reward, terminated, truncated, info
         if "events" in final:
@@ -247,6 +287,16 @@ class Env:
                 self.sim.thresholds(CAMERA),
                 nominal=(threshold, threshold),
                 factor=factor,
+            )
+        drawn = self.randomisation
+        if drawn.airframes_differ:
+            episodes.vary_airframes(
+                self._mask_array,
+                self.sim.airframes,
+                mass=drawn.mass_factor,
+                inertia=drawn.inertia_factor,
+                drag=drawn.drag_factor,
+                wind_max_m_s=drawn.wind_m_s,
             )
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
@@ -286,10 +336,14 @@ class Env:
         if length == 1:
             return command
         self._queue[self._queue_place] = command
-        late = (draws[:, -2] * length).long().clamp_(max=length - 1)
-        chosen = self._queue[(self._queue_place - late) % length, self._each]
+        chosen = self._queue[(self._queue_place - self._latency()) % length, self._each]
         self._queue_place = (self._queue_place + 1) % length
         return chosen
+
+    def _latency(self) -> torch.Tensor:
+        """Return the steps from an action to its effect in each episode, int64, [N]."""
+        length = self._queue.shape[0]
+        return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
     def _look(self, observation: Any) -> None:
         look_at_vehicles(
@@ -298,6 +352,7 @@ class Env:
             self._episodes,
             fields=self.sim.fields,
             scene_of_world=self.sim.scene_of_world,
+            gyro_bias_rad_s=self.randomisation.gyro_bias_rad_s,
             gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
             gravity_noise=self.randomisation.gravity_noise,
         )
@@ -325,21 +380,25 @@ class Env:
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
 
 
-def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
-    """Return the settings of the simulator for a task."""
+def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, Any]:
+    """Return the settings of the simulator for a task, in which there can be wind."""
     rate_hz = task.rate_hz * task.renders_per_step
     camera = {
         "kind": "event_camera",
         "lens": dict(task.camera),
+        "mount": dict(task.mount),
         "sampling_rate_hz": rate_hz,
         "packet_rate_hz": rate_hz,
         "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},
     }
+    vehicle = {"on_collision": "end", "max_step_s": 0.004, **task.vehicle}
+    if wind:  # that of the episodes takes its place
+        vehicle["parameters"] = {**vehicle.get("parameters", {}), "wind_m_s": (1.0, 0.0, 0.0)}
     return {
         "device": device,
         "control": {"rate_hz": task.rate_hz},
         "render": {"samples_per_pixel": task.rays_per_pixel},
         "path": {"kind": "hover"},
-        "vehicle": {"on_collision": "end", "max_step_s": 0.004, **task.vehicle},
+        "vehicle": vehicle,
         "sensors": {CAMERA: camera} if sees else {},
     }

@@ -17,6 +17,7 @@ import warp as wp
 from neurosim_core.random import normal4, random_bits, stream_id, uniform4
 from neurosim_core.scene.freespace import DistanceField, FreeSpace, sample_distance
 from neurosim_core.sim.observation import Observation
+from neurosim_core.vehicle.aerodynamics import Airframe
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,6 +37,9 @@ COLUMNS = {
 }
 """Columns of `look_at_vehicles`."""
 COLUMN_COUNT = 29
+
+PARAMETERS = {"mass_factor": 0, "inertia_factor": 1, "drag_factor": 2, "wind_m_s": slice(3, 5)}
+"""Columns of what differs between the airframes of worlds; of the wind x and y in W."""
 
 _POINT_COUNT = 4096
 _GOAL_TRIES = 16
@@ -149,6 +153,7 @@ def _look(
     # Model:
     fields: wp.array[DistanceField],
     scene_of_world: wp.array[wp.int32],
+    gyro_bias: wp.float32,
     gyro_noise: wp.float32,
     gravity_noise: wp.float32,
     # In:
@@ -171,6 +176,7 @@ def _look(
     stamp = clock_ns[world]
     n = normal4(random_bits(seeds[world], _NOISE, stamp, 0))
     m = normal4(random_bits(seeds[world], _NOISE, stamp, 1))
+    b = gyro_bias * _signed(uniform4(random_bits(seeds[world], _EPISODE, wp.int64(6), 0)))
     _write(rows_out, world, 0, p)
     _write(rows_out, world, 3, v)
     for part in range(4):
@@ -179,7 +185,7 @@ def _look(
     _write(rows_out, world, 13, wp.quat_rotate_inv(q, v))
     _write(rows_out, world, 16, down)
     _write(rows_out, world, 19, wp.quat_rotate_inv(q, goal[world] - p))
-    _write(rows_out, world, 22, w + gyro_noise * wp.vec3(n[0], n[1], n[2]))
+    _write(rows_out, world, 22, w + wp.vec3(b[0], b[1], b[2]) + gyro_noise * wp.vec3(n[0], n[1], n[2]))
     _write(rows_out, world, 25, down + gravity_noise * wp.vec3(m[0], m[1], m[2]))
     rows_out[world, 28] = sample_distance(fields[scene_of_world[world]], p)[0]
 
@@ -202,6 +208,60 @@ def _scale_thresholds(
         on = wp.float64(low + (high - low) * u[0])
         off = wp.float64(low + (high - low) * u[1])
         thresholds_out[world] = wp.vec2d(on * nominal[0], off * nominal[1])
+
+
+@wp.struct
+class _Ranges:
+    mass: wp.vec2
+    inertia: wp.vec2
+    drag: wp.vec2
+    wind_max: wp.float32
+
+
+@wp.func
+def _within(bounds: wp.vec2, u: wp.float32) -> wp.float32:
+    return bounds[0] + (bounds[1] - bounds[0]) * u
+
+
+@wp.kernel
+def _vary_airframes(
+    # Model:
+    nominal: wp.array[Airframe],
+    ranges: _Ranges,
+    # In:
+    mask: wp.array[wp.bool],
+    seeds: wp.array[wp.uint64],
+    # Out:
+    airframes_out: wp.array[Airframe],
+    parameters_out: wp.array2d[wp.float32],
+) -> None:
+    world = wp.tid()
+    if not mask[world]:
+        return
+    u = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(5), 0))
+    mass = _within(ranges.mass, u[0])
+    inertia = _within(ranges.inertia, u[1])
+    drag = _within(ranges.drag, u[2])
+    around = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(5), 1))
+    speed = ranges.wind_max * u[3]
+    wind = speed * wp.vec2(wp.cos(2.0 * wp.PI * around[0]), wp.sin(2.0 * wp.PI * around[0]))
+    airframe = nominal[0]
+    airframe.mass_inverse = airframe.mass_inverse / wp.float64(mass)
+    scale = wp.float64(mass) * wp.float64(inertia)
+    airframe.inertia = airframe.inertia * scale
+    airframe.inertia_inverse = airframe.inertia_inverse / scale
+    airframe.inertia_diagonal = airframe.inertia_diagonal * scale
+    airframe.inertia_diagonal_inverse = airframe.inertia_diagonal_inverse / scale
+    airframe.rotor_drag = airframe.rotor_drag * wp.float64(drag)
+    airframe.parasitic_drag = airframe.parasitic_drag * wp.float64(drag)
+    if ranges.wind_max > 0.0:
+        airframe.wind = wp.vec3d(wp.float64(wind[0]), wp.float64(wind[1]), wp.float64(0.0))
+    airframes_out[world] = airframe
+    parameters_out[world, 0] = mass
+    parameters_out[world, 1] = inertia
+    parameters_out[world, 2] = drag
+    parameters_out[world, 3] = wind[0]
+    parameters_out[world, 4] = wind[1]
 
 
 def free_points(spaces: Sequence[FreeSpace], *, clearance_m: float, device: Any) -> Any:
@@ -233,6 +293,7 @@ class Episodes:
         seeds: Seed of the present episode of each world, device array of uint64, shape [N].
         goal: Where to go [m], device array of vec3, shape [N].
         draws: Uniform numbers of each episode, device array of float32, shape [N, DRAW_COUNT].
+        parameters: Of the airframe in each episode, device array of float32, shape [N, 5]; see `PARAMETERS`.
     """
 
     def __init__(
@@ -253,6 +314,9 @@ class Episodes:
         self.seeds: Any = wp.zeros(world_count, dtype=wp.uint64, device=device)
         self.goal: Any = wp.zeros(world_count, dtype=wp.vec3, device=device)
         self.draws: Any = wp.zeros((world_count, DRAW_COUNT), dtype=wp.float32, device=device)
+        rows = np.tile(np.array([1.0, 1.0, 1.0, 0.0, 0.0], dtype=np.float32), (world_count, 1))
+        self.parameters: Any = wp.array(rows, dtype=wp.float32, device=device)
+        self._nominal: Any = None
 
     def seed(self, seed: int) -> None:
         """Let world i go on from seed + i."""
@@ -265,6 +329,30 @@ class Episodes:
             dim=len(self.seeds),
             inputs=[self._points, self._scene_of_world, self._start, mask, self.seeds],
             outputs=[*self.start.values(), self.goal, self.draws],
+            device=self._device,
+        )
+
+    def vary_airframes(
+        self,
+        mask: Any,
+        airframes: Any,
+        *,
+        mass: tuple[float, float],
+        inertia: tuple[float, float],
+        drag: tuple[float, float],
+        wind_max_m_s: float,
+    ) -> None:
+        """Draw the airframes of the worlds of a mask: factors on those of the first call, and a wind."""
+        if self._nominal is None:
+            self._nominal = wp.clone(airframes[:1])
+        ranges = _Ranges()
+        ranges.mass, ranges.inertia, ranges.drag = wp.vec2(*mass), wp.vec2(*inertia), wp.vec2(*drag)
+        ranges.wind_max = wind_max_m_s
+        wp.launch(
+            _vary_airframes,
+            dim=len(self.seeds),
+            inputs=[self._nominal, ranges, mask, self.seeds],
+            outputs=[airframes, self.parameters],
             device=self._device,
         )
 
@@ -288,6 +376,7 @@ def look_at_vehicles(
     *,
     fields: Any,
     scene_of_world: Any,
+    gyro_bias_rad_s: float,
     gyro_noise_rad_s: float,
     gravity_noise: float,
 ) -> None:
@@ -299,6 +388,7 @@ def look_at_vehicles(
         episodes: Their seeds address the noise; and where to go.
         fields: Distance to each scene, array of `DistanceField`.
         scene_of_world: Index of the scene of each world.
+        gyro_bias_rad_s: Largest bias of the gyroscope about each axis [rad/s].
         gyro_noise_rad_s: Standard deviation of the gyroscope [rad/s].
         gravity_noise: Standard deviation of each part of the measured direction of gravity.
     """
@@ -310,6 +400,7 @@ def look_at_vehicles(
         inputs=[
             fields,
             scene_of_world,
+            gyro_bias_rad_s,
             gyro_noise_rad_s,
             gravity_noise,
             episodes.seeds,

@@ -31,17 +31,23 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
     """
     onnx = need("onnx")
     shape, graph = policy.shape, _Graph(onnx)
-    feature = graph.add("Log", [graph.add("Add", ["events", graph.constant(np.float32(1.0))])])
+    hidden, size = policy.hidden, policy.memory_size
+    seen = graph.add("Log", [graph.add("Add", ["events", graph.constant(np.float32(1.0))])])
     for layer in policy.eyes:
-        feature = graph.layer(layer, feature)
-    inputs = graph.add("Concat", [feature, "vector"], axis=1)
-    memory = graph.gru(policy.memory, inputs, "memory")
-    head = graph.layer(policy.head, memory)
-    columns = [graph.constant(np.array([n], np.int64)) for n in (0, shape["action_count"], 1)]
-    action = graph.add("Slice", [head, columns[0], columns[1], columns[2]])
+        seen = graph.layer(layer, seen)
+    features = graph.add("Concat", [seen, "vector"], axis=1)
+    for layer in policy.mix:
+        features = graph.layer(layer, features)
+    before, estimate = graph.columns("memory", 0, hidden), graph.columns("memory", hidden, size)
+    inputs = graph.add("Concat", [features, estimate], axis=1)
+    after = graph.gru(policy.memory, inputs, before)
+    change = graph.add("Mul", [graph.layer(policy.change, after), graph.constant(np.float32(0.1))])
+    memory = graph.add("Concat", [after, graph.add("Add", [estimate, change])], output="memory_out", axis=1)
+    action = graph.add("Concat", [memory, "vector"], axis=1)
+    for layer in policy.head:
+        action = graph.layer(layer, action)
     bounds = [graph.constant(np.float32(bound)) for bound in (-1.0, 1.0)]
     graph.add("Clip", [action, *bounds], output="action")
-    graph.add("Identity", [memory], output="memory_out")
 
     def tensor(name: str, *size: int) -> Any:
         return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, *size])
@@ -53,9 +59,9 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
             [
                 tensor("events", shape["channels"], shape["height"], shape["width"]),
                 tensor("vector", shape["vector_size"]),
-                tensor("memory", shape["memory_size"]),
+                tensor("memory", size),
             ],
-            [tensor("action", shape["action_count"]), tensor("memory_out", shape["memory_size"])],
+            [tensor("action", shape["action_count"]), tensor("memory_out", size)],
             graph.constants,
         ),
         opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
@@ -83,6 +89,10 @@ class _Graph:
         name = output or f"n{len(self.nodes)}"
         self.nodes.append(self._onnx.helper.make_node(kind, inputs, [name], **attributes))
         return name
+
+    def columns(self, x: str, begin: int, end: int) -> str:
+        bounds = [self.constant(np.array([n], np.int64)) for n in (begin, end, 1)]
+        return self.add("Slice", [x, *bounds])
 
     def linear(self, weight: Any, bias: Any, x: str) -> str:
         values = [self.constant(each.detach().cpu().numpy()) for each in (weight, bias)]

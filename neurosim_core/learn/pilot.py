@@ -148,6 +148,7 @@ def pilot_settings(card: Mapping[str, Any]) -> dict[str, Any]:
             CAMERA: {
                 "kind": "event_camera",
                 "lens": dict(card["camera"]),
+                "mount": dict(card["mount"]),
                 "sampling_rate_hz": rate_hz * card["renders_per_step"],
                 "packet_rate_hz": rate_hz,
                 "pixel": {"threshold_on": card["threshold"], "threshold_off": card["threshold"]},
@@ -187,7 +188,7 @@ def fly_policy(
     Args:
         policy: Name of a policy that comes with the package, or a file.
         duration_s: For how long [s].
-        seed: Of the throw: 0.8 m/s in some direction.
+        seed: Of the throw: 1.2 m/s in some direction.
         overrides: Further settings by dotted key, such as {"scene.seed": 3}.
         say: Told how it goes, line by line.
 
@@ -204,7 +205,7 @@ def fly_policy(
     model = sim.make_model(config)
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     start = sim.StartState(
-        position=model.free_space.seed_m, velocity=[0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.0]
+        position=model.free_space.seed_m, velocity=[1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0]
     )
     state = sim.make_state(model, start=start)
     packets = sim.start(model, state)

@@ -67,7 +67,10 @@ class ActorCritic(nn.Module):
 
 
 class EventPolicy(nn.Module):
-    """A convolutional network on event surfaces, and a GRU over time.
+    """A convolutional network on event surfaces, a GRU over time, and an estimate that is integrated.
+
+    The estimate (such as of the velocity) is part of the memory, and the network gives its change in each
+    step: a vehicle that does not see much goes on from what it saw, by dead reckoning.
 
     Args:
         channels: Of the surfaces.
@@ -75,8 +78,8 @@ class EventPolicy(nn.Module):
         width: Of the surfaces [px].
         vector_size: Numbers seen besides.
         action_count: Numbers in an action.
-        hint_count: Numbers that it learns to estimate besides, such as the velocity.
-        memory_size: Numbers remembered from step to step.
+        hint_count: Numbers that it estimates, at least 1.
+        hidden: Width of the GRU.
     """
 
     def __init__(
@@ -87,7 +90,7 @@ class EventPolicy(nn.Module):
         vector_size: int,
         action_count: int = 4,
         hint_count: int = 3,
-        memory_size: int = 128,
+        hidden: int = 128,
     ) -> None:
         super().__init__()
         self.shape = {
@@ -97,36 +100,50 @@ class EventPolicy(nn.Module):
             "vector_size": vector_size,
             "action_count": action_count,
             "hint_count": hint_count,
-            "memory_size": memory_size,
+            "hidden": hidden,
         }
-        self.memory_size, self.action_count = memory_size, action_count
+        self.memory_size, self.hidden = hidden + hint_count, hidden
         convolutions: list[nn.Module] = []
-        rows, columns, inputs = height, width, channels
-        for outputs in (16, 32, 48):
-            convolutions += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ELU()]
-            rows, columns, inputs = -(-rows // 2), -(-columns // 2), outputs
+        rows, columns, inputs, size = height, width, channels, 5
+        for outputs in (32, 48, 48, 48, 48):
+            convolutions += [nn.Conv2d(inputs, outputs, size, stride=2, padding=size // 2), nn.ELU()]
+            rows, columns, inputs, size = -(-rows // 2), -(-columns // 2), outputs, 3
+            if max(rows, columns) <= 4:
+                break
         self.eyes = nn.Sequential(
-            *convolutions, nn.Flatten(), nn.Linear(inputs * rows * columns, 64), nn.ELU()
+            *convolutions, nn.Flatten(), nn.Linear(inputs * rows * columns, 96), nn.ELU()
         )
-        self.memory = nn.GRUCell(64 + vector_size, memory_size)
-        self.head = nn.Linear(memory_size, action_count + hint_count)
+        self.mix = nn.Sequential(nn.Linear(96 + vector_size, 96), nn.ELU())
+        self.memory = nn.GRUCell(96 + hint_count, hidden)
+        self.change = nn.Linear(hidden, hint_count)
+        nn.init.orthogonal_(self.change.weight, 0.02)
+        nn.init.zeros_(self.change.bias)
+        self.head = nn.Sequential(
+            nn.Linear(self.memory_size + vector_size, 64), nn.ELU(), nn.Linear(64, action_count)
+        )
 
-    def see(self, surfaces: torch.Tensor) -> torch.Tensor:
-        """Return features of surfaces, [n, 64]."""
-        features: torch.Tensor = self.eyes(torch.log1p(surfaces))
+    def see(self, surfaces: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+        """Return features of a step, [n, 96]."""
+        features: torch.Tensor = self.mix(torch.cat([self.eyes(torch.log1p(surfaces)), vector], dim=-1))
         return features
+
+    def remember(self, features: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
+        """Return the memory after a step, [N, memory_size]."""
+        hidden, estimate = memory[:, : self.hidden], memory[:, self.hidden :]
+        hidden = self.memory(torch.cat([features, estimate], dim=1), hidden)
+        return torch.cat([hidden, estimate + 0.1 * self.change(hidden)], dim=1)
 
     def forward(
         self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions in [-1, 1], [N, 4], and the memory for the next step, [N, memory_size]."""
-        memory = self.memory(torch.cat([self.see(surfaces), vector], dim=1), memory)
-        return torch.clamp(self.head(memory)[:, : self.action_count], -1.0, 1.0), memory
+        memory = self.remember(self.see(surfaces, vector), memory)
+        return torch.clamp(self.head(torch.cat([memory, vector], dim=1)), -1.0, 1.0), memory
 
     def unroll(
         self, surfaces: torch.Tensor, vectors: torch.Tensor, begun: torch.Tensor, memory: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return actions (not clamped) and hints of a stretch of steps.
+        """Return actions (not clamped) and estimates of a stretch of steps.
 
         Args:
             surfaces: [T, N, C, H, W].
@@ -134,11 +151,10 @@ class EventPolicy(nn.Module):
             begun: An episode begins with this step: the memory is empty, float32, [T, N].
             memory: Before the first, [N, memory_size].
         """
-        features = self.see(surfaces.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
-        inputs = torch.cat([features, vectors], dim=2)
-        remembered = []
-        for step, keep in enumerate(1.0 - begun):
-            memory = self.memory(inputs[step], memory * keep[:, None])
-            remembered.append(memory)
-        out = self.head(torch.stack(remembered))
-        return out[..., : self.action_count], out[..., self.action_count :]
+        seen = self.see(surfaces.flatten(0, 1), vectors.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
+        memories = []
+        for features, keep in zip(seen, 1.0 - begun, strict=True):
+            memory = self.remember(features, memory * keep[:, None])
+            memories.append(memory)
+        remembered = torch.stack(memories)
+        return self.head(torch.cat([remembered, vectors], dim=2)), remembered[..., self.hidden :]

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from neurosim_core.learn.descent import Descent
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import ActorCritic
 
@@ -46,7 +47,10 @@ class Ppo:
         observations, _ = env.reset()
         sizes = [env.group(observations, name).shape[1] for name in ("actor", "critic")]
         self.policy = ActorCritic(*sizes).to(env.device)
-        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max, eps=1e-5)
+        self._batch: dict[str, torch.Tensor] = {}
+        size = config.horizon * env.num_envs // config.minibatches
+        self._rows = torch.zeros(size, dtype=torch.int64, device=env.device)
         self._now = self._seen(observations)
 
     def begin(self, seed: int) -> None:
@@ -63,21 +67,19 @@ class Ppo:
         Returns:
             What to log.
         """
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * (1.0 - 0.9 * done)
         with torch.no_grad():
             batch, log = self._fly()
-        self._learn(batch)
+        self._learn(batch, self.config.learning_rate * (1.0 - 0.9 * done))
         return log
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training goes on from."""
-        return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {"policy": self.policy.state_dict(), "optimizer": self._descent.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.policy.load_state_dict(state["policy"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self._descent.optimizer.load_state_dict(state["optimizer"])
 
     def _seen(self, observations: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         return self.env.group(observations, "actor"), self.env.group(observations, "critic")
@@ -132,24 +134,28 @@ class Ppo:
             advantages[step], later = following, value[step]
         return advantages
 
-    def _learn(self, batch: dict[str, torch.Tensor]) -> None:
-        config, policy = self.config, self.policy
-        count = len(batch["value"])
+    def _learn(self, batch: dict[str, torch.Tensor], rate: float) -> None:
         advantage = batch["advantage"]
         batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        for _ in range(config.epochs):
-            order = torch.randperm(count, generator=self._generator, device=advantage.device)
-            for rows in order.chunk(config.minibatches):
-                part = {name: value[rows] for name, value in batch.items()}
-                log_p = policy.log_probability(policy(part["actor"]), part["action"])
-                ratio = torch.exp(log_p - part["log_p"])
-                gain = torch.minimum(
-                    ratio * part["advantage"],
-                    ratio.clamp(1.0 - config.clip, 1.0 + config.clip) * part["advantage"],
-                ).mean()
-                error = (policy.value(part["critic"]) - part["return"]).square().mean()
-                loss = 0.5 * error - gain - config.entropy_weight * policy.entropy()
-                self.optimizer.zero_grad(set_to_none=True)
-                loss.backward()
-                torch.nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_max)
-                self.optimizer.step()
+        if not self._batch:
+            self._batch = {name: torch.empty_like(value) for name, value in batch.items()}
+        for name, value in batch.items():
+            self._batch[name].copy_(value)
+        for _ in range(self.config.epochs):
+            order = torch.randperm(len(advantage), generator=self._generator, device=advantage.device)
+            for rows in order.split(len(self._rows))[: self.config.minibatches]:
+                self._rows.copy_(rows)
+                self._descent.step(rate)
+
+    def _loss(self) -> torch.Tensor:
+        """Return the loss of the rows of the batch that `_rows` names."""
+        config, policy = self.config, self.policy
+        part = {name: value.index_select(0, self._rows) for name, value in self._batch.items()}
+        log_p = policy.log_probability(policy(part["actor"]), part["action"])
+        ratio = torch.exp(log_p - part["log_p"])
+        gain = torch.minimum(
+            ratio * part["advantage"],
+            ratio.clamp(1.0 - config.clip, 1.0 + config.clip) * part["advantage"],
+        ).mean()
+        error = (policy.value(part["critic"]) - part["return"]).square().mean()
+        return 0.5 * error - gain - config.entropy_weight * policy.entropy()

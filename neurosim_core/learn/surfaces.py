@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 _ONE = wp.constant(65536.0)  # of the fixed-point sums: a pixel has room for 32,767 events in a step
 _NEVER_US = wp.constant(wp.int64(-(1 << 60)))
-_THREADS_ON_CUDA = 64
+_THREADS_ON_CUDA = 256
 """Threads that share the events of a world."""
 
 
@@ -221,13 +221,15 @@ def _show_sums(
     # Model:
     decay: wp.array[wp.float32],
     # In/out:
-    sums: wp.array4d[wp.int32],
-    surface: wp.array4d[wp.float32],
+    sums: wp.array2d[wp.int32],
+    surface: wp.array2d[wp.float32],
 ) -> None:
-    world, channel, row, column = wp.tid()
-    added = wp.float32(sums[world, channel, row, column]) / _ONE
-    sums[world, channel, row, column] = 0
-    surface[world, channel, row, column] = surface[world, channel, row, column] * decay[channel] + added
+    plane, pixel = wp.tid()  # two axes: with four, CUDA spends more on indices than on sums
+    added = sums[plane, pixel]
+    if added != 0:
+        sums[plane, pixel] = 0
+    before = surface[plane, pixel] * decay[plane % decay.shape[0]]
+    surface[plane, pixel] = before + wp.float32(added) / _ONE
 
 
 @wp.kernel
@@ -312,7 +314,9 @@ class EventSurface:
         else:
             inputs = [events.t, *where, now_ns, self._step_us, self._lanes]
             self._launch(_add_voxels, dim, inputs, [self._sums])
-        self._launch(_show_sums, self.array.shape, [self._decay], [self._sums, self.array])
+        planes = (self.array.shape[0] * self.array.shape[1], self.array.shape[2] * self.array.shape[3])
+        flat = [self._sums.reshape(planes), self.array.reshape(planes)]
+        self._launch(_show_sums, planes, [self._decay], flat)
 
     def forget(self, mask: Any) -> None:
         """Clear the surfaces of worlds that begin anew; `mask` is a device array of int32, shape [N]."""

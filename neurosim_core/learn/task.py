@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
 from neurosim_core.vehicle import MultirotorConfig
 
 MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
@@ -28,10 +29,26 @@ class Randomisation:
     """Most steps between an action and its effect; each episode has its own, from 0 on."""
     threshold_factor: tuple[float, float] = (0.8, 1.25)
     """Range of each threshold of the event camera against the nominal one."""
+    mass_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the mass; with the inertia of the same shape."""
+    inertia_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the inertia besides."""
+    drag_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of rotor drag and parasitic drag."""
+    wind_m_s: float = 0.0
+    """Strongest wind, level and constant in an episode [m/s]; if > 0, in place of the vehicle's."""
+    gyro_bias_rad_s: float = 0.0
+    """Largest bias of the gyroscope about each axis, constant in an episode [rad/s]."""
     gyro_noise_rad_s: float = 0.02
     """Standard deviation of the gyroscope [rad/s]."""
     gravity_noise: float = 0.01
     """Standard deviation of each part of the measured direction of gravity."""
+
+    @property
+    def airframes_differ(self) -> bool:
+        """Mass, inertia, drag or wind are drawn."""
+        factors = self.mass_factor, self.inertia_factor, self.drag_factor
+        return self.wind_m_s > 0.0 or any(factor != (1.0, 1.0) for factor in factors)
 
 
 NO_RANDOMISATION = Randomisation(
@@ -101,6 +118,10 @@ class Task:
     """When an episode is cut (truncated) [s]."""
     camera: Mapping[str, Any] = {"width": 24, "height": 24, "horizontal_fov_rad": 1.6}
     """Lens of the event camera."""
+    mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03)}
+    """Where it sits on the body: {position_m, rpy_rad}; a positive pitch looks down."""
+    surface: SurfaceConfig = LeakySurface(tau_s=(0.02, 0.2))
+    """How events are shown."""
     threshold: float = 0.1
     """Of the event camera, both ways."""
     renders_per_step: int = 1
@@ -111,6 +132,8 @@ class Task:
     """Settings of the vehicle."""
     start: StartConfig = StartConfig()
     randomisation: Randomisation = Randomisation()
+    training: Randomisation | None = None
+    """What training draws in its place: with more of it, students cope with other scenes; None: the same."""
     rate_max_rad_s: Sequence[float] = (4.0, 4.0, 2.0)
     """Body rates of an action of 1 [rad/s]."""
     thrust_span: float = 0.6

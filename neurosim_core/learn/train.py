@@ -21,7 +21,7 @@ import torch
 
 from neurosim_core.learn import need
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
-from neurosim_core.learn.env import Env, make_env
+from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
@@ -78,11 +78,14 @@ class Training:
         self.trained_s: dict[str, float] = {}
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
+        drawn = find_task(config.task).training
+        randomise = True if drawn is None else drawn
         self.env = make_env(
             config.task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
+            randomise=randomise,
             pixels=config.pixels,
             seed=config.seed,
         )
@@ -95,6 +98,7 @@ class Training:
             device=config.device,
             observe=states,
             models=self.env.sim.models,
+            randomise=randomise,
             seed=config.seed,
         )
         self._teacher = Ppo(teacher_env, config.teacher, self._generator)
@@ -186,15 +190,24 @@ class Training:
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
+def prepare_torch() -> None:
+    """Choose how PyTorch computes in this process."""
+    torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
+    torch.backends.cudnn.benchmark = True
+    torch.set_float32_matmul_precision("high")
+
+
 def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
     """Return how a task is trained: with more worlds on a GPU, and for longer."""
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
-        return config
+        return dataclasses.replace(config, pixels=24)
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512),
-        student=DaggerConfig(worlds=2048, iterations=220, horizon=25, minibatches=6),
+        teacher=PpoConfig(worlds=512, iterations=40),
+        student=DaggerConfig(worlds=1024, iterations=88, replay=4, updates=24, batch=128),
+        block=44,
+        evaluation_worlds=512,
     )
 
 
@@ -272,7 +285,7 @@ def train(
 
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
-    torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
+    prepare_torch()
     training = Training(folder, None if resume else config, say=say)
     if resume:
         training.resume()
@@ -297,6 +310,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "task": name,
         "rate_hz": task.rate_hz,
         "camera": dict(task.camera),
+        "mount": dict(task.mount),
         "threshold": task.threshold,
         "renders_per_step": task.renders_per_step,
         "rays_per_pixel": task.rays_per_pixel,

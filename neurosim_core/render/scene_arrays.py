@@ -82,29 +82,21 @@ def upload_scene(
     )
     materials = (*scene.materials, *joined.materials)
     light: NDArray[np.float32] | None = None
-    with ThreadPoolExecutor(max_workers=1) as aside:
+    with ThreadPoolExecutor(max_workers=2) as aside:
         packing = aside.submit(pack_textures, materials)
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
+        building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
         if baked or config.exposure == "auto":
             light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
         packed = packing.result()
+        tree, embree = building.result()
     terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
     material = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
         exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
-
-    points = wp.array(mesh.vertices, dtype=wp.vec3, device=device)
-    indices = wp.array(mesh.faces.reshape(-1), dtype=int, device=device)
-    tree = wp.Mesh(
-        points,
-        indices,
-        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
-        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
-    )
-    embree = EmbreeTree(mesh.vertices, mesh.faces) if embree_width else None
     data = SceneData()
     data.mesh = tree.id
     if embree is not None:
@@ -144,6 +136,17 @@ def upload_scene(
         data=data,
         exposure=exposure,
     )
+
+
+def _build_trees(mesh: RefinedMesh, device: str, *, embree: bool) -> tuple[wp.Mesh, EmbreeTree | None]:
+    """Return the tree of a mesh as Warp has it, and as Embree has it if that casts rays."""
+    tree = wp.Mesh(
+        wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+        wp.array(mesh.faces.reshape(-1), dtype=int, device=device),
+        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+    return tree, EmbreeTree(mesh.vertices, mesh.faces) if embree else None
 
 
 def _terms_of(

@@ -177,9 +177,6 @@ def room_around(
     return scene_distance(field, point, exact_below) - radius
 
 
-_NAMED_INSIDE = "the point that the scene names as inside"
-
-
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class FreeSpace:
     """The map of a scene that paths are planned on."""
@@ -196,6 +193,8 @@ class FreeSpace:
     """A point in the free space that is meant [m], shape [3]."""
     seed_rule: str
     """How the seed was found, one sentence."""
+    closed: bool
+    """Outside there is nothing to fly in (`Scene.closed`), and no `seed_m` of the configuration says else."""
     notes: tuple[str, ...]
     """What was assumed, one sentence each; shown to the user."""
     arrays: DistanceField
@@ -243,7 +242,7 @@ class FreeSpace:
         return _reachable(self, clearance_m)
 
     def check_start(self, point_m: ArrayLike) -> None:
-        """Refuse to begin inside a solid, or outside of a scene that names its inside (`Scene.inside_m`).
+        """Refuse to begin inside a solid, or outside of a closed scene.
 
         A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
         (12 m^3). Where a surface passes, there is no solid to be inside of. Outside is what is beyond the
@@ -269,7 +268,7 @@ class FreeSpace:
                 if volume_m3 >= _ROOM_MIN_M3:
                     return
                 where = f"inside a solid of {volume_m3:.2g} m^3"
-        if where.startswith("inside") or self.seed_rule == _NAMED_INSIDE:
+        if where.startswith("inside") or self.closed:
             raise ValueError(
                 f"the path begins at {np.round(point, 3).tolist()} m, {where}; "
                 f"free space is around {np.round(self.seed_m, 3).tolist()} m"
@@ -360,7 +359,7 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     arrays.voxel = wp.float32(voxel)
     known = _Seed(np.array(config.seed_m), "seed_m of the configuration") if config.seed_m else None
     if known is None and scene.inside_m is not None:
-        known = _Seed(np.array(scene.inside_m), _NAMED_INSIDE)
+        known = _Seed(np.array(scene.inside_m), "the point that the scene names as inside")
     host = distance.numpy()
     unseeded = FreeSpace(
         distance=host,
@@ -369,6 +368,7 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
         bounds_m=bounds,
         seed_m=bounds.mean(axis=0),
         seed_rule="",
+        closed=scene.closed and config.seed_m is None,
         notes=(),
         arrays=arrays,
         mesh=mesh,

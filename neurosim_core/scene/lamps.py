@@ -149,11 +149,15 @@ def _steps_by_air(free: NDArray[np.bool_], start: NDArray[np.int64]) -> NDArray[
     _, depth, height = padded.shape
     wide = around @ (depth * height, height, 1)
     near = wide[np.abs(around).sum(axis=1) == 1]
+    place = np.empty(unseen.shape, dtype=np.int64)
     before, last = wide[:0], np.array([(start + 1) @ (depth * height, height, 1)])
     steps[last], unseen[last] = 0.0, False
     for step in range(1, sum(free.shape) * 2):
         leaving = last[:, None] + near if step % 2 else np.concatenate([before, last])[:, None] + wide
-        found = np.unique(leaving[unseen[leaving]])
+        found = leaving[unseen[leaving]]
+        order = np.arange(len(found))
+        place[found] = order
+        found = found[place[found] == order]  # each once
         if step % 2 == 0 and len(found) == 0:
             break
         steps[found], unseen[found] = step, False

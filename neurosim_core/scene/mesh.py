@@ -365,12 +365,12 @@ def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], pa
         material, color_uv, tinted = _tint(np.concatenate(colors)[keep], tinted, material, materials, notes)
 
     # one vertex for each distinct pair of file vertex and normal; corners of tinted faces are never shared
-    pair = np.stack([corner_vertex, corner_normal], axis=1)
     apart = np.repeat(tinted, 3)
-    order = np.lexsort((np.where(apart, np.arange(len(pair)), -1), pair[:, 1], pair[:, 0]))
-    new = np.ones(len(pair), dtype=bool)
-    new[1:] = (pair[order[1:]] != pair[order[:-1]]).any(axis=1) | apart[order[1:]] | apart[order[:-1]]
-    index = np.empty(len(pair), dtype=np.int64)
+    key = corner_vertex << 33 | (corner_normal + 1) << 1 | apart
+    order = np.argsort(key, kind="stable")
+    new = np.ones(len(key), dtype=bool)
+    new[1:] = (key[order[1:]] != key[order[:-1]]) | apart[order[1:]] | apart[order[:-1]]
+    index = np.empty(len(key), dtype=np.int64)
     index[order] = np.cumsum(new) - 1
     first = order[new]
     vertex, normal = corner_vertex[first], corner_normal[first]

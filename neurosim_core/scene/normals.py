@@ -51,9 +51,10 @@ def smooth_normals(
     tail = np.arange(faces.size)
     head = tail + 1 - 3 * (tail % 3 == 2)
     ends = np.sort(point[faces].reshape(-1)[np.stack([tail, head], axis=1)], axis=1)
-    sorted_edges = np.lexsort((ends[:, 1], ends[:, 0]))
+    edge_key = ends[:, 0] << 32 | ends[:, 1]
+    sorted_edges = np.argsort(edge_key, kind="stable")
     first, second = sorted_edges[:-1], sorted_edges[1:]
-    gentle = (ends[first] == ends[second]).all(axis=1)
+    gentle = edge_key[first] == edge_key[second]
     gentle &= np.einsum("ex,ex->e", face_normal[first // 3], face_normal[second // 3]) > np.cos(CREASE_RAD)
     first, second = first[gentle], second[gentle]
     at = point[faces].reshape(-1)

@@ -97,6 +97,8 @@ class Scene:
     """What instances are, such as "chair", by name, where the file says it."""
     inside_m: tuple[float, float, float] | None = None
     """A point known to be in free space, if the source of the scene knows one [m]."""
+    closed: bool = False
+    """Whether paths must begin inside: there is nothing to see from outside."""
 
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What was subtracted from the coordinates of the file, in metres and with z up, as float32 could not

@@ -82,3 +82,11 @@ def as_device_array(value: Any, device: Any) -> Any:
     if device.is_cuda and hasattr(value, "__cuda_array_interface__"):
         return wp.from_dlpack(value)
     return None
+
+
+def check_rows(rows: Any, out: Any, name: str) -> None:
+    """Refuse an array of the device that cannot be copied to another."""
+    if rows.ndim != 2 or tuple(rows.shape) != tuple(out.shape):
+        raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
+    if rows.dtype not in (wp.float32, wp.float64):
+        raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")

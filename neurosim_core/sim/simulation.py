@@ -23,7 +23,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.sim.carrier import Carrier
-from neurosim_core.sim.inputs import as_device_array, make_seeds
+from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples, VehicleStates
@@ -154,6 +154,14 @@ class Simulation:
                 if thresholds is not None:
                     return thresholds
         raise ValueError(f"{camera!r} is no event camera with ideal pixels: its thresholds stay as they are")
+
+    @property
+    def airframes(self) -> Any:
+        """Parameters of the multirotor of each world, device array of `vehicle.aerodynamics.Airframe`, [N].
+
+        They may be written between steps. Controllers and motors go on with the configured ones.
+        """
+        return self._state.vehicle.airframes
 
     @property
     def fields(self) -> Any:
@@ -370,7 +378,7 @@ class Simulation:
         self._state.command_mode = mode
 
     def _take_rows(self, rows: Any, out: Any, name: str) -> None:
-        _check_rows(rows, out, name)
+        check_rows(rows, out, name)
         wp.launch(take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
 
     def _checked_mask(self, mask: Any) -> Any:
@@ -401,7 +409,7 @@ class Simulation:
         for name, value in given.items():
             array = getattr(self._state.start, name)
             if (on_device := as_device_array(value, self.device)) is not None:
-                _check_rows(on_device, array, name)
+                check_rows(on_device, array, name)
                 checked[name] = on_device
             elif value is None:
                 checked[name] = None
@@ -480,14 +488,6 @@ def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> N
                 f"sensors.{name}.rate_hz must divide control.rate_hz = {control.rate_hz:g} in worlds, where "
                 f"pictures are taken at the end of steps, got {rate.rate_hz:g}"
             )
-
-
-def _check_rows(rows: Any, out: Any, name: str) -> None:
-    """Refuse an array of the device that cannot be copied to another."""
-    if rows.ndim != 2 or tuple(rows.shape) != tuple(out.shape):
-        raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
-    if rows.dtype not in (wp.float32, wp.float64):
-        raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
 
 
 def _first(rows: Any, count: int) -> Any:

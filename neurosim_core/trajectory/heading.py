@@ -9,9 +9,9 @@ control points, so the limit holds everywhere.
 from __future__ import annotations
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.interpolate import BSpline, PPoly
 from scipy.ndimage import gaussian_filter1d
 
 from neurosim_core.clock import NS_PER_S
@@ -75,8 +75,8 @@ def follow_travel(path: Path, *, lookahead_s: float, rate_max_rad_s: float) -> P
     limited = _nearest_with_slope(target, rate_max_rad_s * _SAMPLE_NS / NS_PER_S)
     smooth = gaussian_filter1d(limited, _SMOOTHING_S * NS_PER_S / _SAMPLE_NS, mode="nearest")
 
-    spline = BSpline(clamped, np.interp(asked_s, stamps_s, smooth), _DEGREE)
-    powers = np.asarray(PPoly.from_spline(spline.tck).c)[::-1]  # of seconds since the knot
+    spline = scipy.interpolate.BSpline(clamped, np.interp(asked_s, stamps_s, smooth), _DEGREE)
+    powers = np.asarray(scipy.interpolate.PPoly.from_spline(spline.tck).c)[::-1]  # of seconds since the knot
     pieces = powers[:, _DEGREE : _DEGREE + len(fine.coefficients)].T
     return fine.with_yaw(pieces * np.diff(knots_s)[:, None] ** np.arange(_DEGREE + 1))
 

@@ -16,8 +16,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize
+from scipy import linalg
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.trajectory.path import Path
@@ -186,7 +187,7 @@ def allocate_durations(
     if len(start) == 1:
         return np.ones(1)
     bounds = [(low - 3.0, low + 3.0) for low in start]  # a factor of 20 either way: keeps the solver sane
-    result = optimize.minimize(
+    result = scipy.optimize.minimize(
         objective,
         start,
         jac=True,

@@ -15,9 +15,9 @@ from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from neurosim_core.clock import NS_PER_S
@@ -267,7 +267,7 @@ def spline_path(stamps_ns: NDArray[np.int64], position: NDArray[np.float64], ori
     times_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
     spans_s = np.diff(times_s)
     rising = spans_s[:, None, None] ** np.arange(4)
-    place = _rising(CubicSpline(times_s, position).c) * rising
+    place = _rising(scipy.interpolate.CubicSpline(times_s, position).c) * rising
     rotation = _rising(RotationSpline(times_s, orientation).interpolator.c) * rising
     forward = orientation.apply([1.0, 0.0, 0.0])
     yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))

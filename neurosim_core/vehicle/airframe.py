@@ -248,3 +248,9 @@ def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
         wp.array(quadratic, dtype=wp.vec4d, device=device),
         wp.array(linear_weights(position, drag), dtype=vec10d, device=device),
     )
+
+
+def alike(airframe: Airframe, count: int, device: Any) -> Any:
+    """Return an airframe for each of N vehicles, device array of `Airframe`, shape [N]."""
+    row = np.array([airframe.numpy_value()], dtype=Airframe.numpy_dtype())
+    return wp.array(np.repeat(row, count), dtype=Airframe, device=device)

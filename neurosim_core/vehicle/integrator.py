@@ -187,13 +187,14 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     def advance(
         # Model:
-        airframe: Airframe,
+        airframes: wp.array[Airframe],
         around: Surroundings,
         interval: Interval,
         # In/out:
         batch: Batch,
     ):
         vehicle = wp.tid()
+        airframe = airframes[vehicle]
         if batch.status[vehicle] != STATUS_OK:
             return
         for rotor in range(batch.rotor_speed_command.shape[1]):
@@ -218,12 +219,13 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     def accelerate(
         # Model:
-        airframe: Airframe,
+        airframes: wp.array[Airframe],
         around: Surroundings,
         # In/out:
         batch: Batch,
     ):
         vehicle = wp.tid()
+        airframe = airframes[vehicle]
         quadratic = wp.vec4d()
         linear = vec10d()
         for rotor in range(batch.rotor_speed.shape[1]):

@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.frames import as_rows
-from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, make_airframe
+from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
 from neurosim_core.vehicle.motor import LagConstants, lag_constants
@@ -218,6 +218,8 @@ class Multirotor:
         self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
         self._adaptive = (rtol, atol, evaluation_count_max)
         self._model = make_airframe(config, self.device)
+        self.airframes = alike(self._model.airframe, count, self.device)
+        """Parameters of each vehicle, [N], which may be written between steps."""
         self._wind = make_wind(
             config.gusts if "gusts" in self.terms else (),
             config.turbulence,
@@ -352,7 +354,7 @@ class Multirotor:
         """Evaluate `arrays.acceleration` and `.angular_acceleration` at the current state; device form."""
         if self._acceleration_launch is None:
             self._acceleration_launch = self._record(
-                self._kernels.accelerate, self._model.airframe, self._surroundings(), self._batch
+                self._kernels.accelerate, self.airframes, self._surroundings(), self._batch
             )
         self._acceleration_launch.launch()
 
@@ -450,7 +452,7 @@ class Multirotor:
             evaluation_count_max=evaluation_count_max,
         )
         return self._record(
-            self._kernels.advance, self._model.airframe, self._surroundings(lags), interval, self._batch
+            self._kernels.advance, self.airframes, self._surroundings(lags), interval, self._batch
         )
 
     def _surroundings(self, lags: Sequence[LagConstants] = ()) -> Surroundings:

@@ -211,7 +211,7 @@ def test_files_of_the_dead_are_removed(make_node, start_child, runtime):
     child = start_child("peer", listen="127.0.0.1")
     stem = f"{child.hear()['node']:016x}"
     wait_for(lambda: len(node.nodes()) == 2)  # what dies before anybody knew it is swept by the next node
-    assert len(list(runtime.glob(f"*/{stem}.*"))) == 4
+    assert len(list(runtime.glob(f"*/{stem}.*"))) == 5
     child.kill()
     wait_for(lambda: not list(runtime.glob(f"*/{stem}.*")))
     wait_for(lambda: [record.name for record in node.nodes()] == ["node"])

@@ -304,7 +304,13 @@ def test_what_is_closed_is_forgotten(make_node):
 def test_no_files_are_left(make_node):
     node = make_node("one", listen="127.0.0.1")
     names = set(os.listdir(runtime_dir(0)))
-    assert {name.partition(".")[2] for name in names - DOMAIN_FILES} == {"control", "lock", "lossy", "strict"}
+    assert {name.partition(".")[2] for name in names - DOMAIN_FILES} == {
+        "control",
+        "lock",
+        "lossy",
+        "ring",
+        "strict",
+    }
     assert all(os.stat(runtime_dir(0) / name).st_mode & 0o077 == 0 for name in names if name.endswith("lock"))
     node.close()
     wait_for(lambda: set(os.listdir(runtime_dir(0))) <= DOMAIN_FILES)

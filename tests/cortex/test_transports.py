@@ -15,6 +15,7 @@ from processes import SOON_S, wait_for
 import cortex.node
 from cortex import keep_last, reliable
 from cortex.context import new_socket
+from cortex.matching import Matcher
 from cortex.places import reach
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
@@ -202,6 +203,15 @@ def test_a_record_cannot_lead_to_plain_tcp_beyond_this_host(tmp_path):
         assert reach(record_at(NEAR, **{role: FAR}), "here", None) is None
     assert reach(record_at(FAR, keys.public), "here", keys).secure is not None
     assert reach(record_at(FAR, keys.public), "here", None, insecure=True) is None
+
+
+def test_a_node_without_a_control_socket_cannot_be_asked():
+    """Its topics can be used all the same."""
+    matcher = Matcher("here", None, insecure=False)
+    assert matcher.reach_control(record_at(NEAR)).address == NEAR
+    with pytest.raises(ConnectionError, match="cannot be asked"):
+        matcher.reach_control(record_at(NEAR, control=""))
+    assert reach(record_at(NEAR, control=""), "here", None) is not None
 
 
 @pytest.mark.parametrize("who", ["stranger", "without keys"])

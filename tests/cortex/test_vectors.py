@@ -10,10 +10,17 @@ import wire_oracle
 from random_schemas import to_plain
 
 from cortex.codec import MalformedMessage, codec_of
+from cortex.intake import Intake
+from cortex.link import Link
+from cortex.policy import keep_last
+from cortex.records import PublisherRecord
 from cortex.schema import Schema, fingerprint_of, type_from_schema
+from cortex.stats import SubscriberCounters
+from cortex.turn import Turn
 from cortex.vectors import DIRECTORY, load_vectors, message_from_plain, message_to_plain
 from cortex.vectors.__main__ import files
 from cortex.vectors.catalogue import CATALOGUE
+from cortex.wire import batch_records, parse_answer
 
 VECTORS = load_vectors()
 CASES = [(name, case) for name, vector in VECTORS.items() for case in vector["cases"]]
@@ -65,6 +72,64 @@ def test_malformed_bodies(name, case):
         codec_of(type_from_schema(schema)).decode(body)
     with pytest.raises(wire_oracle.Bad):
         wire_oracle.decode(json.loads(VECTORS[name]["schema"]), body)
+
+
+FRAMES = json.loads((DIRECTORY / "frames.json").read_text(encoding="utf-8"))
+
+
+def make_link(counters: SubscriberCounters) -> Link:
+    """A link to the publisher of the frames, which is not there."""
+    published = FRAMES["publisher"]
+    codec = codec_of(type_from_schema(Schema.from_json(published["schema"])))
+    record = PublisherRecord(
+        "/frames", published["source"], "", codec.fingerprint, published["schema"], False
+    )
+    return Link(
+        record,
+        codec,
+        "tcp://127.0.0.1:9",
+        policy=keep_last(),
+        local=False,
+        shared_memory=False,
+        counters=counters,
+        clock_offset_ns=0,
+    )
+
+
+@pytest.mark.parametrize("case", FRAMES["frames"], ids=label)
+def test_frames(case):
+    """What is written into a frame is what the tables of WIRE.md find there."""
+    fields, frame = case["fields"], bytes.fromhex(case["frame"])
+    assert frame[:3] == b"CTX"
+    assert frame[3:4].decode() == fields["kind"]
+    places = {"source": 8, "fingerprint": 16, "sequence": 24, "body_size": 48, "aux": 56}
+    if fields["kind"] in "AR":
+        places = {"source": 8, "reader": 16, "options": 24, "next": 32} | (
+            {"sequence": 24} if fields["kind"] == "R" else {}
+        )
+    for name, offset in places.items():
+        if name in fields:
+            assert int.from_bytes(frame[offset : offset + 8], "little") == fields[name], name
+    assert frame[5] == fields.get("stamped", False)
+    if "records" in fields:
+        bodies = [frame[r.offset : r.offset + r.size].hex() for r in batch_records(frame, fields["aux"])]
+        assert bodies == fields["records"]
+
+
+@pytest.mark.parametrize("case", FRAMES["malformed"], ids=label)
+def test_malformed_frames(case):
+    frame = bytes.fromhex(case["frame"])
+    if frame[3:4] == b"A":
+        with pytest.raises(MalformedMessage):
+            parse_answer(frame)
+        return
+    counters = SubscriberCounters()
+    link = make_link(counters)
+    try:
+        Intake(keep_last(), counters, Turn()).accept(link, frame, timed=False)
+    finally:
+        link.close()
+    assert counters.rejected == 1
 
 
 def test_there_are_vectors_for_everything():

@@ -86,6 +86,7 @@ def policy(tmp_path_factory):
         "task": "hover",
         "rate_hz": 50.0,
         "camera": {"width": 8, "height": 8, "horizontal_fov_rad": 1.5},
+        "mount": {"position_m": (0.1, 0.0, 0.03)},
         "threshold": 0.1,
         "renders_per_step": 1,
         "rays_per_pixel": 1,

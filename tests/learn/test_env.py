@@ -127,7 +127,7 @@ def test_starts_are_in_free_space_and_differ(make, hall):
     assert hall.free_space.clearance(position).min() > 0.85
     assert len(np.unique(position, axis=0)) > 32
     speed = env.view.velocity.norm(dim=1)
-    assert speed.max() <= 0.9 + 1e-6
+    assert speed.max() <= 1.4 + 1e-6
     assert speed.min() < 0.5
     np.testing.assert_allclose(env.view.clearance[:, 0], hall.free_space.clearance(position), atol=0.2)
     thresholds = env.sim.thresholds("front").numpy()
@@ -159,3 +159,84 @@ def test_gymnasium(hall):
     assert observations["state"].shape == (2, 17)
     assert {each.shape for each in (reward, terminated, truncated)} == {(2,)}
     env.close()
+
+
+def still(**ranges):
+    """Return a randomisation of airframes only."""
+    return ns.learn.Randomisation(
+        thrust_factor=(1.0, 1.0),
+        latency_steps=0,
+        threshold_factor=(1.0, 1.0),
+        gyro_noise_rad_s=0.0,
+        gravity_noise=0.0,
+        **ranges,
+    )
+
+
+def calm(**start):
+    """Return a task that begins at rest and level."""
+    return type(
+        "Calm", (Brief,), {"start": ns.learn.StartConfig(clearance_m=0.9, **start), "episode_s": 1.0}
+    )()
+
+
+def test_a_mass_that_is_drawn_is_the_mass_that_flies(make):
+    """The thrust that carries the nominal mass m accelerates f m with g (1 / f - 1) upwards."""
+    env = make(
+        8, calm(), observe=["state"], randomise=still(mass_factor=(0.7, 1.3), inertia_factor=(0.5, 2.0))
+    )
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(torch.zeros(8, 4))
+    factor = env.parameters["mass_factor"]
+    assert factor.min() > 0.7
+    assert factor.max() < 1.3
+    assert factor.std() > 0.05
+    expected = 0.1 * 9.81 * (1.0 / factor - 1.0)
+    # drag takes v t / 2 m = 0.02 v of the speed at most, and lift adds as much
+    torch.testing.assert_close(env.view.velocity[:, 2], expected, rtol=0.05, atol=0.002)
+    first = env.parameters
+    env.reset(seed=1)
+    assert all(torch.equal(value, first[name]) for name, value in env.parameters.items())
+    env.reset(seed=2)
+    assert not torch.equal(env.parameters["mass_factor"], factor)
+
+
+def test_a_wind_that_is_drawn_blows_in_proportion_to_the_drag(make):
+    """At rest and level the acceleration is k (v_wind - v) / m, with the drag k that is drawn."""
+    env = make(8, calm(), observe=["state"], randomise=still(drag_factor=(0.5, 2.0), wind_m_s=1.0))
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(torch.zeros(8, 4))
+    found = env.parameters
+    push = found["drag_factor"][:, None] * found["wind_m_s"]
+    ratio = (env.view.velocity[:, :2] * push).sum(1) / push.square().sum(1)
+    assert found["wind_m_s"].norm(dim=1).max() <= 1.0
+    assert ratio.min() > 0.0
+    # 0.1 s against a time constant m / k of 1.2 s or more, and the vehicle tilts a little
+    assert ratio.max() < 1.15 * ratio.min()
+
+
+def test_a_biased_gyroscope_is_wrong_by_the_same_in_each_step(make):
+    env = make(4, calm(), observe=["state"], randomise=still(gyro_bias_rad_s=0.1))
+    env.reset(seed=1)
+    errors = []
+    for _ in range(4):
+        env.step(torch.zeros(4, 4))
+        errors.append(env.view.gyro - env.view.body_rate)
+    torch.testing.assert_close(torch.stack(errors), errors[0].expand(4, 4, 3), rtol=0.0, atol=1e-6)
+    assert errors[0].abs().max() <= 0.1
+    assert errors[0].std() > 0.02
+
+
+def test_a_fast_turn_loses_no_events(make):
+    changes = {"rate_max_rad_s": (4.0, 4.0, 4.0), "episode_s": 1.0, "threshold": 0.02}
+    env = make(4, type("Turning", (Brief,), changes)())
+    env.reset(seed=1)
+    turn = torch.tensor([0.0, 0.0, 0.5, 1.0]).expand(4, 4)
+    events = torch.zeros(())
+    for _ in range(10):
+        observations, *_, info = env.step(turn)
+        assert not info["dropped"].any()
+        events = torch.maximum(events, observations["events"][:, :2].sum((1, 2, 3)).max())
+    assert events > 2 * 8 * 8  # more than worlds have room for by default

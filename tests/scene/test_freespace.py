@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -294,15 +296,16 @@ def test_a_start_inside_a_solid_is_refused(furnished):
     cut_off.check_start((6.0, 1.5, 1.2))  # another room of 30 m^3, behind a closed wall
 
 
-def test_a_start_outside_of_a_scene_that_names_its_inside_is_refused():
-    scene = as_scene(ROOM, inside_m=(1.0, 1.0, 1.0))
-    space = make_free_space(scene, FreeSpaceConfig())
-    space.check_start((0.5, 0.5, 1.0))
+def test_a_start_outside_of_a_closed_scene_is_refused():
+    scene = as_scene(ROOM)
+    closed = dataclasses.replace(scene, closed=True)
     outside = (-3.0, 0.0, 1.0)
+    space = make_free_space(closed, FreeSpaceConfig())
+    space.check_start((0.5, 0.5, 1.0))
     with pytest.raises(ValueError, match="outside of the rooms"):
         space.check_start(outside)
-    make_free_space(as_scene(ROOM), FreeSpaceConfig()).check_start(outside)
-    make_free_space(scene, FreeSpaceConfig(seed_m=(1.0, 1.0, 1.0))).check_start(outside)
+    make_free_space(scene, FreeSpaceConfig()).check_start(outside)
+    make_free_space(closed, FreeSpaceConfig(seed_m=(1.0, 1.0, 1.0))).check_start(outside)
 
 
 def test_outside_the_bounds_nothing_is_free(furnished):

@@ -136,26 +136,26 @@ void fan_out(cortex::Node& talker, cortex::Node& hearer) {
   lossy.join();
 }
 
-// Publishes until the pipe of a reliable subscriber is full; how many messages were taken.
+// Publishes until a reliable subscriber has no room; how many messages were taken.
 int fill(cortex::Publisher<Scan>& publisher) {
   int taken = 0;
   while (publisher.publish(scan_of(taken, 10))) ++taken;
   return taken;
 }
 
-// Two publishers whose pipes are full: a reliable subscription, in whose queue there is room for few, reads both.
+// Two publishers whose rings are full: a reliable subscription, in whose queue there is room for few, reads both.
 void share_the_room(cortex::Node& talker, cortex::Node& hearer) {
   auto subscription = hearer.subscribe<Scan>("/room", cortex::reliable(8, 1ms));
   std::vector<cortex::Publisher<Scan>> publishers;
   for (int number = 0; number < 2; ++number) {
     publishers.push_back(talker.advertise<Scan>("/room"));
     expect(publishers.back().wait_for_subscribers(1, 60s), "a publisher is found");
-    expect(fill(publishers.back()) > 200, "a pipe holds hundreds of messages");
+    expect(fill(publishers.back()) > 200, "a ring holds hundreds of messages");
   }
   std::map<std::uint64_t, int> received;
   for (int left = 200; left > 0; --left) {
     const auto scan = subscription.receive(60s);
-    expect(scan.has_value(), "what is in the pipes arrives");
+    expect(scan.has_value(), "what is in the rings arrives");
     if (scan) ++received[scan->info().source];
   }
   expect(received.size() == 2, "both publishers are heard");

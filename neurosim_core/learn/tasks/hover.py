@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Randomisation, Task, View
 from neurosim_core.registry import register
 
@@ -25,9 +27,10 @@ class Hover(Task):
     position nor velocity. The teacher and the critic see the velocity.
     """
 
-    episode_s = 6.0
-    start = StartConfig(clearance_m=0.9, speed_m_s=(0.3, 0.9), tilt_max_rad=0.15, rate_max_rad_s=0.2)
+    episode_s = 5.0
+    start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))
+    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 2.0))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
     groups: Mapping[str, Sequence[str]] = {
@@ -36,16 +39,24 @@ class Hover(Task):
         "teacher": ("state",),
         "student": ("proprioception", "events"),
     }
-    camera: Mapping[str, Any] = {"width": 32, "height": 32, "horizontal_fov_rad": 1.6}
+    camera: Mapping[str, Any] = {"width": 48, "height": 48, "horizontal_fov_rad": 1.6}
+    surface = LeakySurface(tau_s=(0.02, 0.06, 0.3))
     mirror: Mapping[str, Sequence[float]] = {
         "proprioception": (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, *MIRROR_ACTION),
         "velocity": (1.0, -1.0, 1.0),
     }
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of twelve apartments of one room to train in, or of four others."""
-        seeds = range(100, 104) if unseen else range(12)
-        return [{"kind": "apartment", "rooms": 1, "seed": seed} for seed in seeds]
+        """Return settings of sixteen apartments of all sorts to train in, or of four others of one room."""
+        if unseen:
+            return [{"kind": "apartment", "rooms": 1, "seed": seed} for seed in range(100, 104)]
+        sorts = [(1, 1.0), (1, 0.5), (1, 0.0), (3, 0.5)]
+        return [
+            {"kind": "apartment", "rooms": rooms, "furniture": furniture, "ceiling_m": ceiling, "seed": seed}
+            for seed, ((rooms, furniture), ceiling) in enumerate(
+                itertools.product(sorts, (2.5, 2.7, 3.1, 3.7))
+            )
+        ]
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
         """Forget how long vehicles have hovered."""

@@ -124,4 +124,5 @@ def _assemble(
         lights=tuple(light for piece in pieces for light in piece.lights),
         ambient=Ambient(up=(0.3, 0.3, 0.31), down=(0.23, 0.22, 0.21)),
         inside_m=inside_m,
+        closed=True,
     )

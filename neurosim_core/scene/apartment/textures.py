@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.fft
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
 Field = NDArray[np.float32]

@@ -12,7 +12,7 @@
 #include <vector>
 
 #include "cortex/pace.hpp"
-#include "cortex/pipe.hpp"
+#include "cortex/broadcast.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/ring_view.hpp"
 #include "cortex/runtime.hpp"
@@ -70,10 +70,10 @@ class Link {
   Link(const Link&) = delete;
   Link& operator=(const Link&) = delete;
 
-  // Becomes readable, as the pipe does, when something may have come.
+  // Becomes readable, as the ring's bell does, when something may have come.
   int fd() const noexcept { return fd_; }
-  // That of the pipe, -1 if there is none.
-  int pipe_fd() const noexcept { return offer_ == nullptr ? -1 : offer_->fd(); }
+  // The bell of the ring, -1 if there is none.
+  int bell_fd() const noexcept { return end_ == nullptr ? -1 : end_->fd(); }
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }
@@ -93,19 +93,19 @@ class Link {
     }
   }
 
-  // Reads at most `budget` frames into the queue, those of the pipe first; false if there may be more.
+  // Reads at most `budget` frames into the queue, those of the ring first; false if there may be more.
   bool drain(std::deque<Item>& queue, std::size_t budget, Pace& pace) {
     for (; budget > 0; --budget) {
-      if (pipe_ != nullptr) {
-        const auto bytes = pipe_->next();
+      if (in_ring_) {
+        const auto bytes = end_->next();
         if (!bytes.empty()) {
           pace.count(bytes.size());
           take_in({bytes, nullptr}, queue);
           continue;
         }
-        if (pipe_->broken()) {
-          reject("something in the pipe is no frame");
-          go_without_memory("its pipe cannot be read");
+        if (end_->broken()) {
+          reject("something in the ring is no frame");
+          go_without_memory("its ring cannot be read");
         }
       }
       zmq::message_t message;
@@ -130,7 +130,7 @@ class Link {
   }
   std::uint8_t flags() const noexcept { return type_.stamped ? wire::flag_stamp : 0; }
 
-  // A frame where it lies: in a message of ZeroMQ, or in the pipe's buffer (null) until the next is read.
+  // A frame where it lies: in a message of ZeroMQ, or in the buffer of our end of the ring (null) until the next is read.
   struct Arrival {
     Span<const std::uint8_t> bytes;
     zmq::message_t* message;
@@ -151,11 +151,7 @@ class Link {
     key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
     key_ = wire::pack_key(key, flags());
     if (shared_memory && net::is_ipc(address_)) {
-      try {
-        offer_ = std::make_unique<pipe::Offer>(net::folder_of(address_), reader_);
-      } catch (const std::system_error& error) {
-        complaints_->once("pipe " + address_, "no pipe for " + address_ + ": " + error.what());
-      }
+      end_ = RingReader::open(address_.substr(6, address_.rfind('.') - 6) + ".ring", source_, reader_);
     }
     socket_.set(zmq::sockopt::subscribe, key_);
   }
@@ -178,8 +174,11 @@ class Link {
 
   void accept(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
     if (header.source != source_ || header.flags != flags()) throw MalformedMessage("not a frame of this publisher");
+    if (arrival.message == nullptr && std::strchr("MBS", header.kind) == nullptr) {
+      throw MalformedMessage("a frame in the ring that belongs into the socket");
+    }
     if (header.kind == 'A') return on_answer(arrival.bytes, queue);
-    if (pipe_ != nullptr && arrival.message != nullptr && header.kind != 'L') return;  // it came through the pipe
+    if (in_ring_ && arrival.message != nullptr && header.kind != 'L') return;  // it came through the ring
     if (header.fingerprint != type_.fingerprint) throw MalformedMessage("a message of another type");
     if (header.body_size > wire::body_limit) throw MalformedMessage("a body over the limit of 1 GiB");
     switch (header.kind) {
@@ -194,7 +193,7 @@ class Link {
       case 'B':
         return on_batch(header, arrival, queue);
       case 'L':
-        return on_large(header, *arrival.message, queue);  // none comes through a pipe
+        return on_large(header, *arrival.message, queue);  // none comes through a ring
       case 'S':
         return on_slot(header, arrival.bytes, queue);
       default:
@@ -264,7 +263,7 @@ class Link {
     wire::body_of(header, arrival.bytes, wire::body_limit);
     if (header.aux == 0) {  // tells which number comes next, so that a loss at the end of a burst is known
       if (header.body_size != 0) throw MalformedMessage("a batch of bytes without records");
-      if (advance(header.sequence, 0) && policy_.is_reliable && pipe_ == nullptr) confirm(header.sequence);
+      if (advance(header.sequence, 0) && policy_.is_reliable && !in_ring_) confirm(header.sequence);
       return;
     }
     const auto shared = std::make_shared<zmq::message_t>(arrival.keep());
@@ -337,7 +336,7 @@ class Link {
   }
 
   // Maps the newest ring that is announced, and forgets those that are given up; false if there is no shared memory
-  // from now on. An announcement comes through the socket, descriptors through the pipe: it may be old news.
+  // from now on. An announcement comes through the socket, descriptors through the ring: it may be old news.
   bool take_rings(const std::vector<wire::RingPlace>& places) {
     const auto by_number = [](const wire::RingPlace& a, const wire::RingPlace& b) { return a.ring < b.ring; };
     const auto [oldest, newest] = std::minmax_element(places.begin(), places.end(), by_number);
@@ -392,7 +391,7 @@ class Link {
       if (!answer.rings.empty() && !take_rings(answer.rings)) return;
       subscribe_large(false);
     }
-    if (first && offer_ != nullptr && offer_->taken()) use_pipe();
+    if (first && end_ != nullptr && end_->welcomed()) use_ring();
     if (!first || known_) return;
     if (!answer.latched.empty()) latched(answer.latched, queue);
     known_ = true;
@@ -413,9 +412,9 @@ class Link {
     }
   }
 
-  // The publisher sends all that follows through our pipe.
-  void use_pipe() {
-    pipe_ = std::make_unique<pipe::Reader>(offer_->fd());
+  // The publisher sends all that follows through its ring.
+  void use_ring() {
+    in_ring_ = true;
     for (const char kind : {'M', 'B', 'S'}) subscribe(kind, false);
   }
 
@@ -436,14 +435,14 @@ class Link {
   void go_without_memory(const std::string& why) {
     complaints_->once("memory " + address_, "cannot share memory with " + address_ + ": " + why);
     close_rings();  // before the publisher can learn that our column is free
-    if (pipe_ == nullptr) {
+    if (!in_ring_) {
       subscribe('S', false);
     } else {
       for (const char kind : {'M', 'B'}) subscribe(kind, true);
     }
     subscribe_large(true);
-    pipe_.reset();
-    offer_.reset();
+    in_ring_ = false;
+    end_.reset();
     socket_.set(zmq::sockopt::unsubscribe, key_);
     column_ = wire::no_column;
     attached_ = false;
@@ -473,8 +472,8 @@ class Link {
   std::map<std::uint32_t, std::shared_ptr<RingView>> rings_;
   std::int64_t newest_ring_ = -1;  // the highest number of a ring that was mapped
   std::uint32_t given_up_ = 0;     // the publisher writes to no ring of a lower number any more
-  std::unique_ptr<pipe::Offer> offer_;
-  std::unique_ptr<pipe::Reader> pipe_;  // null: everything comes through the socket
+  std::unique_ptr<RingReader> end_;  // of the ring, if we have asked for it
+  bool in_ring_ = false;             // else everything comes through the socket
 };
 
 }  // namespace cortex::detail

@@ -123,7 +123,7 @@ class Node {
     {
       const std::lock_guard<std::mutex> lock(outlets_->mutex);
       outlets_->closed = true;
-      outlets_->give_up();
+      outlets_->leftovers.clear();
       outlets_->lossy.socket.close();
       outlets_->strict.socket.close();
     }
@@ -168,7 +168,7 @@ class Node {
 
   void open_sockets() {
     const bool tcp = !options_.listen.empty();
-    outlets_ = std::make_shared<detail::Outlets>(context_, tcp, net::folder_of(files_->endpoint("lossy")));
+    outlets_ = std::make_shared<detail::Outlets>(context_, tcp, files_->path("ring"));
     lossy_fd_ = outlets_->lossy.socket.get(zmq::sockopt::fd);
     strict_fd_ = outlets_->strict.socket.get(zmq::sockopt::fd);
     router_ = net::make_socket(context_, zmq::socket_type::router, tcp, 4096, 200);
@@ -317,12 +317,11 @@ class Node {
     serve();
     directory_->tick();
     connected_ = directory_->connected();
-    bool delivering = false;
     {
       const detail::Lock lock(outlets_->mutex, std::try_to_lock);
       if (lock.owns_lock()) {
         outlets_->refresh();
-        delivering = outlets_->leftovers.deliver();
+        outlets_->leftovers.deliver();
       }
     }
     changed = directory_->take_changed() || changed;
@@ -331,7 +330,7 @@ class Node {
     const std::int64_t now_ns = monotonic_ns();
     for (const auto& subscription : subscriptions) subscription->tend(now_ns);
     for (const auto& publisher : publishers()) publisher->tend(now_ns);
-    return changed || delivering;
+    return changed;
   }
 
   void match(const std::vector<std::shared_ptr<detail::SubscriptionCore>>& subscriptions) {

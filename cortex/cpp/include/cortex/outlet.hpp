@@ -15,6 +15,7 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/broadcast.hpp"
 #include "cortex/leftovers.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/socket.hpp"
@@ -52,8 +53,8 @@ inline zmq::message_t message_of(const std::string& bytes) { return zmq::message
 // Both outlets of a node under one lock, and the publishers whose readers come and go through them.
 class Outlets {
  public:
-  Outlets(zmq::context_t& context, bool tcp, std::string directory)
-      : folder(std::move(directory)),
+  Outlets(zmq::context_t& context, bool tcp, const std::string& ring_path)
+      : listener(ring_path),
         lossy{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), false},
         strict{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), true} {
     strict.socket.set(zmq::sockopt::xpub_nodrop, true);
@@ -62,24 +63,8 @@ class Outlets {
   // Reads who has come and gone; the caller holds the lock.
   inline void refresh();
 
-  // Tells those who will not get the rest of what has been published how much that was, through their sockets, in which
-  // there is room, and lets go of it; the caller holds the lock.
-  void give_up() {
-    for (const auto& leftover : leftovers.all()) {
-      for (const auto& reader : leftover.readers) {
-        if (reader.pipe == nullptr) continue;
-        wire::AttachAnswer answer;
-        answer.sequence = leftover.sequence;
-        answer.column = reader.column;
-        zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
-        if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
-      }
-    }
-    leftovers.clear();
-  }
-
   std::mutex mutex;
-  const std::string folder;  // where the unix sockets lie, and readers offer pipes
+  Listener listener;  // where local readers ask for rings
   Outlet lossy;
   Outlet strict;
   std::map<std::uint64_t, PublisherCore*> publishers;

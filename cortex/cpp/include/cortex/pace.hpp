@@ -7,12 +7,12 @@
 #include <cstdint>
 #include <ctime>
 
-#include "cortex/pipe.hpp"
+#include "cortex/broadcast.hpp"
 #include "cortex/policy.hpp"
 
 namespace cortex::detail {
 
-// Each look into a pipe holds up whoever writes to it. A reader that is quicker than its publisher and looks whenever
+// Each look into a ring that was empty holds up whoever writes to it. A reader that is quicker than its publisher and looks whenever
 // it has nothing to do takes few messages at a time, and slows the publisher down by a third. In a flood this lets it
 // sleep in between (40 B from a Python publisher: 1.6 M/s instead of 1.0, for a quarter of the processor's time). What
 // it takes in is older by that much. Not for several threads at once.
@@ -20,7 +20,7 @@ class Pace {
  public:
   explicit Pace(const Policy& policy) noexcept : policy_(policy) {}
 
-  // A frame of so many bytes came through a pipe; what comes through sockets is ZeroMQ's to gather.
+  // A frame of so many bytes came through a ring; what comes through sockets is ZeroMQ's to gather.
   void count(std::size_t bytes) noexcept {
     ++frames_;
     bytes_ += bytes;
@@ -50,12 +50,12 @@ class Pace {
   static constexpr std::int64_t late_ns = 60'000;  // so much longer a sleep may take: the usual slack of timers
   static constexpr std::int64_t flood_ns = 3'000;  // messages that follow each other more quickly are a flood
 
-  // A pipe must not be full meanwhile, be it a small one, nor a queue that drops what is too much.
+  // The ring must not be full meanwhile, nor a queue that drops what is too much.
   std::int64_t gather_for(std::int64_t elapsed_ns) const noexcept {
     const auto time_for = [elapsed_ns](std::size_t most, std::size_t came) {
       return static_cast<std::int64_t>(most) * elapsed_ns / static_cast<std::int64_t>(came) - late_ns;
     };
-    std::int64_t gather_ns = std::min(longest_ns, time_for(pipe::pipe_bytes / 8, bytes_));
+    std::int64_t gather_ns = std::min(longest_ns, time_for(ring_bytes / 8, bytes_));
     if (!policy_.is_reliable) gather_ns = std::min(gather_ns, time_for(policy_.depth / 2, frames_));
     return std::max<std::int64_t>(gather_ns, 0);
   }

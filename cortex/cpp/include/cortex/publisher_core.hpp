@@ -84,7 +84,7 @@ class PublisherCore {
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
     bool on_time = !is_late_;
     if (has_sockets(outlets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
-    on_time &= send_piped(lock, net::bytes(frame));
+    on_time &= send_to_ring(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
     return on_time;
   }
@@ -131,7 +131,7 @@ class PublisherCore {
     on_time = on_time && !is_late_;
     bool passed_over = false;
     if (slot.ring == nullptr) {
-      on_time &= send_body_piped(lock, slot, sequence, stamp_ns, size);
+      on_time &= send_body_to_ring(lock, slot, sequence, stamp_ns, size);
     } else {
       const std::uint64_t mask = readers_.grant(*slot.ring, passed_over);
       slot.ring->pin(slot.index);  // until it has been handed to ZeroMQ below
@@ -153,12 +153,10 @@ class PublisherCore {
   void tend(std::int64_t now_ns) {
     const Lock lock(outlets_->mutex, std::try_to_lock);
     if (!lock.owns_lock() || closed_ || outlets_->closed) return;
-    readers_.flush();
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame(wire::header_size);
     write_header(static_cast<std::uint8_t*>(frame.data()), 'B', sequence_, 0, 0, 0);
-    bool sent = !is_late_;
-    for (const auto& reader : readers_.piped()) sent &= readers_.write(*reader, net::bytes(frame));
+    bool sent = !is_late_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
     if (has_sockets(outlets_->strict)) sent &= outlets_->strict.try_send(std::move(frame));
     if (sent) told_ = sequence_;
@@ -168,13 +166,7 @@ class PublisherCore {
   void attach(Outlet& outlet, const std::string& key, wire::AttachKey request) {
     if (closed_ || readers_.size() >= 1024) return;
     request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
-    const auto& reader = readers_.add(outlet, key, request, !unavailable_, outlets_->folder);
-    if (reader->pipe != nullptr) {  // this tells the reader that all else comes there
-      std::uint8_t nothing[wire::header_size];
-      write_header(nothing, 'B', sequence_, 0, 0, 0);
-      readers_.write(*reader, {nothing, sizeof nothing});
-      readers_.settle();
-    }
+    const auto& reader = readers_.add(outlet, key, request, sequence_, !unavailable_, outlets_->listener);
     answer(*reader, latched_);
   }
 
@@ -183,7 +175,7 @@ class PublisherCore {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
     if (reader->column != wire::no_column) rings_.free_column(reader->column);
-    if (reader->outlet->strict && reader->pipe == nullptr) is_late_ = false;
+    if (reader->outlet->strict && reader->member < 0) is_late_ = false;
   }
 
   // A reliable reader has accounted for all below a sequence; called under the lock.
@@ -249,22 +241,23 @@ class PublisherCore {
     rings_.tidy();
   }
 
-  // Tells readers that this was all, and gives the node what they have no room for.
+  // Tells readers that this was all, and gives the node what they have not read of sockets and slots.
   void leave_behind() {
     Leftover leftover;
-    write_header(leftover.end.data(), 'B', sequence_, 0, 0, 0);
+    std::uint8_t last[wire::header_size];
+    write_header(last, 'B', sequence_, 0, 0, 0);
+    readers_.end({last, sizeof last});  // what is in the ring stays the readers'
     leftover.sequence = sequence_;
     leftover.rings = rings_.release();
     if (!outlets_->closed && told_ != sequence_) {
-      zmq::message_t frame(leftover.end.data(), leftover.end.size());
+      zmq::message_t frame(last, sizeof last);
       if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
       if (has_sockets(outlets_->strict)) outlets_->strict.send_anyway(std::move(frame));
     }
     for (const auto& reader : readers_.release()) {
-      const bool owes = reader->request.confirms && reader->outlet->strict && reader->pipe == nullptr &&
+      const bool owes = reader->request.confirms && reader->outlet->strict && reader->member < 0 &&
                         reader->confirmed < sequence_;
-      leftover.readers.push_back({reader->key, reader->outlet, reader->column, std::move(reader->pipe),
-                                  told_ == sequence_, reader->request.reader, owes});
+      leftover.readers.push_back({reader->key, reader->outlet, reader->column, reader->request.reader, owes});
     }
     if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
   }
@@ -318,32 +311,31 @@ class PublisherCore {
     return false;
   }
 
-  // Writes into all pipes, waiting for reliable readers; false if one of those lost the frame.
-  bool send_piped(Lock& lock, Span<const std::uint8_t> frame) {
-    Readers::List full;
-    for (const auto& reader : readers_.piped()) {
-      if (readers_.write(*reader, frame)) {
-        reader->late = false;
-      } else if (reader->request.strict) {
-        full.push_back(reader);
-      }
+  // Writes into the ring, waiting for reliable readers; false if one of those lost the frame.
+  bool send_to_ring(Lock& lock, Span<const std::uint8_t> frame) {
+    int found = CORTEX_FULL;
+    const auto attempt = [&] {
+      found = readers_.put(frame);
+      return found != CORTEX_FULL;
+    };
+    const std::int64_t begin_ns = monotonic_ns();
+    while (!attempt()) {
+      const std::int64_t end_ns = begin_ns + std::int64_t{readers_.patience_ms(frame.size())} * 1'000'000;
+      const std::int64_t left_ms = std::max<std::int64_t>((end_ns - monotonic_ns() + 999'999) / 1'000'000, 0);
+      if (await_room(lock, static_cast<std::uint32_t>(left_ms), attempt)) break;
+      if (closed_ || outlets_->closed) return false;
+      readers_.give_up(frame.size(), monotonic_ns() - begin_ns);
     }
-    bool on_time = true;
-    for (const auto& reader : full) {
-      const auto attempt = [&] { return reader->left || readers_.write(*reader, frame); };
-      if (!reader->late) reader->late = !await_room(lock, reader->request.timeout_ms, attempt);
-      on_time &= !reader->late;
-    }
-    return on_time;
+    return found == CORTEX_WRITTEN;
   }
 
-  // A body that found no slot travels through pipes as a message.
-  bool send_body_piped(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
-    if (readers_.piped().empty()) return true;
+  // A body that found no slot travels through the ring as a message.
+  bool send_body_to_ring(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
+    if (!readers_.has_members()) return true;
     std::vector<std::uint8_t> frame(wire::header_size + size);
     write_header(frame.data(), 'M', sequence, stamp_ns, size, 0);
     std::memcpy(frame.data() + wire::header_size, slot.buffer.data(), size);
-    return send_piped(lock, {frame.data(), frame.size()});
+    return send_to_ring(lock, {frame.data(), frame.size()});
   }
 
   bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
@@ -358,11 +350,11 @@ class PublisherCore {
     bool lossy = false;
     bool strict = false;
     for (const auto& reader : readers_.all()) {
-      if (reader->column != wire::no_column && reader->pipe == nullptr) (reader->outlet->strict ? strict : lossy) = true;
+      if (reader->column != wire::no_column && reader->member < 0) (reader->outlet->strict ? strict : lossy) = true;
     }
     if (lossy) outlets_->lossy.try_send(share(frame));
     bool on_time = !strict || send_strict(lock, frame, zmq::send_flags::none);
-    on_time &= send_piped(lock, net::bytes(frame));
+    on_time &= send_to_ring(lock, net::bytes(frame));
     return on_time;
   }
 
@@ -421,7 +413,7 @@ class PublisherCore {
   }
 
   bool is_full(const Reader& reader, const Slot& slot) {
-    if (slot.ring == nullptr) return reader.pipe == nullptr && *private_bytes_ > private_bytes_max / 2;
+    if (slot.ring == nullptr) return reader.member < 0 && *private_bytes_ > private_bytes_max / 2;
     if (reader.column != wire::no_column) return !readers_.has_room(reader, *slot.ring);
     return slot.ring->pinned() >= readers_.quota(*slot.ring);
   }
@@ -444,11 +436,11 @@ class PublisherCore {
     }
   }
 
-  // Large messages go through pipes and sockets from now on, also to those that had a column.
+  // Large messages go through rings and sockets from now on, also to those that had a column.
   void do_without_memory() {
     unavailable_ = true;
     for (const auto& reader : readers_.all()) {
-      if (reader->column == wire::no_column || reader->pipe != nullptr) continue;
+      if (reader->column == wire::no_column || reader->member >= 0) continue;
       rings_.free_column(reader->column);
       reader->column = wire::no_column;
       answer(*reader, "");

@@ -7,13 +7,11 @@
 #include <cstdint>
 #include <memory>
 #include <string>
-#include <system_error>
 #include <utility>
 #include <vector>
 
 #include "cortex/outlet.hpp"
-#include "cortex/pipe.hpp"
-#include "cortex/relay.hpp"
+#include "cortex/broadcast.hpp"
 #include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
@@ -25,10 +23,7 @@ struct Reader {
   wire::AttachKey request;
   Outlet* outlet = nullptr;
   std::uint32_t column = wire::no_column;
-  std::unique_ptr<pipe::Writer> pipe;  // where its frames go; null: through the outlet
-  std::shared_ptr<pipe::Relay::Member> member;  // of the relay that writes the pipe; null: we do
-  bool late = false;  // its pipe was full for too long: it holds up nothing until it has room again
-  bool left = false;
+  int member = -1;  // its number in the ring, through which its frames go; -1: through the outlet
   std::uint64_t confirmed = 0;  // it has accounted for all below this
 };
 
@@ -39,26 +34,23 @@ class Readers {
   using List = std::vector<std::shared_ptr<Reader>>;
 
   const List& all() const noexcept { return all_; }
-  const List& piped() const noexcept { return piped_; }
+  bool has_members() const noexcept { return members_ > 0; }
   bool empty() const noexcept { return all_.empty(); }
   std::size_t size() const noexcept { return all_.size(); }
   // Those that the outlet itself serves.
   std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
 
-  // Takes a reader in; with a column of the lease table, and through its pipe, if it offers that and there is room.
+  // Takes a reader in; with a column of the lease table, and through the ring, if it asks for that and there is room.
+  // `first` is the sequence of the first message for it.
   const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
-                                     bool shared_memory, const std::string& folder) {
+                                     std::uint64_t first, bool shared_memory, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
     reader->outlet = &outlet;
     if (request.shared_memory && shared_memory) reader->column = free_column();
-    if (reader->column != wire::no_column) reader->pipe = pipe::Writer::open(folder, request.reader);
-    if (reader->pipe == nullptr) {
-      ++(outlet.strict ? strict_ : lossy_);
-    } else {
-      piped_.push_back(reader);
-    }
+    if (reader->column != wire::no_column) join(*reader, first, listener);
+    ++(reader->member >= 0 ? members_ : outlet.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
 
@@ -69,46 +61,38 @@ class Readers {
     if (found == all_.end()) return nullptr;
     const std::shared_ptr<Reader> reader = std::move(*found);
     all_.erase(found);
-    if (reader->pipe == nullptr) --(reader->outlet->strict ? strict_ : lossy_);
-    take_back(*reader);
-    piped_.erase(std::remove(piped_.begin(), piped_.end(), reader), piped_.end());
-    reader->left = true;
-    settle();
+    --(reader->member >= 0 ? members_ : reader->outlet->strict ? strict_ : lossy_);
+    if (reader->member >= 0) ring_->remove(reader->member);
     return reader;
   }
 
-  // Lets a relay write the pipes if there are many, else their publisher; what is to be written directly is written.
-  void settle() {
-    if (piped_.size() <= direct_max) return end_relay();
-    try {
-      if (relay_ == nullptr) relay_ = std::make_unique<pipe::Relay>();
-    } catch (const std::system_error&) {
-      return;  // slower, but as well
-    }
-    for (const auto& reader : piped_) {
-      if (reader->member == nullptr) reader->member = relay_->add(*reader->pipe);
-    }
+  // Sends a frame through the ring, see `Broadcast`.
+  int put(Span<const std::uint8_t> frame) noexcept { return has_members() ? ring_->put(frame) : CORTEX_WRITTEN; }
+  void end(Span<const std::uint8_t> frame) noexcept {
+    if (has_members()) ring_->end(frame);
   }
 
-  // Writes a frame into a reader's pipe, or as much of it as there is room for, and keeps the rest; false if there is
-  // no room.
-  bool write(Reader& reader, Span<const std::uint8_t> frame) {
-    return reader.member == nullptr ? reader.pipe->write(frame) : relay_->put(*reader.member, frame);
+  // The shortest time for which a reliable reader that has no room in the ring may hold up the publisher.
+  std::uint32_t patience_ms(std::size_t frame_size) const noexcept {
+    std::uint32_t shortest = UINT32_MAX;
+    for (const auto& reader : all_) {
+      if (is_full(*reader, frame_size)) shortest = std::min(shortest, reader->request.timeout_ms);
+    }
+    return shortest;
   }
 
-  // Writes what is left of frames.
-  void flush() {
-    for (const auto& reader : piped_) {
-      if (reader->member == nullptr) reader->pipe->flush();
+  // Waits no more for those that have held it up for their time.
+  void give_up(std::size_t frame_size, std::int64_t waited_ns) noexcept {
+    for (const auto& reader : all_) {
+      const bool is_over = std::int64_t{reader->request.timeout_ms} * 1'000'000 <= waited_ns;
+      if (is_over && is_full(*reader, frame_size)) ring_->give_up(reader->member);
     }
   }
 
   // Gives all readers away.
   List release() noexcept {
-    end_relay();
-    for (const auto& reader : all_) reader->left = true;
-    piped_.clear();
-    lossy_ = strict_ = 0;
+    ring_.reset();
+    members_ = lossy_ = strict_ = 0;
     return std::exchange(all_, {});
   }
 
@@ -155,24 +139,25 @@ class Readers {
   std::uint32_t timeout_ms(const Outlet& outlet) const noexcept {
     std::uint32_t longest = 0;
     for (const auto& reader : all_) {
-      if (reader->outlet == &outlet && reader->pipe == nullptr) longest = std::max(longest, reader->request.timeout_ms);
+      if (reader->outlet == &outlet && reader->member < 0) longest = std::max(longest, reader->request.timeout_ms);
     }
     return longest;
   }
 
  private:
-  // So many pipes a publisher writes itself: what is quickest for one reader is a storm of wake-ups for many.
-  static constexpr std::size_t direct_max = 2;
-
-  void take_back(Reader& reader) noexcept {
-    if (reader.member != nullptr) relay_->remove(reader.member);
-    reader.member.reset();
+  bool is_full(const Reader& reader, std::size_t frame_size) const noexcept {
+    return reader.member >= 0 && ring_->is_full(reader.member, frame_size);
   }
 
-  void end_relay() noexcept {
-    if (relay_ == nullptr) return;
-    for (const auto& reader : piped_) take_back(*reader);
-    relay_.reset();
+  void join(Reader& reader, std::uint64_t first, Listener& listener) {
+    CortexHello hello;
+    if (!listener.take(reader.request.source, reader.request.reader, hello)) return;
+    if (ring_ == nullptr) ring_ = Broadcast::open(reader.request.source);
+    if (ring_ == nullptr) {
+      cortex_hello_close(&hello);
+    } else {
+      reader.member = ring_->add(hello, reader.request.strict, first);
+    }
   }
 
   std::uint32_t free_column() const noexcept {
@@ -185,8 +170,8 @@ class Readers {
   }
 
   List all_;
-  List piped_;
-  std::unique_ptr<pipe::Relay> relay_;
+  std::unique_ptr<Broadcast> ring_;
+  std::size_t members_ = 0;
   std::size_t lossy_ = 0;
   std::size_t strict_ = 0;
 };

@@ -220,10 +220,11 @@ class NodeFiles {
   NodeFiles(const NodeFiles&) = delete;
   NodeFiles& operator=(const NodeFiles&) = delete;
   ~NodeFiles() {
-    for (const char* role : {"lossy", "strict", "control", "lock"}) ::unlink((stem_ + "." + role).c_str());
+    for (const char* role : {"lossy", "strict", "control", "ring", "lock"}) ::unlink((stem_ + "." + role).c_str());
     ::close(fd_);
   }
-  std::string endpoint(const char* role) const { return "ipc://" + stem_ + "." + role; }
+  std::string path(const char* role) const { return stem_ + "." + role; }
+  std::string endpoint(const char* role) const { return "ipc://" + path(role); }
 
  private:
   bool lock() {

@@ -32,7 +32,6 @@ inline bool is_tcp(const std::string& address) { return address.rfind("tcp://", 
 inline bool is_ipc(const std::string& address) { return address.rfind("ipc://", 0) == 0; }
 
 // Where the unix socket of an ipc address lies.
-inline std::string folder_of(const std::string& address) { return address.substr(6, address.rfind('/') - 6); }
 
 // A socket that never blocks its owner at close, and over tcp notices a peer that is gone. On ipc the kernel reports
 // a dead peer at once, and a stopped one may still hold leases of shared memory.

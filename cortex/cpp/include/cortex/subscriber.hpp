@@ -163,7 +163,7 @@ class SubscriptionCore {
         fds.push_back({waker_.fd(), POLLIN, 0});
         for (const auto& link : links_) {
           fds.push_back({link->fd(), POLLIN, 0});
-          if (link->pipe_fd() >= 0) fds.push_back({link->pipe_fd(), POLLIN, 0});
+          if (link->bell_fd() >= 0) fds.push_back({link->bell_fd(), POLLIN, 0});
         }
       }
       const std::int64_t now_ns = monotonic_ns();
@@ -227,7 +227,7 @@ class SubscriptionCore {
 
  private:
   static constexpr std::size_t drain_count = 64;        // frames that are read at a time
-  static constexpr std::size_t drain_lossy_count = 4096;  // more than a socket or a pipe holds of small ones
+  static constexpr std::size_t drain_lossy_count = 4096;  // more than a socket holds of small ones
   static constexpr std::size_t fresh_depth = 64;         // shorter queues are topped up before every message
   static constexpr std::int64_t fresh_ns = 1'000'000;    // and longer ones if they were filled so long ago
   static constexpr std::int64_t spin_ns = 20'000;
@@ -248,7 +248,7 @@ class SubscriptionCore {
 
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
   // the last one was there within `spin_ns`, this looks for the next one for so long. It looks every `gather_ns`, since
-  // each look and each read hold up whoever writes to the pipe.
+  // each look in vain has whoever writes to the ring wake us.
   void wait(std::vector<pollfd>& fds, std::int64_t begin_ns, std::int64_t deadline_ns) {
     if (in_rush_.load(std::memory_order_relaxed)) {
       const std::int64_t end_ns = std::min(begin_ns + spin_ns, deadline_ns);

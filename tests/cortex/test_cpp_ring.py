@@ -1,17 +1,14 @@
-"""Pipes between the C++ client and Python, and between two C++ processes."""
+"""Rings between the C++ client and Python, and between two C++ processes."""
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import random
-import select
 import shutil
 import signal
-import termios
+import socket
 import time
-from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,9 +23,8 @@ from processes import SOON_S, wait_for
 import cortex.link
 from cortex import wire
 from cortex.codec import codec_of
-from cortex.host import pipe_path
+from cortex.compiled import native
 from cortex.node import Node
-from cortex.pipe import Offer
 from cortex.policy import Policy, keep_last, latest, reliable
 from cortex.shm import RingView
 
@@ -40,29 +36,15 @@ SIZES = "10,20000,4000,0,50000"
 """Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
 
 
-@pytest.fixture(autouse=True)
-def no_name_is_left(runtime: Path) -> Iterator[None]:
-    """Whoever meets, the name of a pipe goes as soon as they have."""
-    yield
-    assert not list(runtime.rglob("pipe.*"))
+def rings_of(pid: int | str) -> set[str]:
+    """The rings, and pages of their readers, that a process has mapped."""
+    lines = Path(f"/proc/{pid}/maps").read_text(encoding="ascii").splitlines()
+    return {line.split()[4] for line in lines if "/memfd:cortex (" in line}
 
 
-def pipes_of(pid: int | str) -> set[tuple[int, int]]:
-    """The named pipes that a process has open."""
-    found = set()
-    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        try:
-            if "/pipe." in os.readlink(descriptor):
-                status = descriptor.stat()
-                found.add((status.st_dev, status.st_ino))
-        except OSError:  # closed meanwhile
-            continue
-    return found
-
-
-def is_piped(peer: Peer, other: int | str = "self") -> bool:
-    """Whether a C++ program and another process have a pipe in common."""
-    return bool(pipes_of(peer.process.pid) & pipes_of(other))
+def share_a_ring(peer: Peer, other: int) -> bool:
+    """Whether a C++ program and another process have a ring in common."""
+    return bool(rings_of(peer.process.pid) & rings_of(other))
 
 
 def result_of(peer: Peer) -> dict[str, int]:
@@ -82,7 +64,6 @@ def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Ca
     scans = make_node().publisher("/scan", Scan)
     peer = start("count", "/scan", "reliable", 0, 3, 3000)
     assert scans.wait_for_subscribers(1, SOON_S)
-    assert is_piped(peer)
     for number in range(3000):
         assert scans.publish(scan(number, sizes()[number % 5]))
     result = result_of(peer)
@@ -92,13 +73,13 @@ def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Ca
 
 def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    peer = start("publish", "/scan", 3000, SIZES)
+    start("publish", "/scan", 3000, SIZES)
     for number in range(3000):
         received = scans.recv(SOON_S)
         assert (received.stamp_ns, received.ranges.size) == (number, sizes()[number % 5])
         assert (received.ranges == number).all()
     assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
-    assert is_piped(peer)
+    assert scans.carriers == ["ipc, ring, shared memory"]
 
 
 def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
@@ -110,10 +91,10 @@ def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
     assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
 
 
-def test_messages_without_a_slot_go_through_the_pipe(
+def test_messages_without_a_slot_go_through_the_ring(
     start: Callable[..., Peer], make_node: Callable[..., Node]
 ) -> None:
-    """A C++ publisher that has no descriptor left for a ring sends whole bodies, larger than the pipe."""
+    """A C++ publisher that has no descriptor left for slots sends whole bodies through the ring."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "full")
     for number in range(100):
@@ -129,7 +110,7 @@ def test_messages_without_a_slot_go_through_the_pipe(
 def test_slow_reader_of_cpp_knows_what_it_missed(
     start: Callable[..., Peer], make_node: Callable[..., Node], policy: Policy, size: str
 ) -> None:
-    """Far more than the pipe holds, without a pause: received, overtaken and lost are all that was sent."""
+    """Far more than the ring holds, without a pause: received, overtaken and lost are all that was sent."""
     scans = make_node().subscriber("/scan", Scan, policy=policy)
     start("publish", "/scan", 6000, size)
     counters = scans.counters
@@ -154,7 +135,7 @@ def counted(node: Node) -> list[int]:
 
 
 def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
-    """More than a publisher writes to itself: all get everything through pipes, while others come and go."""
+    """All get everything through the ring, while others come and go."""
     node = make_node()
     readers = [node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) for _ in range(4)]
     peer = start("publish", "/scan", 1200, "10,10,20000", "", 4)
@@ -162,12 +143,12 @@ def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[...
     for number in range(1200):  # each in turn, as a reliable one holds up the publisher
         assert {reader.recv(SOON_S).stamp_ns for reader in readers} == {number}
         if number == 0:
-            assert len(pipes_of(peer.process.pid)) == 4
+            assert {reader.carriers[0] for reader in readers} == {"ipc, ring, shared memory"}
         if number % 100 == 50:
             passers.append(node.subscriber("/scan", Scan, policy=keep_last(4)))
         elif number % 100 == 0 and passers:
             passers.pop().close()
-        elif number in (410, 810):  # at last it writes all pipes itself
+        elif number in (410, 810):
             readers.pop().close()
     assert all(reader.counters.lost == 0 for reader in readers)
     assert result_of(peer) == {"published": 1200, "refused": 0, "timeouts": 0}
@@ -184,7 +165,7 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
     writer = start("publish", "/scan", 9000, "10", "", 4)
     for number in range(9000):
         assert {other.recv(SOON_S).stamp_ns for other in others} == {number}
-        if number in (500, 8000):  # meanwhile comes more than its pipe and the relay hold
+        if number in (500, 8000):  # meanwhile comes more than the ring holds
             stopped.process.send_signal(signal.SIGSTOP if number == 500 else signal.SIGCONT)
     assert all(other.counters.lost == 0 for other in others)
     result = result_of(writer)
@@ -192,25 +173,20 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
     wait_for(lambda: counted(node) == [9000])
 
 
-def test_reader_without_pipe(
+def test_reader_without_ring(
     start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An older reader offers none: the C++ publisher serves it through ZeroMQ."""
-
-    def refuse(*_: object) -> None:
-        raise OSError("no pipes here")
-
-    monkeypatch.setattr(cortex.link, "Offer", refuse)
+    """One without the C module asks for none: the C++ publisher serves it through ZeroMQ."""
+    monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    peer = start("publish", "/scan", 500, SIZES)
+    start("publish", "/scan", 500, SIZES)
     for number in range(500):
         assert scans.recv(SOON_S).stamp_ns == number
     assert scans.counters.lost == 0
-    assert not pipes_of(peer.process.pid)
 
 
 @pytest.mark.parametrize("others", [0, 2])
-def test_killed_cpp_reader_with_a_full_pipe(
+def test_killed_cpp_reader_that_holds_up_its_publisher(
     start: Callable[..., Peer], make_node: Callable[..., Node], others: int
 ) -> None:
     """The publisher waits for a reliable reader; when that dies it goes on, and no signal kills it."""
@@ -240,16 +216,21 @@ def test_killed_cpp_publisher_is_followed_by_another(start: Callable[..., Peer])
     """What a dead publisher wrote is read to its end, and the next one is another source."""
     reader = start("count", "/scan", "reliable", 200, 3, 100_000_000)
     first = start("publish", "/scan", -1, SIZES)
-    wait_for(lambda: is_piped(reader, first.process.pid))
+    wait_for(lambda: share_a_ring(reader, first.process.pid))
     time.sleep(random.random() * 0.2)  # it dies at any moment
     first.process.kill()
     reader.process.kill()
 
     reader = start("count", "/scan", "reliable", 0, 3, 500)
     second = start("publish", "/scan", -1, "10")
-    wait_for(lambda: is_piped(reader, second.process.pid) or reader.has_line())  # or it was quick
+    wait_for(lambda: share_a_ring(reader, second.process.pid) or reader.has_line())  # or it was quick
     result = result_of(reader)
     assert (result["wrong"], result["lost"], result["rejected"]) == (0, 0, 0)
+
+
+def nothing(flags: int) -> bytes:
+    """A socket to which nothing comes."""
+    raise zmq.Again
 
 
 class SlowReader:
@@ -275,14 +256,16 @@ class SlowReader:
         wait_for(lambda: bool(found()))
         ((self.source, address),) = found()
         self.key = wire.attach_key(wire.AttachKey(self.source, 1, True, True, 10, 1), stamped=True)
-        self._offer = Offer(Path(address.removeprefix("ipc://")).parent, 1)
+        path = address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
+        self._idle = socket.socketpair()
+        self._ring = native.RingReader(path, self.source, 1, self._idle[0].fileno(), nothing, zmq.Again, 20)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.connect(address)
         self._socket.subscribe(self.key)
         column = self.answer().column
         assert column is not None
-        assert self._offer.taken()
+        assert self._ring.welcomed() is not None
         self.column: int = column
 
     def answer(self) -> wire.AttachAnswer:
@@ -290,28 +273,15 @@ class SlowReader:
         assert self._socket.poll(1e3 * SOON_S), "the publisher does not answer"
         return wire.parse_answer(self._socket.recv())
 
-    @property
-    def waiting(self) -> int:
-        """What lies in the pipe [bytes]."""
-        count = array("i", [0])
-        fcntl.ioctl(self._offer.fd, termios.FIONREAD, count)
-        return count[0]
-
     def frame(self) -> bytes:
-        """The next frame, taken apart by its header's own size."""
-        head = self._read(wire.HEADER_SIZE)
-        slot = wire.MASK.size + wire.PLACE_SIZE
-        return head + self._read(slot if head[3:4] == b"S" else int.from_bytes(head[48:56], "little"))
-
-    def _read(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
-            assert select.select([self._offer.fd], [], [], SOON_S)[0], "the rest of a frame does not come"
-            data += os.read(self._offer.fd, size - len(data))
-        return data
+        """The next frame."""
+        found: bytes = self._ring.receive(zmq.DONTWAIT)
+        return found
 
     def leave(self) -> None:
-        self._offer.close()
+        self._ring.close()
+        for end in self._idle:
+            end.close()
         self._context.destroy(linger=0)
 
 
@@ -319,7 +289,7 @@ class SlowReader:
 def attach(
     make_node: Callable[..., Node], start: Callable[..., Peer]
 ) -> Iterator[Callable[..., tuple[SlowReader, dict[str, int]]]]:
-    """Makes a C++ program fill the pipe of a reader and leave; both, and what the program says."""
+    """Makes a C++ program publish until a reader has no room, and leave; both, and what the program says."""
     readers = []
 
     def run(most: int, size: int) -> tuple[SlowReader, dict[str, int]]:
@@ -337,28 +307,19 @@ def sequence_of(frame: bytes) -> int:
     return int.from_bytes(frame[24:32], "little")
 
 
-def test_closed_publisher_finishes_a_frame(
+def test_what_a_closed_publisher_has_taken_stays(
     attach: Callable[..., tuple[SlowReader, dict[str, int]]],
 ) -> None:
-    """A frame that is in the pipe in part comes whole, behind it the number that tells of the loss."""
+    """Also when its process has ended; behind it the number that tells of the loss."""
     reader, result = attach(10**9, 2700)
-    frame = wire.HEADER_SIZE + len(body_of(0, 2700))
-    assert reader.waiting < wire.HEADER_SIZE + result["taken"] * frame  # three pages each: one was cut
-    assert reader.frame()[3:4] == b"B"
+    reader.publisher.end()
     for number in range(result["taken"]):
         assert reader.frame()[wire.HEADER_SIZE :] == body_of(number, 2700)
     last = reader.frame()
     assert (last[3:4], len(last), sequence_of(last)) == (b"B", wire.HEADER_SIZE, result["published"])
     assert result["published"] == result["taken"] + 1
-
-
-def test_publisher_that_ends_tells_what_there_was(
-    attach: Callable[..., tuple[SlowReader, dict[str, int]]],
-) -> None:
-    """Its node does not wait for ever: a reader with a full pipe is told through its socket."""
-    reader, result = attach(10**9, 10)
-    reader.publisher.end()
-    assert reader.answer().sequence == result["published"] > result["taken"]
+    with pytest.raises(zmq.Again):
+        reader.frame()
 
 
 def test_cpp_reader_counts_what_it_had_no_time_for(
@@ -378,7 +339,7 @@ def test_cpp_reader_counts_what_it_had_no_time_for(
     wait_for(lambda: counted(watcher) == [sent])
 
     writer = start("fill", "/scan", 10**9, 10)
-    wait_for(lambda: is_piped(reader, writer.process.pid) or writer.has_line())  # or one message was late
+    wait_for(lambda: share_a_ring(reader, writer.process.pid) or writer.has_line())  # or one message was late
     reader.process.send_signal(signal.SIGSTOP)
     sent += result_of(writer)["published"]
     writer.end()
@@ -400,7 +361,7 @@ def test_slots_of_a_closed_publisher_stay(
     """What was sent through shared memory is there until its reader has given it back."""
     reader, result = attach(5, 20_000)
     assert result == {"taken": 5, "published": 5}
-    frames = [reader.frame() for _ in range(6)][1:]
+    frames = [reader.frame() for _ in range(5)]
     assert reader.frame()[3:4] == b"B"
     offset = wire.HEADER_SIZE + wire.MASK.size
     place = wire.parse_place(frames[0], offset)
@@ -413,27 +374,33 @@ def test_slots_of_a_closed_publisher_stay(
     wait_for(lambda: not is_ring(place))  # all was given back
 
 
-class PipingImpostor(Impostor):
-    """A publisher that takes the pipe of its subscriber, and writes there what it likes."""
+class RingImpostor(Impostor):
+    """A publisher that takes its subscriber into a ring, and writes there what it likes."""
 
-    def take_pipe(self, runtime: Path, key: bytes) -> int:
-        number = int.from_bytes(key[16:24], "little")
-        path = pipe_path(runtime, number)
-        assert path.is_fifo()
-        assert path.stat().st_mode & 0o777 == 0o600
-        fd = os.open(path, os.O_WRONLY)
-        os.write(fd, make_frame(b"B", 0, b""))
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.listener = native.listen(str(directory / "data.ring"))
+        self.ring = native.Broadcast(self.SOURCE, zmq.Again)
+
+    def take_in(self, key: bytes) -> None:
+        fd = native.accept(self.listener)
+        source, number, page, bell = native.hear(fd)
+        assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
+        self.ring.add(fd, page, bell, False, 0)
         self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
-        return fd
+
+    def close(self) -> None:
+        super().close()
+        self.ring.close()
+        os.close(self.listener)
 
 
 @pytest.fixture
-def impostor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PipingImpostor]:
-    liar = PipingImpostor(runtime)
+def impostor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RingImpostor]:
+    liar = RingImpostor(runtime)
     monkeypatch.setenv("CORTEX_TEST_PEER", liar.control)
     yield liar
     liar.close()
-    assert not list(runtime.rglob("pipe.*"))
     shutil.rmtree(runtime, ignore_errors=True)
     runtime.mkdir(mode=0o700)
 
@@ -445,7 +412,7 @@ def body_of(number: int, size: int = 4) -> bytes:
 
 
 def bad_frames() -> list[bytes]:
-    """Frames that are whole as the pipe sees them, and that the subscriber must reject."""
+    """Frames that the subscriber must reject."""
     body = body_of(1)
     record = wire.RECORD.pack(0, 0, len(body), 0) + body
     record += bytes(-len(record) % 8)
@@ -461,19 +428,22 @@ def bad_frames() -> list[bytes]:
     ]
 
 
-def test_lies_in_a_pipe_are_rejected(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
-    """Frames in pieces, bad frames between good ones, at last no frame: then the socket is used again."""
+def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> None:
+    """Bad frames between good ones, at last none at all: then the socket is used again."""
     peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
     key = impostor.await_key()
     assert key[24] & 1
-    fd = impostor.take_pipe(runtime, key)
-    bad = bad_frames()
-    stream = make_frame(b"M", 0, body_of(0)) + b"".join(bad) + make_frame(b"M", 1, body_of(1))
-    stream += make_frame(b"M", 2, b"\xff" * 40)  # the codec rejects it
-    stream += make_frame(b"M", 3, body_of(3, 20_000))  # larger than a read
-    for at in range(0, len(stream), 333):
-        os.write(fd, stream[at : at + 333])
-    os.write(fd, b"this is no frame" * 10)
+    impostor.take_in(key)
+    bad = [*bad_frames(), b"this is no frame" * 10]
+    for frame in (
+        make_frame(b"M", 0, body_of(0)),
+        *bad,
+        make_frame(b"M", 1, body_of(1)),
+        make_frame(b"M", 2, b"\xff" * 40),  # the codec rejects it
+        make_frame(b"M", 3, body_of(3, 20_000)),
+        b"",
+    ):
+        assert impostor.ring.send(frame)
     second = impostor.await_key()  # it attaches anew, without shared memory
     assert second[16:24] != key[16:24]
     assert not second[24] & 1
@@ -482,19 +452,17 @@ def test_lies_in_a_pipe_are_rejected(programs: Path, runtime: Path, impostor: Pi
     impostor.xpub.send_multipart([make_frame(b"L", 7, b"", size=len(body_of(7))), body_of(7)])
     impostor.xpub.send(make_frame(b"M", 8, codec_of(Scan).encode(scan(-1, 0), 1000)))
     result = result_of(peer)
-    os.close(fd)
     assert result["received"] == 5  # 0, 1, 3, 6, 7
     assert result["wrong"] == 0
-    assert result["rejected"] == len(bad) + 1 + 1  # with the body, and what is no frame
+    assert result["rejected"] == len(bad) + 1 + 1  # with the body, and the ring
     assert result["lost"] == 2  # 4 and 5
     assert "cannot be read" in peer.end()
 
 
-def test_publisher_that_takes_no_pipe(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
-    """An older publisher answers without opening it: the name goes, and the socket is read."""
+def test_publisher_that_takes_nobody_in(programs: Path, impostor: RingImpostor) -> None:
+    """Its subscriber reads the socket."""
     peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
     key = impostor.await_key()
-    assert pipe_path(runtime, int.from_bytes(key[16:24], "little")).is_fifo()
     impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
     impostor.xpub.send(make_frame(b"M", 0, body_of(0)))
     impostor.xpub.send(make_frame(b"M", 1, codec_of(Scan).encode(scan(-1, 0), 1000)))
@@ -502,21 +470,17 @@ def test_publisher_that_takes_no_pipe(programs: Path, runtime: Path, impostor: P
     peer.end()
 
 
-def test_random_bytes_in_a_pipe_do_no_harm(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
-    """Damaged streams, one reader each: it lives, and goes on with the socket or the pipe."""
+def test_random_bytes_in_a_ring_do_no_harm(programs: Path, impostor: RingImpostor) -> None:
+    """Damaged frames, one reader each: it lives."""
     rng = random.Random(11)
     for _ in range(5):
         peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
-        key = impostor.await_key()
-        while not key[24] & 1:  # the one before, which has given up its pipe
-            key = impostor.await_key()
-        fd = impostor.take_pipe(runtime, key)
+        impostor.take_in(impostor.await_key())
         frames = [make_frame(b"M", number, body_of(number)) for number in range(50)] + bad_frames()
         rng.shuffle(frames)
-        stream = bytearray(b"".join(frames))
-        for _ in range(20):
-            stream[rng.randrange(len(stream))] ^= 1 << rng.randrange(8)
-        os.write(fd, stream)
+        for frame in frames:
+            damaged = bytearray(frame)
+            damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
+            assert impostor.ring.send(bytes(damaged))
         assert peer.process.poll() is None
         peer.end()  # exits with status 0
-        os.close(fd)

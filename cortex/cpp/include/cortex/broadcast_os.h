@@ -1,0 +1,386 @@
+/* SPDX-License-Identifier: Apache-2.0
+   What `broadcast.h` needs of the system: sealed memory, a socket that hands descriptors over, and bells. */
+
+#ifndef CORTEX_BROADCAST_OS_H
+#define CORTEX_BROADCAST_OS_H
+
+#if defined(__linux__)
+
+#include <fcntl.h>
+#include <sys/eventfd.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#ifndef F_ADD_SEALS /* of <linux/fcntl.h>, which cannot be included with <fcntl.h> */
+#define F_ADD_SEALS 1033
+#define F_GET_SEALS 1034
+#endif
+enum { CORTEX_SEAL = 1, CORTEX_SEAL_SHRINK = 2, CORTEX_SEAL_GROW = 4, CORTEX_SEAL_FUTURE_WRITE = 16, CORTEX_DESCRIPTORS = 2 };
+
+static inline void cortex_close_fd(int fd) {
+    const int error = errno;
+    if (fd >= 0) close(fd);
+    errno = error;
+}
+
+static inline void cortex_ring_bell(int bell) {
+    const uint64_t one = 1;
+    if (write(bell, &one, sizeof one) < 0) return; /* it rings already */
+}
+
+static inline void cortex_hush_bell(int bell) {
+    uint64_t count;
+    if (read(bell, &count, sizeof count) < 0) return; /* it did not ring */
+}
+
+static inline int cortex_is_gone(int socket) {
+    char byte;
+    return recv(socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT) == 0;
+}
+
+/* Sealed memory of its own: nobody can change its size, and if `others_read` nobody else can write to it. */
+static inline int cortex_memory(uint64_t bytes, int others_read) {
+    const int fd = (int)syscall(SYS_memfd_create, "cortex", 3u /* MFD_CLOEXEC | MFD_ALLOW_SEALING */);
+    if (fd < 0) return -1;
+    errno = posix_fallocate(fd, 0, (off_t)bytes); /* a missing page is an error here, instead of SIGBUS later */
+    const int seals = CORTEX_SEAL_SHRINK | CORTEX_SEAL_GROW | (others_read ? 0 : CORTEX_SEAL);
+    if (errno || fcntl(fd, F_ADD_SEALS, seals) < 0) {
+        cortex_close_fd(fd);
+        return -1;
+    }
+    return fd;
+}
+
+/* Whether a descriptor is memory whose size is this and stays. */
+static inline int cortex_is_memory(int fd, uint64_t bytes) {
+    struct stat status;
+    const int seals = fcntl(fd, F_GET_SEALS);
+    return seals >= 0 && !(~seals & (CORTEX_SEAL_SHRINK | CORTEX_SEAL_GROW)) && fstat(fd, &status) == 0
+        && (uint64_t)status.st_size == bytes;
+}
+
+/* Map a ring, its frames twice in a row. */
+static inline CortexRing *cortex_map(int fd, uint64_t capacity, int protection) {
+    const size_t whole = CORTEX_HEAD_BYTES + (size_t)capacity;
+    uint8_t *base = (uint8_t *)mmap(NULL, whole + (size_t)capacity, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+    if (base == MAP_FAILED) return NULL;
+    const int flags = MAP_SHARED | MAP_FIXED;
+    if (mmap(base, whole, protection, flags, fd, 0) == MAP_FAILED
+        || mmap(base + whole, (size_t)capacity, protection, flags, fd, CORTEX_HEAD_BYTES) == MAP_FAILED) {
+        munmap(base, whole + (size_t)capacity);
+        return NULL;
+    }
+    return (CortexRing *)base;
+}
+
+static inline void cortex_unmap(CortexRing *ring, uint64_t capacity) {
+    if (ring != NULL) munmap(ring, CORTEX_HEAD_BYTES + 2 * (size_t)capacity);
+}
+
+/* Send a message with descriptors. */
+static inline int cortex_send(int socket, const void *data, size_t size, const int *fds, int count) {
+    union {
+        struct cmsghdr head;
+        char space[CMSG_SPACE(CORTEX_DESCRIPTORS * sizeof(int))];
+    } control;
+    struct iovec part;
+    struct msghdr message;
+    memset(&control, 0, sizeof control);
+    memset(&message, 0, sizeof message);
+    part.iov_base = (void *)(uintptr_t)data;
+    part.iov_len = size;
+    message.msg_iov = &part;
+    message.msg_iovlen = 1;
+    message.msg_control = control.space;
+    message.msg_controllen = CMSG_SPACE((size_t)count * sizeof(int));
+    struct cmsghdr *head = CMSG_FIRSTHDR(&message);
+    head->cmsg_level = SOL_SOCKET;
+    head->cmsg_type = SCM_RIGHTS;
+    head->cmsg_len = CMSG_LEN((size_t)count * sizeof(int));
+    memcpy(CMSG_DATA(head), fds, (size_t)count * sizeof(int));
+    return sendmsg(socket, &message, MSG_DONTWAIT | MSG_NOSIGNAL) == (ssize_t)size ? 0 : -1;
+}
+
+/* Receive a message with just so many descriptors. */
+static inline int cortex_receive(int socket, void *data, size_t size, int *fds, int count) {
+    union {
+        struct cmsghdr head;
+        char space[CMSG_SPACE(CORTEX_DESCRIPTORS * sizeof(int))];
+    } control;
+    struct iovec part = {data, size};
+    struct msghdr message;
+    memset(&message, 0, sizeof message);
+    message.msg_iov = &part;
+    message.msg_iovlen = 1;
+    message.msg_control = control.space;
+    message.msg_controllen = sizeof control.space;
+    const ssize_t got = recvmsg(socket, &message, MSG_DONTWAIT | MSG_CMSG_CLOEXEC);
+    if (got < 0) return -1;
+    int found = 0;
+    for (struct cmsghdr *head = CMSG_FIRSTHDR(&message); head != NULL; head = CMSG_NXTHDR(&message, head)) {
+        if (head->cmsg_level != SOL_SOCKET || head->cmsg_type != SCM_RIGHTS) continue;
+        const int more = (int)((head->cmsg_len - CMSG_LEN(0)) / sizeof(int));
+        for (int index = 0; index < more; ++index, ++found) {
+            int fd;
+            memcpy(&fd, CMSG_DATA(head) + (size_t)index * sizeof(int), sizeof fd);
+            if (found < count) fds[found] = fd;
+            else close(fd);
+        }
+    }
+    if ((size_t)got == size && found == count) return 0;
+    for (int index = 0; index < found && index < count; ++index) close(fds[index]);
+    errno = EPROTO;
+    return -1;
+}
+
+/* Whether the other end belongs to our user. */
+static inline int cortex_is_ours(int socket) {
+    struct ucred peer;
+    socklen_t size = sizeof peer;
+    return getsockopt(socket, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0 && peer.uid == geteuid();
+}
+
+/* A socket, and the address of a path. */
+static inline int cortex_socket(const char *path, struct sockaddr_un *address) {
+    memset(address, 0, sizeof *address);
+    address->sun_family = AF_UNIX;
+    if (strlen(path) >= sizeof address->sun_path) {
+        errno = ENAMETOOLONG;
+        return -1;
+    }
+    strcpy(address->sun_path, path);
+    return socket(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+}
+
+static inline int cortex_listen(const char *path) {
+    struct sockaddr_un address;
+    const int fd = cortex_socket(path, &address);
+    if (fd < 0) return -1;
+    if (bind(fd, (struct sockaddr *)&address, sizeof address) == 0 && listen(fd, 1024) == 0) return fd;
+    cortex_close_fd(fd);
+    return -1;
+}
+
+static inline int cortex_accept(int listener) {
+    const int fd = accept4(listener, NULL, NULL, SOCK_NONBLOCK | SOCK_CLOEXEC);
+    if (fd < 0 || cortex_is_ours(fd)) return fd;
+    close(fd);
+    errno = EACCES;
+    return -1;
+}
+
+static inline int cortex_hear(int socket, CortexHello *hello) {
+    uint64_t said[3];
+    int fds[2];
+    if (cortex_receive(socket, said, sizeof said, fds, 2) < 0) return -1;
+    hello->source = said[1];
+    hello->reader = said[2];
+    hello->socket = socket;
+    hello->page = fds[0];
+    hello->bell = fds[1];
+    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && fcntl(fds[1], F_SETFL, O_NONBLOCK) == 0)
+        return 0;
+    close(fds[0]);
+    close(fds[1]);
+    errno = EPROTO;
+    return -1;
+}
+
+/* Make memory for a ring that goes on at the writer's head; the writer is as it was if there is none. */
+static inline int cortex_writer_make(CortexWriter *writer, uint64_t capacity) {
+    const int fd = cortex_memory(CORTEX_HEAD_BYTES + capacity, 1);
+    CortexRing *ring = fd < 0 ? NULL : cortex_map(fd, capacity, PROT_READ | PROT_WRITE);
+    if (ring == NULL) {
+        cortex_close_fd(fd);
+        return -1;
+    }
+    if (fcntl(fd, F_ADD_SEALS, CORTEX_SEAL_FUTURE_WRITE | CORTEX_SEAL) < 0) fcntl(fd, F_ADD_SEALS, CORTEX_SEAL); /* Linux < 5.1 */
+    ring->magic = CORTEX_RING_MAGIC;
+    ring->capacity = capacity;
+    ring->source = writer->source;
+    ring->reserved = ring->head = ring->last = writer->head;
+    writer->ring = ring;
+    writer->data = (uint8_t *)ring + CORTEX_HEAD_BYTES;
+    writer->capacity = capacity;
+    writer->fd = fd;
+    return 0;
+}
+
+static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity) {
+    memset(writer, 0, sizeof *writer);
+    writer->source = source;
+    return cortex_writer_make(writer, capacity);
+}
+
+/* Tell a reader where the ring is. */
+static inline int cortex_welcome(const CortexWriter *writer, int socket, uint64_t first) {
+    const uint64_t said[5] = {CORTEX_RING_MAGIC, writer->capacity, writer->source, writer->head, first};
+    return cortex_send(socket, said, sizeof said, &writer->fd, 1);
+}
+
+static inline void cortex_hello_close(const CortexHello *hello) {
+    cortex_close_fd(hello->page);
+    cortex_close_fd(hello->bell);
+    cortex_close_fd(hello->socket);
+}
+
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
+    int number = 0;
+    while (number < writer->count && writer->members[number].used) ++number;
+    void *page = MAP_FAILED;
+    if (number < CORTEX_MEMBERS)
+        page = mmap(NULL, CORTEX_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, hello->page, 0);
+    if (page == MAP_FAILED || cortex_welcome(writer, hello->socket, first) < 0) {
+        if (page != MAP_FAILED) munmap(page, CORTEX_PAGE_BYTES);
+        cortex_hello_close(hello);
+        return -1;
+    }
+    cortex_close_fd(hello->page);
+    CortexMember *member = &writer->members[number];
+    member->used = 1;
+    member->strict = strict;
+    member->late = 0;
+    member->socket = hello->socket;
+    member->bell = hello->bell;
+    member->page = (CortexPage *)page;
+    member->tail = writer->head;
+    __atomic_store_n(&member->page->tail, writer->head, __ATOMIC_RELEASE);
+    if (number == writer->count) ++writer->count;
+    return number;
+}
+
+static inline void cortex_writer_remove(CortexWriter *writer, int number) {
+    CortexMember *member = &writer->members[number];
+    if (!member->used) return;
+    member->used = 0;
+    munmap(member->page, CORTEX_PAGE_BYTES);
+    close(member->bell);
+    close(member->socket);
+}
+
+/* Go on in a larger ring: each reader gets it through its socket, and looks there after what is in the old one. */
+static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {
+    if (capacity > (uint64_t)1 << 32 || sysconf(_SC_AVPHYS_PAGES) < (long)(capacity / CORTEX_PAGE_BYTES)) return -1;
+    CortexWriter larger = *writer;
+    larger.head += CORTEX_ENTRY_BYTES;
+    if (cortex_writer_make(&larger, capacity) < 0) return -1;
+    for (int index = 0; index < writer->count; ++index) {
+        CortexMember *member = &larger.members[index];
+        if (!member->used || cortex_welcome(&larger, member->socket, 0) == 0) continue;
+        shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
+        member->late = 1;
+    }
+    cortex_writer_append(writer, CORTEX_MOVED, NULL, 0); /* the spare bytes have room for it */
+    cortex_writer_wake(writer);
+    cortex_unmap(writer->ring, writer->capacity);
+    close(writer->fd);
+    *writer = larger;
+    return 0;
+}
+
+static inline void cortex_writer_close(CortexWriter *writer) {
+    for (int index = 0; index < writer->count; ++index) cortex_writer_remove(writer, index);
+    cortex_unmap(writer->ring, writer->capacity);
+    if (writer->ring != NULL) close(writer->fd);
+    writer->ring = NULL;
+}
+
+/* Take the ring that the publisher hands over, instead of the one there is; 0 if none has come, -1 if it is none. */
+static inline int cortex_reader_map(CortexReader *reader) {
+    uint64_t said[5];
+    int fd;
+    if (cortex_receive(reader->socket, said, sizeof said, &fd, 1) < 0) return errno == EAGAIN ? 0 : -1;
+    const uint64_t capacity = said[1];
+    CortexRing *ring = NULL;
+    if (said[0] == CORTEX_RING_MAGIC && said[2] == reader->source && capacity >= CORTEX_HEAD_BYTES
+        && capacity <= (uint64_t)1 << 32 && !(capacity & (capacity - 1)) && cortex_is_memory(fd, CORTEX_HEAD_BYTES + capacity))
+        ring = cortex_map(fd, capacity, PROT_READ);
+    close(fd);
+    if (ring == NULL) return -1;
+    if (reader->ring == NULL) reader->first = said[4];
+    cortex_unmap(reader->ring, reader->capacity);
+    reader->ring = ring;
+    reader->data = (const uint8_t *)ring + CORTEX_HEAD_BYTES;
+    reader->capacity = capacity;
+    cortex_reader_move(reader, said[3]);
+    return 1;
+}
+
+static inline int cortex_reader_welcomed(CortexReader *reader) { return cortex_reader_map(reader) > 0; }
+static inline int cortex_reader_follow(CortexReader *reader) { return cortex_reader_map(reader) > 0 ? 0 : -1; }
+
+static inline void cortex_reader_close(CortexReader *reader) {
+    cortex_unmap(reader->ring, reader->capacity);
+    if (reader->page != NULL) munmap(reader->page, CORTEX_PAGE_BYTES);
+    cortex_close_fd(reader->bell);
+    cortex_close_fd(reader->socket);
+    reader->ring = NULL;
+    reader->page = NULL;
+    reader->bell = reader->socket = -1;
+}
+
+static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number) {
+    struct sockaddr_un address;
+    memset(reader, 0, sizeof *reader);
+    reader->source = source;
+    reader->bell = -1;
+    reader->socket = cortex_socket(path, &address);
+    const int page = cortex_memory(CORTEX_PAGE_BYTES, 0);
+    if (reader->socket < 0 || page < 0) goto failed;
+    {
+        void *memory = mmap(NULL, CORTEX_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, page, 0);
+        if (memory == MAP_FAILED) goto failed;
+        reader->page = (CortexPage *)memory;
+    }
+    reader->bell = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    if (reader->bell < 0 || connect(reader->socket, (struct sockaddr *)&address, sizeof address) < 0) goto failed;
+    {
+        const uint64_t said[3] = {CORTEX_RING_MAGIC, source, number};
+        const int fds[2] = {page, reader->bell};
+        if (!cortex_is_ours(reader->socket) || cortex_send(reader->socket, said, sizeof said, fds, 2) < 0) goto failed;
+    }
+    close(page);
+    return 0;
+failed:
+    cortex_close_fd(page);
+    cortex_reader_close(reader);
+    return -1;
+}
+
+#else /* no memfd: frames go through sockets */
+
+static inline int cortex_unsupported(void) {
+    errno = ENOSYS;
+    return -1;
+}
+static inline int cortex_is_gone(int socket) { return (void)socket, 0; }
+static inline void cortex_ring_bell(int bell) { (void)bell; }
+static inline void cortex_hush_bell(int bell) { (void)bell; }
+static inline int cortex_listen(const char *path) { return (void)path, cortex_unsupported(); }
+static inline int cortex_accept(int listener) { return (void)listener, cortex_unsupported(); }
+static inline int cortex_hear(int socket, CortexHello *hello) { return (void)socket, (void)hello, cortex_unsupported(); }
+static inline void cortex_hello_close(const CortexHello *hello) { (void)hello; }
+static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity) {
+    return (void)writer, (void)source, (void)capacity, cortex_unsupported();
+}
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
+    return (void)writer, (void)hello, (void)strict, (void)first, cortex_unsupported();
+}
+static inline void cortex_writer_remove(CortexWriter *writer, int member) { (void)writer, (void)member; }
+static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {
+    return (void)writer, (void)capacity, cortex_unsupported();
+}
+static inline void cortex_writer_close(CortexWriter *writer) { (void)writer; }
+static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number) {
+    return (void)reader, (void)path, (void)source, (void)number, cortex_unsupported();
+}
+static inline int cortex_reader_welcomed(CortexReader *reader) { return (void)reader, 0; }
+static inline int cortex_reader_follow(CortexReader *reader) { return (void)reader, cortex_unsupported(); }
+static inline void cortex_reader_close(CortexReader *reader) { (void)reader; }
+
+#endif
+#endif

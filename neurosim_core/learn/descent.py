@@ -1,0 +1,79 @@
+"""Gradient steps with Adam, each replayed as one CUDA graph: small networks wait for launches otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import nn
+
+_EAGER_STEPS = 3
+"""Steps before one is captured: PyTorch sets things up in them."""
+
+
+class Descent:
+    """Minimises a loss.
+
+    Args:
+        module: Its parameters are changed.
+        loss: Returns the loss, of tensors that are the same in each step and whose values change; it must
+            not wait for the device.
+        gradient_max: Gradients with a larger norm are scaled down to it.
+        **settings: Of Adam.
+
+    Attributes:
+        optimizer: Adam.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        loss: Callable[[], torch.Tensor],
+        *,
+        gradient_max: float,
+        **settings: Any,
+    ) -> None:
+        self._module, self._loss, self._gradient_max = module, loss, gradient_max
+        device = next(module.parameters()).device
+        self._on_cuda = device.type == "cuda"
+        self._rate = torch.zeros((), device=device) if self._on_cuda else 0.0
+        self.optimizer = torch.optim.Adam(
+            module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
+        )
+        self._count = 0
+        self._graph: Any = None
+
+    def step(self, rate: float) -> None:
+        """Take a gradient step.
+
+        Args:
+            rate: Learning rate.
+        """
+        for group in self.optimizer.param_groups:
+            if self._on_cuda:
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        self._count += 1
+        if not self._on_cuda:
+            self._descend()
+        elif self._count <= _EAGER_STEPS:
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                self._descend()
+            torch.cuda.current_stream().wait_stream(stream)
+        else:
+            if self._graph is None:
+                self._graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(self._graph):
+                    self._descend()
+            self._graph.replay()
+
+    def _descend(self) -> None:
+        loss = self._loss()
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self._module.parameters(), self._gradient_max)
+        self.optimizer.step()

@@ -1,0 +1,417 @@
+"""The ring that carries a publisher's frames to local readers: what each gets, and when it is woken."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import select
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import zmq
+from peer import Block, is_whole, make_block
+from processes import SOON_S, wait_for
+
+import cortex.link
+import cortex.subscriber
+from cortex import keep_last, reliable
+from cortex.compiled import native
+from cortex.shm import ShmUnavailable
+from cortex.wire import MESSAGE, Header, pack_header
+
+pytestmark = pytest.mark.skipif(native is None, reason="no C module")
+
+SOURCE = 7
+RING_BYTES = 1 << 19
+
+
+def frame(number: int, size: int) -> bytes:
+    """A frame that says which it is, and whose every byte depends on that."""
+    return pack_header(Header(MESSAGE, 1, SOURCE, number, None, 3, size, 0)) + bytes([number % 251]) * size
+
+
+def number_of(found: bytes) -> int:
+    """The number of a frame, which must be whole."""
+    number = int.from_bytes(found[24:32], "little")
+    assert found == frame(number, len(found) - 64)
+    return number
+
+
+class Ring:
+    """A publisher's ring, and its readers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path / "1.ring")
+        self.listener = native.listen(self.path)
+        self.writer = native.Broadcast(SOURCE, zmq.Again)
+        self.readers: list = []
+        self._idle = socket.socketpair()
+
+    def join(self, *, strict: bool):
+        """A reader, and its number."""
+        reader = native.RingReader(
+            self.path, SOURCE, len(self.readers) + 1, self._idle[0].fileno(), nothing, zmq.Again, 20
+        )
+        connection = native.accept(self.listener)
+        source, number, page, bell = native.hear(connection)
+        assert (source, number) == (SOURCE, len(self.readers) + 1)
+        assert reader.welcomed() is None
+        member = self.writer.add(connection, page, bell, strict, 5)
+        assert reader.welcomed() == 5
+        self.readers.append(reader)
+        return reader, member
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self.writer.close()
+        for reader in self.readers:
+            reader.close()
+        os.close(self.listener)
+        for end in self._idle:
+            end.close()
+
+
+def nothing(flags: int) -> bytes:
+    """A socket to which nothing comes."""
+    raise zmq.Again
+
+
+@pytest.fixture
+def ring(tmp_path: Path):
+    made = Ring(tmp_path)
+    yield made
+    made.close()
+
+
+def takes(writer, each: bytes) -> bool:
+    """Whether there is room for a frame, which then is sent."""
+    try:
+        assert writer.send(each) is True
+    except zmq.Again:
+        return False
+    return True
+
+
+def read_all(reader) -> list[int]:
+    """The numbers of all frames that are there."""
+    numbers = []
+    try:
+        while True:
+            numbers.append(number_of(reader.receive(zmq.DONTWAIT)))
+    except zmq.Again:
+        return numbers
+
+
+def fill(ring: Ring, size: int) -> int:
+    """Send frames until a reliable reader has no room; how many there was room for."""
+    count = 0
+    while takes(ring.writer, frame(count, size)):
+        count += 1
+    return count
+
+
+@pytest.mark.parametrize("largest", [200, 20_000, 3 * RING_BYTES], ids=str)
+def test_every_reliable_reader_gets_every_frame_in_order(ring, largest):
+    """Small ones, ones that wrap around, and ones that need a larger ring."""
+    generator = random.Random(largest)
+    readers = [ring.join(strict=True)[0] for _ in range(3)]
+    got: list[list[int]] = [[] for _ in readers]
+    count = 4_000_000 // (largest + 2000)
+    for number in range(count):
+        each = frame(number, generator.randrange(largest))
+        while not takes(ring.writer, each):
+            for reader, numbers in zip(readers, got, strict=True):
+                numbers += read_all(reader)
+        if generator.random() < 0.1:
+            index = generator.randrange(3)
+            got[index] += read_all(readers[index])
+    for reader, numbers in zip(readers, got, strict=True):
+        assert numbers + read_all(reader) == list(range(count))
+        assert not reader.broken
+
+
+def test_threads_read_while_the_publisher_writes(ring):
+    """Each sleeps until the bell rings; it waits for the slowest, and nobody loses anything."""
+    readers = [ring.join(strict=True)[0] for _ in range(3)]
+    count = 20_000
+    got: list[list[int]] = [[] for _ in readers]
+
+    def read(reader, numbers: list[int]) -> None:
+        while len(numbers) < count:
+            try:
+                numbers.append(number_of(reader.receive(0)))
+            except zmq.Again:
+                continue
+
+    threads = [threading.Thread(target=read, args=pair) for pair in zip(readers, got, strict=True)]
+    for thread in threads:
+        thread.start()
+    for number in range(count):
+        wait_for(lambda number=number: takes(ring.writer, frame(number, 40)), every_s=1e-5)
+    for thread in threads:
+        thread.join(SOON_S)
+    assert got == [list(range(count))] * 3
+
+
+def test_a_reliable_reader_holds_up_the_publisher(ring):
+    reader, member = ring.join(strict=True)
+    count = fill(ring, 1000)
+    assert RING_BYTES - 2000 < count * 1072 < RING_BYTES
+    assert ring.writer.in_the_way(1064) == [member]
+    number_of(reader.receive(zmq.DONTWAIT))
+    assert ring.writer.in_the_way(1064) == []
+    assert takes(ring.writer, frame(count, 1000))
+    assert read_all(reader) == list(range(1, count + 1))
+
+
+def test_who_is_late_keeps_what_it_has_and_loses_what_comes(ring):
+    """Until it has read half of what waits for it."""
+    reader, member = ring.join(strict=True)
+    count = fill(ring, 1000)
+    ring.writer.give_up(member)
+    assert ring.writer.in_the_way(1064) == []
+    for number in range(count, count + 5):
+        assert ring.writer.send(frame(number, 1000)) is False
+    for number in range(count // 2 + 2):
+        assert number_of(reader.receive(zmq.DONTWAIT)) == number
+    assert takes(ring.writer, frame(count + 5, 1000))
+    assert read_all(reader) == [*range(count // 2 + 2, count), count + 5]
+
+
+def test_who_is_late_holds_up_nobody_else(ring):
+    """The others get everything, and what it cannot keep it loses as a whole."""
+    late, member = ring.join(strict=True)
+    other, _ = ring.join(strict=True)
+    count = fill(ring, 1000)
+    ring.writer.give_up(member)
+    got = read_all(other)
+    for number in range(count, 3 * count):
+        assert ring.writer.send(frame(number, 1000)) is False
+        got += read_all(other)
+    assert got == list(range(3 * count))
+    rest = read_all(late)
+    assert rest == list(range(rest[0], 3 * count))
+    assert rest[0] > count
+    assert takes(ring.writer, frame(3 * count, 1000))
+
+
+def test_a_lossy_reader_keeps_the_newest_and_disturbs_nobody(ring):
+    reader, _ = ring.join(strict=False)
+    count = 3 * RING_BYTES // 1072
+    for number in range(count):
+        assert takes(ring.writer, frame(number, 1000))
+    got = read_all(reader)
+    assert got == list(range(got[0], count))
+    assert len(got) * 1072 > RING_BYTES // 2
+
+
+def test_a_lossy_reader_in_a_race_sees_no_torn_frame(ring):
+    """Each frame is checked byte by byte; numbers only grow."""
+    reader, _ = ring.join(strict=False)
+    ended = threading.Event()
+
+    def write() -> None:
+        for number in range(20_000):
+            takes(ring.writer, frame(number, 3000))
+        ended.set()
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    got: list[int] = []
+    while not ended.is_set():
+        got += read_all(reader)
+    thread.join()
+    got += read_all(reader)
+    assert got == sorted(set(got))
+    assert got[-1] == 19_999
+
+
+def test_the_last_frame_finds_room_and_outlives_the_publisher(ring):
+    reader, _ = ring.join(strict=True)
+    count = fill(ring, 1000)
+    ring.writer.end(frame(count, 0))
+    ring.writer.close()
+    assert read_all(reader) == list(range(count + 1))
+
+
+def test_the_bell_rings_for_a_frame_after_none_was_there(ring):
+    """Once, not for each frame; and never while nothing has come."""
+    reader, _ = ring.join(strict=True)
+    poll = select.poll()
+    poll.register(reader.fd, select.POLLIN)
+    assert read_all(reader) == []
+    assert not poll.poll(0)
+    takes(ring.writer, frame(0, 10))
+    assert poll.poll(0)
+    assert read_all(reader) == [0]
+    assert not poll.poll(0)
+    takes(ring.writer, frame(1, 10))
+    takes(ring.writer, frame(2, 10))
+    assert poll.poll(0)
+    assert number_of(reader.receive(zmq.DONTWAIT)) == 1
+    assert not poll.poll(0)  # it is known that there is more
+    assert read_all(reader) == [2]
+
+
+def test_a_reader_that_is_gone_is_forgotten(ring):
+    before = len(os.listdir("/proc/self/fd"))
+    reader, member = ring.join(strict=True)
+    fill(ring, 1000)
+    reader.close()
+    assert takes(ring.writer, frame(0, 1000))  # at once: its connection has ended
+    ring.writer.remove(member)
+    assert takes(ring.writer, frame(1, 10))
+    assert len(os.listdir("/proc/self/fd")) == before
+    with pytest.raises(IndexError, match="no member"):
+        ring.writer.remove(member)
+    assert ring.join(strict=True)[1] == member
+
+
+def test_a_reader_cannot_write_to_the_ring(ring):
+    """Its memory is sealed: a second mapping for writing is refused."""
+    ring.join(strict=True)
+    fds = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]
+    rings = [fd for fd in fds if os.path.exists(fd) and os.stat(fd).st_size == RING_BYTES + (1 << 16)]
+    assert rings
+    with pytest.raises(PermissionError), open(rings[0], "r+b", buffering=0) as file:
+        file.write(b"x")
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"x" * 24, (b"CTXCAST1" * 3)], ids=["nothing", "nonsense", "no descriptors"]
+)
+def test_who_says_something_else_is_refused(ring, said):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(ring.path)
+        connection = native.accept(ring.listener)
+        if said:
+            other.send(said)
+            with pytest.raises(OSError, match=r"[Pp]rotocol"):
+                native.hear(connection)
+        else:
+            with pytest.raises(BlockingIOError):
+                native.hear(connection)
+        os.close(connection)
+
+
+@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
+def test_processes_speak_through_the_ring(make_node, start_child, policy):
+    """Small and large messages in one order."""
+    child = start_child(
+        "endless_publisher", topic="/blocks", sizes=[100, 150_000, 6000, 20_000], rate_hz=400.0
+    )
+    child.hear()
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    numbers = []
+    for _ in range(60):
+        block = subscriber.recv(SOON_S)
+        assert is_whole(block)
+        numbers.append(block.number)
+    assert numbers == sorted(set(numbers))
+    assert subscriber.carriers == ["ipc, ring, shared memory"]
+    counters = subscriber.counters
+    assert numbers[-1] - numbers[0] <= 59 + counters.lost + counters.overtaken
+    assert counters.rejected == 0
+    assert counters.lost == 0 or not policy.reliable
+    child.finish()
+
+
+def test_a_ring_that_brings_nonsense_is_left_for_the_socket(make_node, start_child):
+    """What was published meanwhile is counted as lost, and nothing after it."""
+    publisher = make_node().publisher("/blocks", Block)
+    child = start_child("endless_subscriber", topic="/blocks", policy=["reliable", {"timeout_s": SOON_S}])
+    child.hear()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    sent = 0
+
+    def publish() -> None:
+        nonlocal sent
+        assert publisher.publish(make_block(sent, 100))
+        sent += 1
+
+    publish()
+    wait_for(lambda: child.ask()["count"] == 1)
+    publisher._fanout.ring._ring.send(b"nonsense" * 20)
+    wait_for(lambda: child.ask()["rejected"] == 1)
+    publish()
+    wait_for(lambda: child.ask()["count"] == sent)
+    assert child.ask()["lost"] == 0
+
+
+def test_a_ring_is_read_to_its_end_however_long_that_takes(make_node, start_child, monkeypatch):
+    """Its publisher has left long ago when its reader comes to read."""
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 0)
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, SOON_S))
+    child.ask(do="await_subscribers", topic="/blocks")
+    assert child.ask(do="publish", topic="/blocks", count=40, size=100)["delivered"] == 40
+    child.finish()
+    wait_for(lambda: not subscriber.sources())
+    for _ in range(5):
+        subscriber.dismiss(time.monotonic_ns())
+    assert [subscriber.recv(SOON_S).number for _ in range(40)] == list(range(40))
+    wait_for(lambda: not subscriber._links)
+    assert subscriber.counters.lost == 0
+
+
+def test_what_came_before_the_answer_was_read_counts(make_node, start_child, monkeypatch):
+    """Its publisher was gone before the reader, which lost most of it, looked for the first time."""
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 10**15)
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    subscriber = make_node().subscriber("/blocks", Block, policy=keep_last(8))
+    child.ask(do="await_subscribers", topic="/blocks")
+    child.ask(do="publish", topic="/blocks", count=100, size=RING_BYTES // 20)
+    child.finish()
+    wait_for(lambda: not subscriber.sources())
+    count = 0
+
+    def accounted() -> int:
+        nonlocal count
+        with contextlib.suppress(TimeoutError):
+            assert is_whole(subscriber.recv(0.0))
+            count += 1
+        return count + subscriber.counters.lost + subscriber.counters.overtaken
+
+    wait_for(lambda: accounted() >= 100)
+    assert accounted() == 100
+    assert subscriber.counters.lost > 0
+
+
+@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
+def test_a_reader_that_cannot_map_the_first_slots(make_node, start_child, monkeypatch, policy):
+    """It attaches anew, through the socket: the latched message comes all the same."""
+
+    def refuse(*_):
+        raise ShmUnavailable("not here")
+
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block", latch=True)
+    child.ask(do="publish", topic="/blocks", count=1, start=7, size=100_000)
+    monkeypatch.setattr(cortex.link, "RingView", refuse)
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    block = subscriber.recv(SOON_S)
+    assert (block.number, is_whole(block)) == (7, True)
+    assert subscriber.carriers == ["ipc"]
+    child.ask(do="publish", topic="/blocks", count=2, start=8, size=100_000)
+    assert [subscriber.recv(SOON_S).number for _ in range(2)] == [8, 9]
+    assert subscriber.counters.lost == subscriber.counters.rejected == 0
+    child.finish()
+
+
+def test_a_reader_in_the_same_process_needs_no_ring(make_node):
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    subscriber = node.subscriber("/blocks", Block, policy=reliable())
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher.publish(make_block(1, 100))
+    assert subscriber.recv(SOON_S).number == 1
+    assert subscriber.carriers == ["inproc, shared memory"]

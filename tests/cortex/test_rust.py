@@ -1,0 +1,284 @@
+"""The Rust subscriber and publisher, written from WIRE.md: vectors, and what passes between it and Python."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pytest
+from peer import Block, Number, Scan, is_whole, make_block
+from processes import ROOT, SOON_S
+
+from cortex import Node, keep_last, reliable
+from cortex.registry import ensure_registry
+from cortex.schema import schema_of
+from cortex.vectors import message_to_plain
+
+CRATE = ROOT / "cortex" / "examples" / "rust"
+TARGET = ROOT / "build" / "rust"
+CARGO = shutil.which(
+    "cargo", path=os.pathsep.join([os.environ.get("PATH", ""), str(Path.home() / ".cargo/bin")])
+)
+OLDEST = (1, 89)
+PATIENCE_S = 900.0
+"""After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
+
+
+def _missing() -> str:
+    if CARGO is None:
+        return "no cargo: install Rust from https://rustup.rs"
+    shown = subprocess.run([CARGO, "--version"], capture_output=True, text=True, check=False).stdout
+    found = re.match(r"cargo (\d+)\.(\d+)", shown)
+    if found is None or (int(found[1]), int(found[2])) < OLDEST:
+        return f"cargo {OLDEST[0]}.{OLDEST[1]} or newer is needed, this is {shown.strip()!r}"
+    return ""
+
+
+MISSING = _missing()
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"the Rust example cannot be built here: {MISSING}")
+
+
+def cargo(*arguments: str) -> str:
+    """Run cargo in the crate; builds are kept in `build/rust`, which cargo itself locks."""
+    assert CARGO is not None
+    command = [CARGO, arguments[0], "--offline", "--locked", "--target-dir", str(TARGET), *arguments[1:]]
+    done = subprocess.run(command, cwd=CRATE, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module", autouse=True)
+def build() -> None:
+    """Everything is built once."""
+    cargo("build")
+
+
+@pytest.fixture
+def start(runtime: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts one of the programs, with a registry for it to find, and ends it."""
+    ensure_registry(0)
+    started: list[subprocess.Popen[bytes]] = []
+
+    def run(*arguments: str) -> subprocess.Popen[bytes]:
+        pipe = subprocess.PIPE
+        command = [str(TARGET / "debug" / arguments[0]), *arguments[1:]]
+        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def finish(process: subprocess.Popen[bytes]) -> tuple[list[Any], list[str]]:
+    """Wait for a program that ends by itself: the lines of JSON that it printed, and those of its errors."""
+    output, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, errors.decode()
+    return [json.loads(line) for line in output.splitlines()], errors.decode().splitlines()
+
+
+class Publishing:
+    """A running `cortex-pub` that publishes messages of a type."""
+
+    def __init__(self, process: subprocess.Popen[bytes], kind: type) -> None:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        self._process, self._schema = process, schema_of(kind)
+        self._input: IO[bytes] = process.stdin
+        self._output: IO[bytes] = process.stdout
+        self._say(self._schema.to_json())
+
+    def _say(self, line: str) -> None:
+        self._input.write(line.encode() + b"\n")
+        self._input.flush()
+
+    def await_subscribers(self, count: int) -> None:
+        while json.loads(self._output.readline())["subscribers"] != count:
+            pass
+
+    def publish(self, message: Any) -> None:
+        self._say(json.dumps(message_to_plain(self._schema, message)))
+
+    def close(self) -> dict[str, int]:
+        """End its input; what it has counted."""
+        lines, errors = finish(self._process)
+        assert not errors
+        counted: dict[str, int] = lines[-1]
+        return counted
+
+
+class Reading:
+    """A `cortex-sub` that ends by itself, and whose output is read meanwhile: it must not wait for us."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._results: list[tuple[list[Any], list[str]]] = []
+        self._thread = threading.Thread(target=lambda: self._results.append(finish(process)))
+        self._thread.start()
+
+    def finish(self) -> tuple[list[Any], dict[str, int]]:
+        """The messages, and what it has counted."""
+        self._thread.join()
+        ((messages, errors),) = self._results
+        return messages, json.loads(errors[-1])
+
+
+def transport(name: str) -> list[str]:
+    return ["--tcp"] if name == "tcp" else []
+
+
+def test_vectors():
+    output = cargo("test")
+    assert {"test bodies ... ok", "test frames ... ok", "test types ... ok"} <= set(output.splitlines())
+
+
+@pytest.mark.parametrize("over", ["ipc", "tcp"])
+def test_reliable_from_python(start, make_node, over):
+    """Far more than all queues hold: the subscriber gets each message, and the publisher's end."""
+    publisher = make_node(listen="127.0.0.1").publisher("/numbers", Number, max_wait_s=SOON_S)
+    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once", *transport(over)))
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    count = 10_000
+    delivered = sum(publisher.publish(Number(number, -number)) for number in range(count))
+    publisher.close()
+    messages, counted = reading.finish()
+    assert len(messages) == counted["received"]
+    assert counted["received"] + counted["lost"] == count
+    assert (counted["rejected"], counted["cut_off"]) == (0, 0)
+    assert counted["received"] >= delivered
+    if delivered == count:  # nobody had to wait for longer than the reader asks for
+        assert messages == [{"stamp_ns": number, "value": -number} for number in range(count)]
+
+
+@pytest.mark.parametrize("over", ["ipc", "tcp"])
+def test_batches_and_large_messages_from_python(start, make_node, over):
+    publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, coalesce=True, max_wait_s=SOON_S)
+    reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    blocks = [make_block(number, 20_000 if number % 10 == 9 else number) for number in range(100)]
+    assert all(publisher.publish(block) for block in blocks)
+    publisher.close()
+    messages, counted = reading.finish()
+    assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
+    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
+
+
+@pytest.mark.parametrize("over", ["ipc", "tcp"])
+def test_reliable_from_rust(start, make_node, over):
+    """As the other way round; every tenth message is a large one."""
+    node = make_node()
+    publishing = Publishing(start("cortex-pub", "/blocks", *transport(over)), Block)
+    subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
+    publishing.await_subscribers(1)
+    count, blocks = (
+        3_000,
+        [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(3_000)],
+    )
+    closing: list[dict[str, int]] = []
+
+    def feed() -> None:
+        for block in blocks:
+            publishing.publish(block)
+        closing.append(publishing.close())
+
+    feeding = threading.Thread(target=feed)
+    feeding.start()
+    received = []
+    while subscriber.counters.received + subscriber.counters.lost < count:
+        received.append(subscriber.recv(SOON_S))
+    feeding.join()
+    assert closing[0]["published"] == count
+    assert len(received) + subscriber.counters.lost == count
+    assert subscriber.counters.lost <= closing[0]["timeouts"]
+    assert all(is_whole(block) for block in received)
+    numbers = [block.number for block in received]
+    assert numbers == sorted(set(numbers))
+    assert subscriber.counters.rejected == subscriber.counters.cut_off == 0
+
+
+def test_a_reader_that_rust_does_not_wait_for(start, make_node):
+    """It counts what it has lost, learns of the last loss, and gets messages again."""
+    publishing = Publishing(start("cortex-pub", "/blocks"), Block)
+    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
+    publishing.await_subscribers(1)
+    count = 2_000  # of a kilobyte: more than lies between the two
+    for number in range(count):
+        publishing.publish(make_block(number, 1_000))
+    received = 0
+    while received + subscriber.counters.lost < count:
+        with contextlib.suppress(TimeoutError):
+            assert is_whole(subscriber.recv(0.01))
+            received += 1
+    lost = subscriber.counters.lost
+    assert lost > 0
+    publishing.publish(make_block(count, 5))
+    assert subscriber.recv(SOON_S).number == count
+    assert publishing.close() == {"published": count + 1, "timeouts": lost}
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
+
+
+def test_several_subscribers_of_rust(start, make_node):
+    """Each reader gets its own copy, whatever its policy; who leaves is no subscriber any more."""
+    publishing = Publishing(start("cortex-pub", "/scans"), Scan)
+    first, second = make_node("first"), make_node("second")
+    lossy = first.subscriber("/scans", Scan, policy=keep_last(8))
+    strict = second.subscriber("/scans", Scan, policy=reliable(8))
+    publishing.await_subscribers(2)
+    scan = Scan(5, np.array([0.5, -np.inf, np.nan], np.float32))
+    publishing.publish(scan)
+    for subscriber in (lossy, strict):
+        message, info = subscriber.recv_with_info(SOON_S)
+        np.testing.assert_array_equal(message.ranges, scan.ranges)
+        assert (message.stamp_ns, info.stamp_ns, info.sequence) == (5, 5, 0)
+    lossy.close()
+    publishing.await_subscribers(1)
+    assert publishing.close() == {"published": 1, "timeouts": 0}
+
+
+def test_rust_to_rust(start):
+    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once"))
+    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
+    publishing.await_subscribers(1)
+    for number in range(100):
+        publishing.publish(Number(number, number * number))
+    assert publishing.close() == {"published": 100, "timeouts": 0}
+    messages, counted = reading.finish()
+    assert messages == [{"stamp_ns": number, "value": number * number} for number in range(100)]
+    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
+
+
+def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
+    """Connected peers go on; who comes later is found through the registry that takes over."""
+    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
+    node = make_node("first")
+    first = node.subscriber("/numbers", Number, policy=reliable(8))
+    publishing.await_subscribers(1)
+    os.kill(int((runtime / "0" / "registry.lock").read_text()), 9)
+    second = make_node("second").subscriber("/numbers", Number, policy=reliable(8))
+    publishing.await_subscribers(2)
+    publishing.publish(Number(1, 2))
+    assert first.recv(SOON_S) == second.recv(SOON_S) == Number(1, 2)
+    assert publishing.close() == {"published": 1, "timeouts": 0}
+
+
+def test_a_killed_rust_publisher_is_gone(start, make_node):
+    process = start("cortex-pub", "/numbers")
+    publishing = Publishing(process, Number)
+    node: Node = make_node()
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(8))
+    publishing.await_subscribers(1)
+    publishing.publish(Number(1, 2))
+    assert subscriber.recv(SOON_S) == Number(1, 2)
+    process.kill()
+    while any(record.publishers for record in node.nodes()):
+        with pytest.raises(TimeoutError):
+            subscriber.recv(0.01)
