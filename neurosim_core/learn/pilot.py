@@ -204,9 +204,7 @@ def fly_policy(
     config = load_config(settings, overrides=dict(overrides or {}))
     model = sim.make_model(config)
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
-    start = sim.StartState(
-        position=model.free_space.seed_m, velocity=[np.cos(angle), np.sin(angle), 0.0]
-    )
+    start = sim.StartState(position=model.free_space.seed_m, velocity=[np.cos(angle), np.sin(angle), 0.0])
     state = sim.make_state(model, start=start)
     packets = sim.start(model, state)
     speeds: list[float] = []
