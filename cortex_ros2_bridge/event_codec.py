@@ -8,6 +8,8 @@ Reference: the README of event_camera_msgs.
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -134,6 +136,36 @@ def write_dvs(out: Bytes, events: EventColumns, *, width: int, height: int) -> N
         out.data, [("x", "<u2"), ("y", "<u2"), ("sec", "<i4"), ("ns", "<u4"), ("p", "u1")], 1
     )
     head[0] = (x[0], y[0], begin, nanosecond[0], polarity[0])
+
+
+def read_dvs(data: Buffer) -> tuple[tuple[int, int], EventColumns]:
+    """Return width and height of the sensor, and the events of a dvs_msgs/EventArray, in CDR.
+
+    Args:
+        data: The message, little endian; whole microseconds are kept of its times.
+
+    Raises:
+        EventCodecError: It is cut off, or big endian.
+    """
+    view = memoryview(data).cast("B")
+    try:
+        (length,) = struct.unpack_from("<I", view, 12)
+        begin = 16 + (length + 3 & -4)
+        height, width, count = struct.unpack_from("<III", view, begin)
+        if len(view) < begin + 12 + dvs_size(count):
+            raise ValueError(f"{count} events need more")
+        records = np.zeros(count, DVS_RECORD)
+        if count:
+            x, y, second, nanosecond, polarity = struct.unpack_from("<HHiIB", view, begin + 12)
+            records[0] = (x, y, second, nanosecond, polarity)
+            padded = bytes(view[begin + 26 : begin + 12 + dvs_size(count)]) + bytes(3)
+            records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
+    except (struct.error, ValueError) as error:
+        raise EventCodecError(f"{len(view)} bytes are no dvs_msgs/EventArray: {error}") from error
+    if bytes(view[:2]) != b"\0\1":
+        raise EventCodecError("a dvs_msgs/EventArray that is not little-endian CDR")
+    t = records["sec"].astype(np.int64) * 1_000_000 + records["nanosec"] // 1000
+    return (width, height), EventColumns(t, *(records[name].copy() for name in ("x", "y", "polarity")))
 
 
 class EventPicture:

@@ -49,12 +49,13 @@ class BagBackend:
     name = "bag"
     failure = trouble = ""
 
-    def __init__(self, path: str | Path, *, distro: str | None = None) -> None:
+    def __init__(self, path: str | Path, *, distro: str | None = None, storage: str = "mcap") -> None:
         """Begin a bag.
 
         Args:
             path: The directory to make, or `flight.mcap` for the directory `flight`.
             distro: Distribution whose message definitions are written; None: ROS_DISTRO, else a recent one.
+            storage: "mcap" or "sqlite3".
 
         Raises:
             ValueError: The distribution is unknown.
@@ -68,7 +69,7 @@ class BagBackend:
         self._writer: Writer | None = None
         try:
             # Version 8 of the metadata is what all distributions read, Humble to Jazzy and later.
-            writer = Writer(self.directory, version=8, storage_plugin=StoragePlugin.MCAP)
+            writer = Writer(self.directory, version=8, storage_plugin=StoragePlugin[storage.upper()])
             writer.open()
         except (WriterError, OSError) as error:
             raise BackendError(f"the bag {self.directory} cannot be made: {error}") from error
@@ -117,12 +118,15 @@ class BagBackend:
                 raise BackendError(f"the bag {self.directory} cannot be completed: {error}") from error
         _log.info("%d messages are in %s", sum(writer.counts.values()), self.directory)
 
-    def write(self, connection: Any, stamp_ns: int | None, message: Buffer) -> None:
-        """Record a message of a topic, with the stamp that it has itself."""
+    def write(
+        self, connection: Any, stamp_ns: int | None, message: Buffer, *, at_ns: int | None = None
+    ) -> None:
+        """Record a message of a topic, with the stamp that it has itself, or at another time."""
         with self._lock:
             if self._writer is None:
                 raise BackendError("this bag is closed")
-            came_ns = self._time.at(stamp_ns, is_clock=connection.msgtype == _CLOCK)
+            is_clock = connection.msgtype == _CLOCK
+            came_ns = self._time.at(stamp_ns, is_clock=is_clock) if at_ns is None else at_ns
             data = message if isinstance(message, (bytes, memoryview)) else bytes(message)
             try:
                 self._writer.write(connection, came_ns, data)
@@ -142,12 +146,12 @@ class BagPublisher:
         self._read_stamp = read_stamp
         self._open = True
 
-    def publish(self, message: Buffer) -> None:
-        """Record a message."""
+    def publish(self, message: Buffer, *, at_ns: int | None = None) -> None:
+        """Record a message, as one that came at a time [ns]; None: now, by /clock or its own stamp."""
         if not self._open:
             raise BackendError(f"the publisher of {self._connection.topic} is closed")
         check_message(message, self._connection.topic)
-        self._bag.write(self._connection, self._read_stamp(message), message)
+        self._bag.write(self._connection, self._read_stamp(message), message, at_ns=at_ns)
 
     def close(self) -> None:
         """Record no more; what was recorded stays."""

@@ -40,7 +40,7 @@ def image(message: messages.Image, context: Context) -> Any:
     if data.ndim != 3:
         raise ConvertError(f"an image must have rows, columns and channels, got shape {data.shape}")
     height, width, channels = data.shape
-    dtype, expected = _pixel(message.encoding)
+    dtype, expected = pixel_type(message.encoding)
     if data.dtype.newbyteorder("=") != dtype or channels != expected:
         raise ConvertError(
             f"{message.encoding} means {expected} channels of {dtype}, got {channels} of {data.dtype}"
@@ -194,7 +194,7 @@ def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Con
 
 
 @functools.cache
-def _pixel(encoding: str) -> tuple[np.dtype[Any], int]:
+def pixel_type(encoding: str) -> tuple[np.dtype[Any], int]:
     """Return what one channel is, and how many there are."""
     kind, channels = _NAMED_PIXELS.get(encoding, ("", 0))
     general = _PIXEL.fullmatch(encoding)

@@ -68,8 +68,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="turn a video or a folder of pictures into events, or events into another format",
         description="Let a simulated event camera look at a video (needs PyAV) or at the pictures of a "
         "folder, and write its events as `neurosim run` does. Log radiance is linear between frames. Or copy "
-        "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, .mcap (only "
-        "from), mvsec.h5 (with pictures, depth, poses and IMU), .h5.",
+        "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, or, with "
+        "pictures, depth, poses and IMU: mvsec.h5, .h5, and bags of ROS 2: flight.mcap, bag (a directory).",
     )
     parser.add_argument("source", type=Path, help="video file, folder of pictures, or file of events")
     parser.add_argument("out", type=Path, help="file to write; HDF5 for videos and pictures")
@@ -96,9 +96,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _convert(arguments: argparse.Namespace) -> int:
     from neurosim_core.io import is_event_file
 
-    if arguments.source_format is not None or (
-        not arguments.source.is_dir() and is_event_file(arguments.source)
-    ):
+    if arguments.source_format is not None or is_event_file(arguments.source):
         return _transfer(arguments)
     return _convert_video(arguments)
 

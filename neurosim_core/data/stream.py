@@ -269,9 +269,10 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     if not isinstance(source, str | Path):
         return [path for one in source for path in find_recordings(one)]
     path = Path(source)
-    if path.is_file():
+    if path.is_file() or (path.is_dir() and is_event_file(path)):
         return [path]
-    found = sorted(p for p in path.rglob("*") if p.is_file() and is_event_file(p) and p.name[0] != ".")
+    hits = {p for p in path.rglob("*") if p.name[0] != "." and p.exists() and is_event_file(p)}
+    found = sorted(p for p in hits if p.parent not in hits)  # what is in a bag is the bag's
     if not found:
         raise FileNotFoundError(
             f"{path} holds no recording" if path.is_dir() else f"no file or folder {path}"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
 import numpy as np
 
-from neurosim_core.packets import EventArrays
+from neurosim_core.packets import NO_EVENTS, EventArrays, Events
 
 BLOCK_EVENTS = 1_000_000
 """Events that are read, and held in memory, at a time."""
+PACKET_US = 10_000
+"""Events that come without packets are put into packets of this length [us]."""
 _HEADER_LINE_MAX = 4096
 _DISORDER_MAX_US = 10_000
 """Cameras send events of neighbouring rows slightly out of order; what comes later than this is damage."""
@@ -98,6 +100,54 @@ class BlockChecker:
         self._last_us = int(events.t[-1])
         self._count += len(t)
         return events
+
+
+class PacketCutter:
+    """Puts events that come in blocks into packets, which end at multiples of 10 ms.
+
+    Args:
+        send: Takes each packet.
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+        sensor: Name of the camera.
+    """
+
+    def __init__(self, send: Callable[[Events], None], *, width: int, height: int, sensor: str) -> None:
+        self._send, self._size, self._sensor = send, (width, height), sensor
+        self._pending: list[EventArrays] = []
+        self._end_us = self._start_us = self._sequence = 0
+
+    def add(self, block: EventArrays) -> None:
+        """Take events, sorted by time."""
+        if not len(block.t):
+            return
+        tick = -(-block.t // PACKET_US)  # a window is (start, end]
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(tick)) + 1, [len(tick)]])
+        for begin, end in zip(begins[:-1].tolist(), begins[1:].tolist(), strict=True):
+            end_us = max(int(tick[begin]), 1) * PACKET_US
+            if end_us != self._end_us:
+                self._flush()
+                self._end_us = end_us
+            self._pending.append(block.rows(slice(begin, end)))
+
+    def end(self) -> None:
+        """Send what is left; without any events, one packet that is empty."""
+        self._flush(always=self._sequence == 0)
+
+    def _flush(self, *, always: bool = False) -> None:
+        if not self._pending and not always:
+            return
+        self._sequence += 1
+        columns = [np.concatenate(part) for part in zip(NO_EVENTS, *self._pending, strict=True)]
+        self._send(
+            Events(
+                stamp_ns=self._end_us * 1000, start_ns=self._start_us * 1000, sequence=self._sequence - 1,
+                sensor=self._sensor, width=self._size[0], height=self._size[1],
+                t=columns[0], x=columns[1], y=columns[2], polarity=columns[3],
+            )
+        )  # fmt: skip
+        self._pending = []
+        self._start_us = self._end_us
 
 
 def read_header(file: BinaryIO) -> dict[str, str]:

@@ -19,7 +19,6 @@ class Format(NamedTuple):
     """Module of `neurosim_core.io` with its classes, imported on first use."""
     reader: str
     writer: str
-    """Empty: it cannot be written."""
     suffixes: tuple[str, ...]
     options: dict[str, Any]
     """More arguments of its writer."""
@@ -34,7 +33,9 @@ FORMATS = {
     "aedat4": Format("aedat4", "Aedat4Reader", "Aedat4Writer", (".aedat4",), {}),
     "mvsec": Format("mvsec", "MvsecReader", "MvsecWriter", ("mvsec.h5", "mvsec.hdf5"), {}),
     "recording": Format("hdf5_events", "Hdf5EventReader", "RecordingEventWriter", (".h5", ".hdf5"), {}),
-    "mcap": Format("cortex_log", "LogReader", "", (".mcap",), {}),
+    "mcap": Format("ros2_bag", "open_mcap", "BagWriter", (".mcap",), {}),
+    "rosbag": Format("ros2_bag", "BagReader", "BagWriter", ("bag",), {}),
+    "rosbag_sqlite3": Format("ros2_bag", "BagReader", "BagWriter", (".sqlite3",), {"storage": "sqlite3"}),
 }
 """By name. Where two suffixes fit, the longer one counts."""
 
@@ -43,7 +44,7 @@ def format_of(path: Path, name: str | None = None) -> str:
     """Return the name of the format of a file, from its own name.
 
     Args:
-        path: The file; what is in it does not count.
+        path: The file; what is in it does not count. A directory with metadata of rosbag2 is a bag.
         name: The format, if the user says it.
 
     Raises:
@@ -53,6 +54,8 @@ def format_of(path: Path, name: str | None = None) -> str:
         if name not in FORMATS:
             raise EventFileError(f"unknown format {name!r}, known: {', '.join(FORMATS)}")
         return name
+    if (path / "metadata.yaml").is_file():
+        return "rosbag"
     fits = {
         suffix: key
         for key, known in FORMATS.items()
@@ -66,9 +69,9 @@ def format_of(path: Path, name: str | None = None) -> str:
 
 
 def is_event_file(path: Path) -> bool:
-    """Whether the name of a file is that of a format of events."""
+    """Whether the name of a file is that of a format of events; of a directory: whether it is a bag."""
     try:
-        return bool(format_of(path))
+        return (path / "metadata.yaml").is_file() if path.is_dir() else bool(format_of(path))
     except EventFileError:
         return False
 
@@ -90,14 +93,14 @@ def open_events(
         ImportError: A library for the format is not installed.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"no file {path}")
     name = format_of(path, format)
     if format is None and name in ("mvsec", "recording"):
         with open_hdf5(path) as file, damage_of(path):
             name = "mvsec" if "davis" in file else "recording"
     known = FORMATS[name]
-    more = {"sensor": sensor} if name in ("recording", "mcap") else {}
+    more = {"sensor": sensor} if name == "recording" or known.module == "ros2_bag" else {}
     reader: EventReader = _load(known, known.reader)(path, size=size, **more)
     return reader
 
@@ -119,8 +122,6 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     path = Path(path)
     name = format_of(path, format)
     known = FORMATS[name]
-    if not known.writer:
-        raise EventFileError(f"{name} can be read only")
     make: Callable[..., EventWriter] = partial(_load(known, known.writer), **known.options)
     return make(path, width=width, height=height)
 

@@ -15,14 +15,19 @@ from typing import Any
 import numpy as np
 
 from neurosim_core import __version__
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size
-from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, packet_class
+from neurosim_core.io.event_file import (
+    BLOCK_EVENTS,
+    PACKET_US,
+    BlockChecker,
+    EventFileError,
+    PacketCutter,
+    find_size,
+)
+from neurosim_core.packets import EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
 
-PACKET_US = 10_000
-"""Events that come without packets are put into packets of this length [us]."""
 _NAMES = ("t", "x", "y", "p")
 _SPAN_MAX_US = 30 * 24 * 3_600_000_000
 
@@ -144,7 +149,7 @@ class RecordingEventWriter:
             ImportError: h5py is not installed.
             OSError: It cannot be written.
         """
-        self._path, self._size, self._sensor = path, (width, height), sensor
+        self._path = path
         self._checker = BlockChecker(path, width=width, height=height)
         described = SensorDescription(
             name=sensor,
@@ -158,8 +163,7 @@ class RecordingEventWriter:
         )
         self._writer = RecordingWriter(path, header, flush_interval_s=float("inf"))
         self._closed = False
-        self._pending: list[EventArrays] = []
-        self._end_us = self._start_us = self._sequence = 0
+        self._packets = PacketCutter(self._writer.write, width=width, height=height, sensor=sensor)
 
     def write(self, events: EventArrays) -> None:
         """See `EventWriter.write`."""
@@ -171,14 +175,7 @@ class RecordingEventWriter:
                 f"{self._path}: times of recordings are from 0 to 30 days, got {block.t[0]} to {block.t[-1]} "
                 "us: --from-zero counts them from the first event"
             )
-        tick = -(-block.t // PACKET_US)  # a window is (start, end]
-        begins = np.concatenate([[0], np.flatnonzero(np.diff(tick)) + 1, [len(tick)]])
-        for begin, end in zip(begins[:-1].tolist(), begins[1:].tolist(), strict=True):
-            end_us = max(int(tick[begin]), 1) * PACKET_US
-            if end_us != self._end_us:
-                self._send()
-                self._end_us = end_us
-            self._pending.append(block.rows(slice(begin, end)))
+        self._packets.add(block)
 
     def write_packet(self, packet: Packet) -> None:
         """Append a packet of another sensor."""
@@ -189,23 +186,8 @@ class RecordingEventWriter:
         if self._closed:
             return
         self._closed = True
-        self._send(always=self._sequence == 0)
+        self._packets.end()
         self._writer.close()
-
-    def _send(self, *, always: bool = False) -> None:
-        if not self._pending and not always:
-            return
-        self._sequence += 1
-        columns = [np.concatenate(part) for part in zip(NO_EVENTS, *self._pending, strict=True)]
-        self._writer.write(
-            Events(
-                stamp_ns=self._end_us * 1000, start_ns=self._start_us * 1000, sequence=self._sequence - 1,
-                sensor=self._sensor, width=self._size[0], height=self._size[1],
-                t=columns[0], x=columns[1], y=columns[2], polarity=columns[3],
-            )
-        )  # fmt: skip
-        self._pending = []
-        self._start_us = self._end_us
 
 
 def _class(recording: Recording, sensor: str) -> type[Packet]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -54,7 +55,8 @@ def transfer(
         out_format: Format of `out`; None: as its name says.
         size: Width and height of the sensor [px], where `source` does not say it.
         sensor: Event camera, of files that hold several; empty: the first.
-        from_zero: Count time from the first event.
+        from_zero: Count time from the first event; where there is ground truth, from the whole second before
+            it, so that pictures stay at multiples of their period.
         on_block: Called with the number of events so far.
 
     Raises:
@@ -63,17 +65,23 @@ def transfer(
         OSError: A file cannot be read or written.
     """
     name = format_of(out, out_format)
-    part = out.with_name(f".{out.name}.part")
+    folder = out.with_name(f".{out.name}.part")
+    part = folder / out.name
     reader = open_events(source, format=format, size=size, sensor=sensor)
     done = Transfer(width=reader.width, height=reader.height)
     shift_us: int | None = None if from_zero else 0
+    packets = getattr(reader, "packets", None)
     try:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
         writer = create_events(part, width=reader.width, height=reader.height, format=name)
         try:
             for events in reader.blocks():
                 if not len(events.t):
                     continue
-                shift_us = int(events.t[0]) if shift_us is None else shift_us
+                if shift_us is None:
+                    shift_us = int(events.t[0])
+                    shift_us -= shift_us % 1_000_000 if packets is not None else 0
                 moved = events._replace(t=events.t - shift_us) if shift_us else events
                 writer.write(moved)
                 done.begin_us = int(moved.t[0]) if not done.event_count else done.begin_us
@@ -83,15 +91,17 @@ def transfer(
                     on_block(done.event_count)
             keep = getattr(writer, "write_packet", None)
             if keep is not None:
-                for packet in reader.packets() if hasattr(reader, "packets") else ():
+                for packet in () if packets is None else packets():
                     if not isinstance(packet, Events):
                         keep(replace(packet, stamp_ns=packet.stamp_ns - 1000 * (shift_us or 0)))
                         done.packet_count += 1
         finally:
             writer.close()
+        if out.is_dir():  # a bag
+            shutil.rmtree(out)
         part.replace(out)
     finally:
-        part.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
         reader.close()
     done.notes = list(reader.notes)
     return done

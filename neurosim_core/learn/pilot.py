@@ -188,7 +188,7 @@ def fly_policy(
     Args:
         policy: Name of a policy that comes with the package, or a file.
         duration_s: For how long [s].
-        seed: Of the throw: 1.2 m/s in some direction.
+        seed: Of the throw: 1 m/s in some direction.
         overrides: Further settings by dotted key, such as {"scene.seed": 3}.
         say: Told how it goes, line by line.
 
@@ -204,9 +204,7 @@ def fly_policy(
     config = load_config(settings, overrides=dict(overrides or {}))
     model = sim.make_model(config)
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
-    start = sim.StartState(
-        position=model.free_space.seed_m, velocity=[1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0]
-    )
+    start = sim.StartState(position=model.free_space.seed_m, velocity=[np.cos(angle), np.sin(angle), 0.0])
     state = sim.make_state(model, start=start)
     packets = sim.start(model, state)
     speeds: list[float] = []

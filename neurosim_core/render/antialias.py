@@ -147,6 +147,7 @@ def _cover_pixel(
 def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are pixels, for all terms."""
     radiance_of = pixel_shader(terms)
+    radiance_beyond = pixel_shader(terms, beyond=True)
     requested = requested_outputs(outputs)
     locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
     write_radiance = radiance_writer(outputs, supersampled=False)
@@ -211,11 +212,11 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             hit = Hit()
             hit.face = face[entry]
             hit.t = met[entry][0]
-            hit.u = wp.clamp(met[entry][1], 0.0, 1.0)
-            hit.v = wp.clamp(met[entry][2], 0.0, 1.0 - hit.u)
+            hit.u = met[entry][1]
+            hit.v = met[entry][2]
             hit.normal = normal[entry]
             width_rad = footprint_width(number[entry]) * spread_rad
-            light = radiance_of(scene, bodies, instant, -1, q, ray[entry], origin, width_rad, hit)
+            light = radiance_beyond(scene, bodies, instant, -1, q, ray[entry], origin, width_rad, hit)
             total += number[entry] * light
             whole += number[entry]
         if count < 0:

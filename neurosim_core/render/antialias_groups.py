@@ -39,7 +39,7 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
-_COVER_BOUNDS = (64, 8)
+_COVER_BOUNDS = (64, 16)
 """Threads of a block, and blocks of a multiprocessor."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
@@ -57,7 +57,7 @@ class BlockLists:
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
-    """Length of the two lists."""
+    """Length of the two lists, and how many entries of the first are taken."""
     threads: int
     """Threads of the kernels that go through them."""
 
@@ -75,7 +75,7 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
     lists = BlockLists()
     lists.uneven = wp.zeros(block_count, dtype=int, device=device)
     lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
-    lists.count = wp.zeros(2, dtype=int, device=device)
+    lists.count = wp.zeros(3, dtype=int, device=device)
     lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
     return lists
 
@@ -140,6 +140,12 @@ def _sum_pairs(place: int, first: int, count: int) -> wp.vec3:
     ...
 
 
+@wp.func_native(read_native(__file__, "next_entry"))
+def _next_entry(count: wp.array[int], counter: int) -> int:
+    """Return the next number that a counter gives to a warp."""
+    ...
+
+
 @wp.func_native(read_native(__file__, "ray_sum"))
 def _ray_sum(value: wp.vec3) -> wp.vec3:
     """Return the sum over the threads of a pixel's rays."""
@@ -162,6 +168,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     requested = requested_outputs(outputs)
     locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
     radiance_of = pixel_shader(terms)
+    radiance_beyond = pixel_shader(terms, beyond=True)
     write_radiance = radiance_writer(outputs, supersampled=False)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
@@ -215,10 +222,10 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             hit = Hit()
             hit.face = part
             hit.t = met[0]
-            hit.u = wp.clamp(met[1], 0.0, 1.0)
-            hit.v = wp.clamp(met[2], 0.0, 1.0 - hit.u)
+            hit.u = met[1]
+            hit.v = met[2]
             hit.normal = wp.vec3(met[3], met[4], met[5])
-            radiance = radiance_of(
+            radiance = radiance_beyond(
                 scene, bodies, place.instant, -1, q, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit
             )
         write_radiance(scene, radiance, 1, place.instant, place.slot, row, col, out)
@@ -237,11 +244,11 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         lists: BlockLists,
     ) -> None:
         # The threads of a warp reach the functions that they call together.
-        begin = (first + wp.tid()) // 32
         lane = (first + wp.tid()) % 32
         pixel_lane = lane % 16
-        for turn in range(turn_count(begin, lists.count[0], lists.threads // 32)):
-            block = lists.uneven[begin + turn * (lists.threads // 32)]
+        entry = _next_entry(lists.count, 2)
+        while entry < lists.count[0]:
+            block = lists.uneven[entry]
             place = locate_tile(
                 block // 4 // view.instant_count, block // 4 % view.instant_count, view, worlds
             )
@@ -282,10 +289,10 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     hit = Hit()
                     hit.face = wp.cast(met[2], int)
                     hit.t = met[6]
-                    hit.u = wp.clamp(met[7], 0.0, 1.0)
-                    hit.v = wp.clamp(met[8], 0.0, 1.0 - hit.u)
+                    hit.u = met[7]
+                    hit.v = met[8]
                     hit.normal = wp.vec3(met[9], met[10], met[11])
-                    light = radiance_of(
+                    light = radiance_beyond(
                         scene,
                         bodies,
                         place.instant,
@@ -309,6 +316,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             unresolved = _warp_votes(written and covered[3] < 0)
             if unresolved != 0 and lane == 0:
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
+            entry = _next_entry(lists.count, 2)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
     def cast_unresolved_pixels(

@@ -21,13 +21,17 @@ _OFFSET_M = wp.constant(1.0e-3)
 
 
 @cache
-def pixel_shader(terms: RenderTerms) -> wp.Function:
+def pixel_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
     """Return the function that says what light a pixel receives along a ray.
 
     Its parameters: the scene and its bodies; the instant; the body that the ray hits, -1: none; orientation
     of the camera; the ray, in W, and its origin; its spread [rad]; what it hits.
+
+    Args:
+        terms: Of the kernel.
+        beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not.
     """
-    shade = _scene_shader(terms)
+    shade = _scene_shader(terms, beyond)
     shade_body = _body_shader(terms) if terms.bodies else None
 
     @wp.func
@@ -51,7 +55,7 @@ def pixel_shader(terms: RenderTerms) -> wp.Function:
 
 
 @cache
-def _scene_shader(terms: RenderTerms) -> wp.Function:
+def _scene_shader(terms: RenderTerms, beyond: bool) -> wp.Function:
     """Return the function that says what light comes from what stands still, or from the sky."""
     surface_albedo, emitted = albedo_reader(terms), _emission(terms)
 
@@ -62,6 +66,9 @@ def _scene_shader(terms: RenderTerms) -> wp.Function:
         corner = 3 * hit.face
         u = hit.u
         v = hit.v
+        if wp.static(beyond):
+            u = wp.clamp(u, 0.0, 1.0)
+            v = wp.clamp(v, 0.0, 1.0 - u)
         w = 1.0 - u - v
         facing = wp.dot(ray, hit.normal)
         albedo = surface_albedo(scene, spread_rad, facing, hit)

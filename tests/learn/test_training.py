@@ -169,7 +169,7 @@ def test_a_task_of_ones_own_is_learnt(monkeypatch):
 
 
 def test_the_policy_that_comes_with_the_package_stops():
-    """Thrown at 1.2 m/s in the default apartment, it ends slower than 0.2 m/s: the bar of the task."""
+    """Thrown at 1 m/s in the default apartment, it ends slower than 0.2 m/s: the bar of the task."""
     pytest.importorskip("onnxruntime")
     from neurosim_core.learn.pilot import fly_policy, shipped_policy
 

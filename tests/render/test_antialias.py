@@ -62,6 +62,23 @@ def test_bars_thinner_than_a_pixel_are_seen(device):
     assert coverage.mean() == pytest.approx(0.3, abs=0.015)
 
 
+def test_an_edge_crosses_levels_when_the_box_filter_does(device):
+    """Log radiance passes levels 0.2 apart at the time of the closed form, to 1/32 of a pixel's transit."""
+    offsets = np.linspace(0.5 * PITCH_M, 1.5 * PITCH_M, 321)
+    log = np.log(radiance(strips((0.0, 3.0)), offsets, device=device)[:, 4, 15])
+    levels = np.log(0.25) + 0.2 * np.arange(1, 7)
+    crossed = np.array([np.argmax(log >= level) for level in levels]) / 320.0
+    np.testing.assert_allclose(crossed, (np.exp(levels) - 0.25) / 0.75, atol=1 / 32 + 1 / 320)
+
+
+def test_a_slow_drift_gives_no_event_of_its_own(device):
+    """Bars 4 times as bright as the floor drift by 0.01 px/s: no step in log radiance reaches a threshold."""
+    bars = strips(*((k * 5.3 * PITCH_M, (k * 5.3 + 1.7) * PITCH_M) for k in range(-6, 7)))
+    log = np.log(radiance(bars, 0.02 * PITCH_M * np.arange(51), device=device))
+    assert log.max() - log.min() > 1.3
+    assert np.abs(np.diff(log, axis=0)).max() < 0.2  # 2 s each: true changes are below 0.06
+
+
 def test_a_still_camera_sees_no_change(device):
     seen = radiance(strips((-0.3, 0.01), (0.2, 0.21)), [0.013] * 5, device=device)
     assert (seen == seen[0]).all()

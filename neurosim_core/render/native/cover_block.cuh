@@ -38,73 +38,72 @@ for (int place = lane; place < 64; place += 32) {
 }
 sky = __any_sync(ALL, sky);
 #include "edge_functions.cuh"
-for (int begin = 0; listed && begin < count;) { // each thread looks at a face
+for (int begin = 0; listed && begin < count;) {
     const int end = wp::min(begin + 32, count), entry = begin + lane;
-    int surface = -1, reach = 0, beyond[3] = {-1, -1, -1};
-    if (entry < end) {
+    int surface = -1;
+    if (entry < end) { // each thread prepares a face
         const int face = block.seen[entry];
         const wp::vec3* corner = scene.whole_corner.data + 3 * (size_t)face;
         float function[3][3];
-        const float volume = functions_of(corner[0] - origin, corner[1] - origin, corner[2] - origin, function);
-        if (volume != 0.0f) {
-            bool crossed[3] = {};
-            for (int other = 0; other < 16; ++other) {
-                bool reached = true, cut[3];
+        if (functions_of(corner[0] - origin, corner[1] - origin, corner[2] - origin, function) != 0.0f)
+            surface = scene.whole_surface.data[face];
+        for (int side = 0; side < 3; ++side)
+            for (int axis = 0; axis < 3; ++axis) block.function[3 * side + axis][entry] = function[side][axis];
+        block.surface[entry] = surface;
+    }
+    __syncwarp();
+    for (int pair_of_faces = begin; pair_of_faces < end; pair_of_faces += 2) { // each half of the threads: which pixels one reaches
+        const int at = wp::min(pair_of_faces + half, end - 1);
+        bool reached = block.surface[at] >= 0, cut[3];
 #pragma unroll
-                for (int side = 0; side < 3; ++side) {
-                    float value[3];
-#pragma unroll
-                    for (int term = 0; term < 3; ++term)
-                        value[term] = fmaf(function[side][0], block.ray[3 * term][other],
-                                           fmaf(function[side][1], block.ray[3 * term + 1][other],
-                                                function[side][2] * block.ray[3 * term + 2][other]));
-                    const float extent = 0.5f * (wp::abs(value[1]) + wp::abs(value[2]));
-                    reached &= value[0] + extent >= 0.0f;
-                    cut[side] = value[0] - extent < 0.0f;
-                }
-                reach |= (int)reached << other;
-#pragma unroll
-                for (int side = 0; side < 3; ++side) crossed[side] |= reached && cut[side];
-            }
-#pragma unroll
-            for (int side = 0; side < 3; ++side) {
-                const int other = crossed[side] ? scene.whole_neighbor.data[3 * (size_t)face + side] : -1;
-                if (other >= 0 && is_beyond(other, function[side])) beyond[side] = other;
-                for (int axis = 0; axis < 3; ++axis) block.function[3 * side + axis][entry] = function[side][axis];
-            }
-            if (reach) surface = scene.whole_surface.data[face];
+        for (int side = 0; side < 3; ++side) {
+            const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at], block.function[3 * side + 2][at]};
+            auto along = [&](const wp::vec3& toward) {
+                return fmaf(function[0], toward[0], fmaf(function[1], toward[1], function[2] * toward[2]));
+            };
+            const float middle = along(center), extent = 0.5f * (wp::abs(along(across)) + wp::abs(along(down)));
+            reached &= middle + extent >= 0.0f;
+            cut[side] = middle - extent < 0.0f;
         }
-        block.reach[entry] = reach;
+        unsigned reach = (__ballot_sync(ALL, reached) >> (16 * half)) & 0xffffu;
+#pragma unroll
+        for (int side = 0; side < 3; ++side)
+            if ((__ballot_sync(ALL, reached && cut[side]) >> (16 * half)) & 0xffffu) reach |= 0x10000u << side;
+        if (pixel == 0) block.reach[at] = (int)reach; // the upper bits: edges that cross pixels
+    }
+    __syncwarp();
+    if (entry < end) {
+        if ((block.reach[entry] & 0xffff) == 0) surface = -1;
         block.surface[entry] = surface;
     }
     __syncwarp();
     if (entry < end) {
-        int first = entry;
+        int first = entry; // entry of the same surface
         for (int other = entry - 1; other >= 0 && surface >= 0; --other)
             if (block.surface[other] == surface) first = other;
         block.first[entry] = first;
     }
-    for (int other = 0; other < count; ++other)
-#pragma unroll
-        for (int side = 0; side < 3; ++side)
-            if (block.seen[other] == beyond[side]) beyond[side] = -1;
-    while (listed) { // those beyond edges, in the order of entries and sides
-        const int mine = beyond[0] >= 0 ? beyond[0] : beyond[1] >= 0 ? beyond[1] : beyond[2];
-        const unsigned waiting = __ballot_sync(ALL, mine >= 0);
-        if (!waiting) break;
-        const int face = __shfl_sync(ALL, mine, __ffs(waiting) - 1);
-        listed = count < MOST;
-        if (!listed) break;
-        if (lane == 0) {
-            block.seen[count] = face;
-            block.part[count] = -1 - face;
+    for (int base = 3 * begin; listed && base < 3 * end; base += 32) { // each thread looks beyond an edge
+        const int at = wp::min((base + lane) / 3, end - 1), side = (base + lane) % 3;
+        int beyond = -1;
+        if (base + lane < 3 * end && (block.reach[at] >> (16 + side)) & 1)
+            beyond = scene.whole_neighbor.data[3 * (size_t)block.seen[at] + side];
+        const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at], block.function[3 * side + 2][at]};
+        if (beyond >= 0 && !is_beyond(beyond, function)) beyond = -1;
+        for (int other = 0; other < count; ++other)
+            if (block.seen[other] == beyond) beyond = -1;
+        for (unsigned waiting; listed && (waiting = __ballot_sync(ALL, beyond >= 0));) {
+            const int face = __shfl_sync(ALL, beyond, __ffs(waiting) - 1);
+            listed = count < MOST;
+            if (listed && lane == 0) {
+                block.seen[count] = face;
+                block.part[count] = -1 - face;
+            }
+            count += listed;
+            if (beyond == face) beyond = -1;
         }
-        ++count;
-#pragma unroll
-        for (int side = 0; side < 3; ++side)
-            if (beyond[side] == face) beyond[side] = -1;
+        __syncwarp();
     }
-    __syncwarp();
     begin = end;
 }
 unsigned nearest[4] = {ALL, ALL, ALL, ALL}; // of each point in a byte: the first entry of what it shows, 255: nothing
@@ -143,7 +142,7 @@ if (listed) {
             for (int side = 0; side < 3; ++side) shown[side] = fmaf(y, value[side][2], fmaf(x, value[side][1], value[side][0]));
             const float near = shown[0] + shown[1] + shown[2];
             const float least = fminf(fminf(shown[0], shown[1]), shown[2]);
-            const bool nearer = least >= -OVERLAP * near && near > best[sample];
+            const bool nearer = least >= -OVERLAP * near && near > NEARER * best[sample];
             best[sample] = nearer ? near : best[sample];
             const unsigned byte = sample % 4, selector = 0x3210u ^ ((byte ^ 4u) << (4 * byte));
             nearest[sample / 4] = nearer ? __byte_perm(nearest[sample / 4], first, selector) : nearest[sample / 4];

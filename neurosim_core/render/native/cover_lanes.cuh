@@ -71,7 +71,7 @@ if (even) {
                                + points[1][sample] * value[side][2][lane];
                 const float near = at[0] + at[1] + at[2];
                 const float least = wp::min(wp::min(at[0], at[1]), at[2]);
-                const bool nearer = least >= -OVERLAP * near && near > best[sample][lane];
+                const bool nearer = least >= -OVERLAP * near && near > NEARER * best[sample][lane];
                 best[sample][lane] = nearer ? near : best[sample][lane];
                 nearest[sample][lane] = nearer ? layer : nearest[sample][lane];
             }

@@ -4,15 +4,13 @@ auto nearest_part = [&](int face, const wp::vec3& direction) {
     float most = -1e30f;
     for (int part = scene.whole_first.data[face]; part < scene.whole_first.data[face + 1]; ++part) {
         const int* index = &mesh.indices[3 * (size_t)part];
-        float function[3][3], least = 1e30f, near = 0.0f;
-        functions_of(mesh.points[index[0]] - origin, mesh.points[index[1]] - origin, mesh.points[index[2]] - origin, function);
-        for (int side = 0; side < 3; ++side) {
-            const float at = function[side][0] * direction[0] + function[side][1] * direction[1] + function[side][2] * direction[2];
-            least = wp::min(least, at);
-            near += at;
-        }
-        if (least / near > most) {
-            most = least / near;
+        const wp::vec3 a = mesh.points[index[0]] - origin, b = mesh.points[index[1]] - origin,
+                       c = mesh.points[index[2]] - origin;
+        const float at[3] = {wp::dot(wp::cross(b, c), direction), wp::dot(wp::cross(c, a), direction),
+                             wp::dot(wp::cross(a, b), direction)};
+        const float share = 1.0f / (at[0] + at[1] + at[2]), least = wp::min(wp::min(at[0] * share, at[1] * share), at[2] * share);
+        if (least > most) {
+            most = least;
             found = part;
         }
     }

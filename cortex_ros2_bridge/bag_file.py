@@ -1,0 +1,290 @@
+"""Bags as files of messages of Cortex: written by the rules of the bridge, and read back.
+
+What is written is what the bridge would send, each message at its own stamp, but for drawings of events. What
+is read back are events, pictures, inertial measurements and odometry, of any bag, also of others' drivers.
+
+    with contextlib.closing(BagWriter(Path("flight.mcap"))) as bag:
+        bag.write("/drone/imu", Imu(...))
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, ReaderError
+
+from cortex import messages
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder
+from cortex.schema import schema_of
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.bag import BagBackend, BagPublisher
+from cortex_ros2_bridge.backend.base import BackendError, Buffer
+from cortex_ros2_bridge.config import BridgeConfig
+from cortex_ros2_bridge.convert import Context, ConvertError
+from cortex_ros2_bridge.convert.camera import pixel_type
+from cortex_ros2_bridge.event_codec import decode_mono, read_dvs
+from cortex_ros2_bridge.frames import rotate
+from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, rule_of, vehicle_of
+
+__all__ = ["EVENT_TYPES", "BackendError", "BagError", "BagReader", "BagWriter", "ConvertError"]
+
+
+class BagError(ValueError):
+    """A bag is damaged, or a message of it cannot be used."""
+
+
+class _Way(NamedTuple):
+    """From a topic of Cortex to one of the bag."""
+
+    convert: Any
+    context: Context
+    publisher: BagPublisher
+
+
+class BagWriter:
+    """Writes messages of Cortex into a bag: every default route of the bridge from their topics.
+
+    Args:
+        path: `flight.mcap` for a single file, which Foxglove opens; else the directory to make.
+        storage: "mcap" or "sqlite3", for a directory; Humble reads only the second without a plug-in.
+
+    Raises:
+        BackendError: There is something at the path already, or it cannot be written.
+    """
+
+    def __init__(self, path: Path, *, storage: str = "mcap") -> None:
+        self._file = path if path.suffix == ".mcap" else None
+        directory = path if self._file is None else path.with_name(f"{path.stem}.bag")
+        self._bag = BagBackend(directory, storage=storage)
+        self._ways: dict[str, list[_Way]] = {}
+        self._closed = False
+
+    def write(self, topic: str, message: Any, *, frame_id: str = "") -> None:
+        """Write a message.
+
+        Args:
+            topic: In Cortex, such as "/drone/imu".
+            message: Any message with a stamp.
+            frame_id: Frame of a message that does not name its own, such as "drone/base_link".
+
+        Raises:
+            ConvertError: ROS has no such values.
+            BackendError: The disk is full.
+        """
+        if topic not in self._ways:
+            self._ways[topic] = self._ways_of(topic, message, frame_id)
+        for way in self._ways[topic]:
+            data = way.convert(message, way.context)
+            if data is not None:
+                way.publisher.publish(data, at_ns=message.stamp_ns)
+            way.context.sequence += 1
+
+    def close(self) -> None:
+        """Complete the bag. Closing twice is allowed."""
+        if self._closed:
+            return
+        self._closed = True
+        self._bag.close()
+        if self._file is not None:
+            (self._bag.directory / f"{self._bag.directory.name}.mcap").replace(self._file)
+            shutil.rmtree(self._bag.directory)
+
+    def _ways_of(self, topic: str, message: Any, frame_id: str) -> list[_Way]:
+        schema = schema_of(type(message))
+        seen = SeenTopic(topic, schema.name, schema.fingerprint, True, schema=schema.to_json())
+        routes, _ = make_routes(Seen((seen,)), BridgeConfig())
+        wide = max(getattr(message, "width", 0), getattr(message, "height", 0)) > 2048  # too many for evt3
+        ways = []
+        for route in routes:
+            rule = rule_of(route)
+            drawn = route.cortex_type == "cortex/Events" and route.ros_type not in EVENT_TYPES
+            if drawn or route.ros_type == "sensor_msgs/msg/CameraInfo":  # nobody gives a calibration
+                continue
+            options = {
+                **route.options,
+                **({"encoding": "mono"} if wide and "encoding" in rule.options else {}),
+            }
+            context = Context(vehicle=vehicle_of(topic), frame_id=frame_id, options=options)
+            publisher = self._bag.publisher(route.ros_topic, route.ros_type, route.qos)
+            ways.append(_Way(rule.convert, context, publisher))
+        return ways
+
+
+class BagReader:
+    """Reads the messages of a bag that have a counterpart in Cortex.
+
+    Args:
+        path: A directory, or a file of type MCAP.
+
+    Raises:
+        BagError: It is no bag, or damaged.
+        OSError: It cannot be read.
+
+    Attributes:
+        topics: Type in ROS of each topic that can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._reader = Reader(path)
+            self._reader.open()
+        except _DAMAGE as error:
+            raise BagError(f"{path} is not a readable bag: {error}") from None
+        self._connections = [each for each in self._reader.connections if each.msgtype in _DECODERS]
+        drawn = {f"{each.topic}/image" for each in self._connections if each.msgtype in EVENT_TYPES}
+        self._connections = [each for each in self._connections if each.topic not in drawn]
+        self.topics = {each.topic: each.msgtype for each in self._connections}
+
+    def messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
+        """Yield topics and messages of Cortex in the order in which they were recorded.
+
+        Args:
+            topics: Which of `topics`; none: all.
+
+        Raises:
+            BagError: The bag is damaged, or has a message that cannot be used.
+        """
+        chosen = [each for each in self._connections if not topics or each.topic in topics]
+        if not chosen:
+            return
+        decoders: dict[int, Callable[[Buffer], Any]] = {each.id: _DECODERS[each.msgtype]() for each in chosen}
+        for connection, data in self._raw(chosen):
+            try:
+                yield connection.topic, decoders[connection.id](data)
+            except (cdr.CdrError, ConvertError, EventCodecError, struct.error, ValueError) as error:
+                raise BagError(f"{self._path}: {connection.topic}: {error}") from None
+
+    def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, Buffer]]:
+        try:
+            for connection, _, data in self._reader.messages(connections):
+                yield connection, data
+        except _DAMAGE as error:
+            raise BagError(f"{self._path} is damaged: {error}") from None
+
+    def close(self) -> None:
+        """Close the bag."""
+        if self._reader.is_open:
+            self._reader.close()
+
+
+def _image(data: Buffer) -> messages.Image:
+    made = cdr.decode_record(data, "sensor_msgs/msg/Image")
+    dtype, channels = pixel_type(made.encoding)
+    kind = dtype.newbyteorder(">" if made.is_bigendian else "<")
+    rows = made.data.reshape(made.height, made.step)[:, : made.width * channels * dtype.itemsize]
+    pixels = np.ascontiguousarray(rows).view(kind).astype(dtype)
+    return messages.Image(
+        stamp_ns=_stamp_ns(made),
+        data=pixels.reshape(made.height, made.width, channels),
+        encoding=made.encoding,
+        frame_id=made.header.frame_id,
+    )
+
+
+def _imu(data: Buffer) -> messages.Imu:
+    made = cdr.decode_record(data, "sensor_msgs/msg/Imu")
+    return messages.Imu(
+        stamp_ns=_stamp_ns(made),
+        specific_force=_vector(made.linear_acceleration),
+        angular_rate=_vector(made.angular_velocity),
+    )
+
+
+def _odometry(data: Buffer) -> messages.Odometry:
+    made = cdr.decode_record(data, "nav_msgs/msg/Odometry")
+    pose, twist = made.pose.pose, made.twist.twist
+    orientation = np.array([*_vector(pose.orientation), pose.orientation.w])
+    return messages.Odometry(
+        stamp_ns=_stamp_ns(made),
+        position=_vector(pose.position),
+        orientation=orientation,
+        velocity=rotate(orientation, _vector(twist.linear)),
+        body_rate=_vector(twist.angular),
+    )
+
+
+class _PacketDecoder:
+    """Decodes the packets of one event camera, in their order.
+
+    Time in evt3 has 24 bits. Where packets are stamped with the time of their first event, as ours are, the
+    stamp says the rest; the stamps of drivers are of another clock, so there wraps are counted.
+    """
+
+    def __init__(self) -> None:
+        self._decoder: Evt3Decoder | None = None
+        self._is_stamped = True
+
+    def __call__(self, data: Buffer) -> messages.Events:
+        made = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
+        stamp_us = _stamp_ns(made) // 1000
+        if made.encoding == "mono":
+            columns = decode_mono(made.events, base_ns=made.time_base)
+            columns = columns._replace(t=columns.t // 1000)
+        elif made.encoding == "evt3":
+            columns = self._decode_evt3(made, stamp_us)
+        else:
+            raise BagError(f"events are encoded as {made.encoding!r}, known: evt3, mono")
+        return _events(columns, stamp_us, (made.width, made.height))
+
+    def _decode_evt3(self, made: Any, stamp_us: int) -> EventColumns:
+        size = {"width": made.width, "height": made.height}
+        if self._is_stamped:
+            columns = Evt3Decoder(start_us=stamp_us).decode(made.events, **size)
+            if not len(columns.t) or int(columns.t[0]) == stamp_us:
+                return columns
+            self._is_stamped = False
+        if self._decoder is None:
+            self._decoder = Evt3Decoder()
+        return self._decoder.decode(made.events, **size)
+
+
+def _event_array(data: Buffer) -> messages.Events:
+    size, columns = read_dvs(data)
+    stamp_us = int(columns.t[0]) if len(columns.t) else 0
+    return _events(columns, stamp_us, size)
+
+
+def _events(columns: EventColumns, stamp_us: int, size: tuple[int, int]) -> messages.Events:
+    end_us = int(columns.t[-1]) if len(columns.t) else stamp_us
+    return messages.Events(
+        stamp_ns=end_us * 1000,
+        start_ns=stamp_us * 1000,
+        width=size[0],
+        height=size[1],
+        t=columns.t,
+        x=columns.x,
+        y=columns.y,
+        polarity=columns.polarity,
+    )
+
+
+def _stamp_ns(made: Any) -> int:
+    return int(made.header.stamp.sec) * 1_000_000_000 + int(made.header.stamp.nanosec)
+
+
+def _vector(made: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([made.x, made.y, made.z])
+
+
+EVENT_TYPES = frozenset({"event_camera_msgs/msg/EventPacket", "dvs_msgs/msg/EventArray"})
+_DECODERS: dict[str, Callable[[], Callable[[Buffer], Any]]] = {
+    "event_camera_msgs/msg/EventPacket": _PacketDecoder,
+    "dvs_msgs/msg/EventArray": lambda: _event_array,
+    "sensor_msgs/msg/Image": lambda: _image,
+    "sensor_msgs/msg/Imu": lambda: _imu,
+    "nav_msgs/msg/Odometry": lambda: _odometry,
+}
+"""What makes the decoder of a topic, by its type in ROS."""
+_DAMAGE = (
+    *(ReaderError, OSError, ValueError, LookupError, TypeError, AttributeError),
+    *(AssertionError, OverflowError, MemoryError, struct.error, sqlite3.Error),
+)
+"""What rosbags raises for damage."""

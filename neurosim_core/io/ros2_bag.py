@@ -1,0 +1,179 @@
+"""Bags of ROS 2: directories of rosbag2 (MCAP or SQLite), and single MCAP files, which Foxglove opens.
+
+The bridge writes and reads them, by the conversions that it has for running systems. It is a package that
+this one does not depend on: it is named here, and imported when a bag is wanted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+from neurosim_core.install import install_hint
+from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, EventReader, PacketCutter
+from neurosim_core.packets import EventArrays, Odometry, Packet, join_events
+
+_BRIDGE = "cortex_ros2_bridge.bag_file"
+_VEHICLE = "drone"
+_EVENTS = "events"
+
+
+def open_mcap(path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> EventReader:
+    """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2.
+
+    Raises:
+        EventFileError: It is neither, or has no events.
+        ImportError: A library is not installed.
+        OSError: It cannot be read.
+    """
+    from neurosim_core.io.cortex_log import LogReader
+
+    with open(path, "rb") as file:
+        is_bag = file.read(25)[21:] == b"ros2"
+    return BagReader(path, size=size, sensor=sensor) if is_bag else LogReader(path, size=size, sensor=sensor)
+
+
+class BagReader:
+    """Reads a bag: events of one camera, and pictures, inertial measurements and odometry."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
+        """Open a bag.
+
+        Args:
+            path: A directory, or a file of type MCAP.
+            size: Not needed: messages of events say it.
+            sensor: Topic of the event camera, or its last part; empty: the first.
+
+        Raises:
+            EventFileError: It is no bag, or has no such camera.
+            ImportError: rosbags is not installed.
+            OSError: It cannot be read.
+        """
+        bags = _bridge()
+        self._path, self._error = path, bags.BagError
+        self.notes: list[str] = []
+        try:
+            self._bag = bags.BagReader(path)
+        except bags.BagError as error:
+            raise EventFileError(str(error)) from None
+        try:
+            self._choose(sensor, bags.EVENT_TYPES)
+            found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
+            self.width, self.height = size or next(found, (1, 1))
+        except BaseException:
+            self._bag.close()
+            raise
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """See `EventReader.blocks`."""
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        pending: list[Any] = []
+        for _, message in self._messages(self._topic):
+            pending.append(message)
+            if sum(len(part.t) for part in pending) >= BLOCK_EVENTS:
+                yield checker.check(join_events(pending))
+                pending = []
+        if pending:
+            yield checker.check(join_events(pending))
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield what is there besides events, in the order in which it was recorded.
+
+        Raises:
+            EventFileError: The bag is damaged.
+        """
+        from neurosim_core.live.messages import to_packet
+
+        counts = dict.fromkeys(self._others, 0)
+        for topic, message in self._messages(*self._others) if self._others else ():
+            packet = to_packet(message, self._others[topic])
+            yield dataclasses.replace(packet, sequence=counts[topic])
+            counts[topic] += 1
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._bag.close()
+
+    def _choose(self, sensor: str, event_types: Collection[str]) -> None:
+        topics = self._bag.topics
+        cameras = [topic for topic, kind in topics.items() if kind in event_types]
+        chosen = [topic for topic in cameras if topic.endswith(f"/{sensor.lstrip('/')}") or not sensor]
+        if not chosen:
+            raise EventFileError(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
+        self._topic = chosen[0]
+        vehicle = f"{self._topic.rpartition('/')[0]}/"
+        self._others = {
+            topic: topic.removeprefix(vehicle).removesuffix("/image_raw").strip("/").replace("/", "_")
+            for topic in topics
+            if topic not in cameras
+        }
+
+    def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
+        try:
+            yield from self._bag.messages(*topics)
+        except self._error as error:
+            raise EventFileError(str(error)) from None
+
+
+class BagWriter:
+    """Writes a bag: what the bridge would send of a vehicle "drone" with these sensors."""
+
+    def __init__(self, path: Path, *, width: int, height: int, storage: str = "mcap") -> None:
+        """Begin a bag.
+
+        Args:
+            path: `NAME.mcap` for a single file, else the directory to make.
+            width: Of the sensor [px].
+            height: Of the sensor [px].
+            storage: "mcap" or "sqlite3", for a directory.
+
+        Raises:
+            ImportError: rosbags is not installed.
+            OSError: It cannot be made.
+        """
+        bags = _bridge()
+        self._errors = bags.ConvertError, bags.BackendError
+        self._checker = BlockChecker(path, width=width, height=height)
+        try:
+            self._bag = bags.BagWriter(path, storage=storage)
+        except bags.BackendError as error:
+            raise OSError(str(error)) from None
+        self._packets = PacketCutter(self.write_packet, width=width, height=height, sensor=_EVENTS)
+        self._closed = False
+
+    def write(self, events: EventArrays) -> None:
+        """See `EventWriter.write`."""
+        self._packets.add(self._checker.check(events))
+
+    def write_packet(self, packet: Packet) -> None:
+        """Append a packet of any sensor, or leave out what ROS has no message for."""
+        from neurosim_core.live.messages import to_message
+
+        body = f"{_VEHICLE}/base_link"
+        is_body = isinstance(packet, Odometry)
+        try:
+            message = to_message(packet, frame_id=body if is_body else f"{_VEHICLE}/{packet.sensor}")
+        except TypeError:  # no message can carry it
+            return
+        try:
+            self._bag.write(f"/{_VEHICLE}/{packet.sensor}", message, frame_id=f"{_VEHICLE}/{packet.sensor}")
+        except self._errors as error:
+            raise EventFileError(str(error)) from None
+
+    def close(self) -> None:
+        """Complete the bag. Closing twice is allowed."""
+        if self._closed:
+            return
+        self._closed = True
+        self._packets.end()
+        self._bag.close()
+
+
+def _bridge() -> Any:
+    try:
+        return importlib.import_module(_BRIDGE)
+    except ImportError as error:
+        raise ImportError(f"bags of ROS 2 need rosbags: {install_hint('ros2')}") from error
