@@ -104,7 +104,8 @@ class BagWriter:
         ways = []
         for route in routes:
             rule = rule_of(route)
-            if route.cortex_type == "cortex/Events" and route.ros_type not in EVENT_TYPES:
+            drawn = route.cortex_type == "cortex/Events" and route.ros_type not in EVENT_TYPES
+            if drawn or route.ros_type == "sensor_msgs/msg/CameraInfo":  # nobody gives a calibration
                 continue
             options = {
                 **route.options,

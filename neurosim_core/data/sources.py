@@ -103,8 +103,7 @@ class WorldsSource:
     def samples(self, config: WindowConfig) -> Iterator[Sample]:
         """See `SampleSource.samples`."""
         worlds = self._simulation
-        found = {name: f for name, f in fields_of(worlds.model.config).items() if f != "flow"}
-        sensors = choose_sensors(found, config, source="worlds")
+        sensors = choose_sensors(fields_of(worlds.model.config), config, source="worlds")
         cutters = [PacketWindows(config, sensors, source=f"world {n}") for n in range(worlds.count)]
         seeds = None if self._calls == 0 else np.array(worlds.seeds) + worlds.count
         self._calls += 1
@@ -139,9 +138,11 @@ def _packets(
                 for world, own in enumerate(packets):
                     values = {name: array[row, world] for name, array in arrays.items()}
                     own.append(kind(stamp_ns=begin_ns + offset_ns, sensor=sensor, **values))
-        elif field in ("depth", "rgb") and sensor in observation.fresh:
+        elif field in ("depth", "flow", "rgb") and sensor in observation.fresh:
             pictures = observation.images[sensor].numpy()
-            encoding: Any = {"depth": "32FC1", "rgb": "rgb8"}[field]
+            encoding: Any = {"depth": "32FC1", "flow": "32FC2", "rgb": "rgb8"}[field]
+            if field == "flow":
+                pictures = pictures[..., :2]  # the mask is behind it
             for world, own in enumerate(packets):
                 data = pictures[world].copy()
                 own.append(Image(stamp_ns=now_ns, sensor=sensor, data=data, encoding=encoding))

@@ -8,7 +8,7 @@ from recorded_flights import HEIGHT, WIDTH, write_flight
 
 import neurosim_core as ns
 from neurosim_core import data
-from neurosim_core.data.sources import RunSource, WorldsSource
+from neurosim_core.data.sources import RunSource
 from neurosim_core.data.windows import WindowConfig
 from neurosim_core.io.transfer import transfer
 from neurosim_core.packets import EventArrays
@@ -112,13 +112,14 @@ def test_surfaces_and_counts_against_a_loop(flight):
     assert np.array_equal(batch.events.counts(), count)
 
 
-@pytest.mark.parametrize("name", ["a.raw", "a.dat", "a.csv", "a.npz", "mvsec.h5"])
+@pytest.mark.parametrize("name", ["a.raw", "a.dat", "a.csv", "a.npz", "mvsec.h5", "a.mcap"])
 def test_any_event_file_is_a_source(name, flight, tmp_path):
     path, events = flight
     transfer(path, tmp_path / name, size=(WIDTH, HEIGHT))
     batches = [*data.Stream(tmp_path / name, fields=["events"], batch=4)]
     found = [batch.events.raw for batch in batches]
-    begin = events.t[0]
+    has_pictures = name in ("mvsec.h5", "a.mcap")  # with them, time is from the whole second before
+    begin = events.t[0] - (events.t[0] % 1_000_000 if has_pictures else 0)
     ends = 50_000 * len(np.concatenate([batch.stamp_ns for batch in batches]))
     expected = events.t[(events.t > begin) & (events.t - begin <= ends)] - begin
     assert np.array_equal(np.concatenate([part.t for part in found]), expected)
@@ -165,11 +166,15 @@ def test_a_run_and_its_recording_give_the_same(tmp_path):
 
 
 def test_batches_of_worlds():
-    batches = [*data.Stream(ns.Simulation(CONFIG, worlds=3), batch=3)]
+    flow = {"kind": "optical_flow", "rate_hz": 20.0, "lens": LENS}
+    config = ns.load_config({**CONFIG, "sensors": {**CONFIG["sensors"], "flow": flow}})
+    batches = [*data.Stream(ns.Simulation(config, worlds=3), batch=3)]
     assert [batch.source for batch in batches] == [("world 0", "world 1", "world 2")] * 4
     assert batches[0].events.voxel(5).shape == (3, 5, 24, 32)
-    alone = [*WorldsSource(ns.Simulation(CONFIG, worlds=1)).samples(WindowConfig())]
+    alone = [*RunSource(config).samples(WindowConfig())]
     for batch, sample in zip(batches, alone, strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(batch.events.of(0), sample.events, strict=True))
         assert np.array_equal(batch.depth[0], sample.depth)
         assert np.array_equal(batch.pose[0], sample.pose)
+        assert np.array_equal(batch.flow[0], sample.flow, equal_nan=True)
+        assert np.isfinite(sample.flow).mean() > 0.5
