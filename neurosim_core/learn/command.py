@@ -31,7 +31,11 @@ def add_parsers(commands: _Commands) -> None:
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
     learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
     learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
-    learn.add_argument("--scenes", choices=["seen", "unseen"], default="unseen", help="eval: where to fly")
+    learn.add_argument(
+        "--scenes",
+        default="unseen",
+        help="eval: where to fly: seen, unseen (default), or the file of a scene",
+    )
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
     learn.add_argument("--data", type=Path, metavar="DIR", help="depth: a data set to learn from")
     learn.add_argument(

@@ -15,7 +15,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -244,7 +244,7 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
 def evaluate_run(
     folder: Path,
     *,
-    scenes: Literal["seen", "unseen"] = "unseen",
+    scenes: str = "unseen",
     device: str | None = None,
     worlds: int | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
@@ -252,14 +252,18 @@ def evaluate_run(
 
     Args:
         folder: The run.
-        scenes: Those that it was trained in, or others.
+        scenes: Those that it was trained in (`seen`), others (`unseen`), or the file of a scene.
         device: None: as in the training.
         worlds: Episodes; None: as configured.
     """
     config = read_config(folder)
     worlds = worlds or config.evaluation_worlds
     env = make_env(
-        config.task, worlds=worlds, device=device or config.device, scenes=scenes, pixels=config.pixels
+        config.task,
+        worlds=worlds,
+        device=device or config.device,
+        scenes=scenes if scenes in ("seen", "unseen") else [scenes],  # type: ignore[arg-type]
+        pixels=config.pixels,
     )
     policy = load_student(folder, env.device)
     for blind in (False, True):

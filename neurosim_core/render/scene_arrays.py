@@ -82,8 +82,9 @@ def upload_scene(
     )
     materials = (*scene.materials, *joined.materials)
     light: NDArray[np.float32] | None = None
-    with ThreadPoolExecutor(max_workers=2) as aside:
+    with ThreadPoolExecutor(max_workers=3) as aside:
         packing = aside.submit(pack_textures, materials)
+        connecting = aside.submit(connect_faces, scene) if config.samples_per_pixel == "adaptive" else None
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
         building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
@@ -107,8 +108,8 @@ def upload_scene(
         data.face_normal = face_normals(tree)
     _upload_surfaces(data, scene, mesh, joined, packed, terms, device)
     _upload_light(data, scene, mesh, light, config, lamps=bool(bodies) or not baked, device=device)
-    if config.samples_per_pixel == "adaptive":
-        _upload_wholes(data, scene, mesh, device)
+    if connecting is not None:
+        _upload_wholes(data, scene, mesh, connecting.result(), device)
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure
@@ -245,9 +246,15 @@ def _rows(values: list[tuple[float, float, float]]) -> NDArray[np.float32]:
     return np.array(values, dtype=np.float32).reshape(-1, 3)
 
 
-def _upload_wholes(data: SceneData, scene: Scene, mesh: RefinedMesh, device: str) -> None:
+def _upload_wholes(
+    data: SceneData,
+    scene: Scene,
+    mesh: RefinedMesh,
+    connected: tuple[NDArray[np.int32], NDArray[np.int32]],
+    device: str,
+) -> None:
     """Write what antialiasing reads: faces as they were before they were cut."""
-    neighbor, surface = connect_faces(scene)
+    neighbor, surface = connected
     first = np.searchsorted(mesh.origin, np.arange(len(scene.faces) + 1)).astype(np.int32)
     data.whole_of_face = wp.array(mesh.origin, dtype=int, device=device)
     data.whole_first = wp.array(first, dtype=int, device=device)
@@ -270,8 +277,12 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     mesh = scene
     count = len(mesh.faces)
     tips = mesh.vertices[mesh.faces]
-    place = np.unique(vertices.view([("", np.float32)] * 3), return_inverse=True)[1].reshape(-1)
-    corner, others = place[mesh.faces].astype(np.int64), ((1, 2), (2, 0), (0, 1))
+    bits = (vertices + np.float32(0.0)).view(np.int32).astype(np.int64)  # + 0 makes -0 equal to 0
+    plan, up = bits[:, 0] << 32 | (bits[:, 1] & 0xFFFFFFFF), bits[:, 2]
+    order = np.lexsort((up, plan))
+    place = np.zeros(len(vertices), dtype=np.int64)
+    place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
+    corner, others = place[mesh.faces], ((1, 2), (2, 0), (0, 1))
     ends = np.sort(corner[:, others].reshape(-1, 2), axis=1)
     key = ends[:, 0] << 32 | ends[:, 1]
     order = np.argsort(key, kind="stable")

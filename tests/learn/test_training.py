@@ -17,7 +17,13 @@ from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
-from neurosim_core.learn.train import TrainConfig, Training, load_student, make_card  # noqa: E402
+from neurosim_core.learn.train import (  # noqa: E402
+    TrainConfig,
+    Training,
+    evaluate_run,
+    load_student,
+    make_card,
+)
 
 torch.set_num_threads(1)
 
@@ -157,6 +163,16 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
     assert "% success" in str(first)
     del training
+
+
+def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
+    run(tmp_path, hall)
+    file = hall.config.scene.file
+    found = dict(evaluate_run(tmp_path, scenes=str(file), worlds=3))
+    assert set(found) == {"events", "blind"}
+    assert found["events"].episodes == 3
+    with pytest.raises(ValueError, match="nowhere"):
+        next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
 
 
 def test_a_task_of_ones_own_is_learnt(monkeypatch):
