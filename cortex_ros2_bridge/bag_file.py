@@ -10,7 +10,6 @@ is read back are events, pictures, inertial measurements and odometry, of any ba
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
 from cortex import messages
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder
@@ -124,8 +123,7 @@ class BagReader:
         path: A directory, or a file of type MCAP.
 
     Raises:
-        BagError: It is no bag, or damaged.
-        OSError: It cannot be read.
+        BagError: It is no bag, is damaged, or cannot be read.
 
     Attributes:
         topics: Type in ROS of each topic that can be read.
@@ -136,7 +134,7 @@ class BagReader:
         try:
             self._reader = Reader(path)
             self._reader.open()
-        except _DAMAGE as error:
+        except Exception as error:  # what rosbags raises for damage is not listed anywhere
             raise BagError(f"{path} is not a readable bag: {error}") from None
         self._connections = [each for each in self._reader.connections if each.msgtype in _DECODERS]
         drawn = {f"{each.topic}/image" for each in self._connections if each.msgtype in EVENT_TYPES}
@@ -166,7 +164,7 @@ class BagReader:
         try:
             for connection, _, data in self._reader.messages(connections):
                 yield connection, data
-        except _DAMAGE as error:
+        except Exception as error:
             raise BagError(f"{self._path} is damaged: {error}") from None
 
     def close(self) -> None:
@@ -283,8 +281,3 @@ _DECODERS: dict[str, Callable[[], Callable[[Buffer], Any]]] = {
     "nav_msgs/msg/Odometry": lambda: _odometry,
 }
 """What makes the decoder of a topic, by its type in ROS."""
-_DAMAGE = (
-    *(ReaderError, OSError, ValueError, LookupError, TypeError, AttributeError),
-    *(AssertionError, OverflowError, MemoryError, struct.error, sqlite3.Error),
-)
-"""What rosbags raises for damage."""

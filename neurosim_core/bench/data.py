@@ -31,8 +31,9 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     seconds = 2.0 if options.quick else 10.0
     with tempfile.TemporaryDirectory() as folder:
         formats = []
-        for name in [name for name, known in FORMATS.items() if known.writer]:
-            if name == "aedat4" and importlib.util.find_spec("faery") is None:
+        for name, known in FORMATS.items():
+            needs = {"aedat4": "faery", "ros2_bag": "rosbags"}.get(known.module, "h5py")
+            if importlib.util.find_spec(needs) is None:
                 continue
             progress(name)
             formats.append({"format": name, **_there_and_back(_path(Path(folder), name), name, seconds)})
@@ -75,7 +76,8 @@ def _there_and_back(path: Path, name: str, seconds: float) -> Row:
         ours = np.concatenate([block[index] for block in _blocks(seconds)])
         same = same and np.array_equal(np.concatenate([block[index] for block in found]), ours)
     return {
-        "bytes/event": path.stat().st_size / count,
+        "bytes/event": sum(each.stat().st_size for each in (path, *path.rglob("*")) if each.is_file())
+        / count,
         "write [M events/s]": count / write_s / 1e6,
         "read [M events/s]": count / read_s / 1e6,
         "identical": "yes" if same else "no",

@@ -19,7 +19,7 @@ from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
 
 WIDTH, HEIGHT = 346, 260
 HOUR_US = 3_600_000_000
-WRITABLE = [name for name, known in FORMATS.items() if known.writer]
+WRITABLE = [*FORMATS]
 
 
 def draw(count: int, *, span_us: int, begin_us: int = 0, seed: int = 0) -> EventArrays:
