@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neurosim_core.data.batch import Batch, EventBatch, Sample, collate
     from neurosim_core.data.live import LiveSource
+    from neurosim_core.data.shards import write_shards
     from neurosim_core.data.stream import Dataset, Stream
+    from neurosim_core.data.tonic import TonicDataset
     from neurosim_core.data.torch_loader import Loader
 
 _HOME = {
@@ -19,10 +21,23 @@ _HOME = {
     "Loader": "torch_loader",
     "Sample": "batch",
     "Stream": "stream",
+    "TonicDataset": "tonic",
     "collate": "batch",
+    "write_shards": "shards",
 }
 
-__all__ = ["Batch", "Dataset", "EventBatch", "LiveSource", "Loader", "Sample", "Stream", "collate"]
+__all__ = [
+    "Batch",
+    "Dataset",
+    "EventBatch",
+    "LiveSource",
+    "Loader",
+    "Sample",
+    "Stream",
+    "TonicDataset",
+    "collate",
+    "write_shards",
+]
 
 
 def __getattr__(name: str) -> Any:

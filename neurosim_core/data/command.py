@@ -28,6 +28,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time of a flight [s]")
     parser.add_argument("--seed", type=int, help="seed of the first flight")
     parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    parser.add_argument(
+        "--webdataset", type=Path, metavar="DIR", help="write windows of 50 ms as shards for WebDataset, too"
+    )
     add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
     parser.set_defaults(command=_make)
 
@@ -55,6 +58,9 @@ def _make(arguments: argparse.Namespace) -> int:
         flight_count=arguments.flights,
         flights_per_scene=arguments.flights_per_scene,
     )
+    shards = arguments.webdataset
+    if shards is not None and (shards.exists() or plan.folder.resolve() in shards.resolve().parents):
+        raise FileExistsError(f"--webdataset {shards}: name a new folder, outside of {plan.folder}")
     prepare(plan)
     console = Console(soft_wrap=not sys.stdout.isatty())
     stop = threading.Event()
@@ -71,6 +77,12 @@ def _make(arguments: argparse.Namespace) -> int:
     # The number of workers changes no byte, and so is no part of the command.
     write_card(plan, command=shlex.join(["neurosim", *_without_workers(sys.argv[1:])]))
     write_checksums(plan)
+    if shards is not None:
+        from neurosim_core.data import Dataset, write_shards
+
+        windows = Dataset(plan.folder)
+        count = len(write_shards((windows[k] for k in range(len(windows))), shards))
+        console.print(f"{shards}/: {len(windows):,} windows in {count} shards")
     console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {plan.flight_count} flights")
     return 0
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.data.batch import Batch, Sample, collate
 from neurosim_core.data.flights import RecordedFlight
+from neurosim_core.data.shards import ShardFlight
 from neurosim_core.data.windows import WindowConfig
 
 _OPEN_MAX = 64
@@ -29,7 +30,8 @@ class Dataset:
 
     Args:
         source: A recording, a file of events of any format (which is copied to a temporary recording), a
-            folder with such files or with a data set of `neurosim dataset`, or a list of these.
+            shard (`write_shards`), a folder with such files or with a data set of `neurosim dataset`, or a
+            list of these.
         window_s: Length of a window [s].
         stride_s: From one window to the next [s]; None: they follow on each other.
         fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
@@ -58,15 +60,18 @@ class Dataset:
             fields=None if fields is None else tuple(fields),
             sensors=sensors or {},
         )
-        self.flights = []
+        self.flights: list[RecordedFlight | ShardFlight] = []
         for path in find_recordings(source):
+            if path.suffix == ".tar":
+                self.flights.append(ShardFlight(path, config))
+                continue
             recording, folder = _as_recording(path)
             flight = RecordedFlight(recording, config, name=str(path))
             if folder is not None:
                 weakref.finalize(flight, _remove, folder, os.getpid())
             self.flights.append(flight)
         self._begins = np.concatenate([[0], np.cumsum([len(flight) for flight in self.flights])])
-        self._open: list[RecordedFlight] = []
+        self._open: list[RecordedFlight | ShardFlight] = []
 
     @property
     def skipped_count(self) -> int:
@@ -93,7 +98,7 @@ class Dataset:
             first, count = first + part, count - part
         return samples
 
-    def _note_open(self, flight: RecordedFlight) -> None:
+    def _note_open(self, flight: RecordedFlight | ShardFlight) -> None:
         if flight in self._open:
             return
         self._open.append(flight)
@@ -271,7 +276,8 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     path = Path(source)
     if path.is_file() or (path.is_dir() and is_event_file(path)):
         return [path]
-    hits = {p for p in path.rglob("*") if p.name[0] != "." and p.exists() and is_event_file(p)}
+    files = (p for p in path.rglob("*") if p.name[0] != "." and p.exists())
+    hits = {p for p in files if p.suffix == ".tar" or is_event_file(p)}
     found = sorted(p for p in hits if p.parent not in hits)  # what is in a bag is the bag's
     if not found:
         raise FileNotFoundError(

@@ -206,7 +206,7 @@ def _draw_events(page: _Page, axes: Any, place: tuple[float, float], name: str, 
     on = int(view.events.polarity.sum())
     off = len(view.events.polarity) - on
     details = []
-    for count, what, color in ((on, "brighter", ON_SRGB), (off, "darker", OFF_SRGB)):
+    for count, what, color in ((on, "on", ON_SRGB), (off, "off", OFF_SRGB)):
         details.append((f"{_short(count)} {what}", tuple(np.array(color) / 255.0)))
     page.heading(*place, f"{name}, {view.window_ns * 1e-6:g} ms", *details)
     _show(axes, event_picture(view.events, width=view.width, height=view.height))

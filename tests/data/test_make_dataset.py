@@ -121,7 +121,11 @@ def test_it_can_grow(whole, tmp_path, monkeypatch):
     before = checksums(whole)
     words = command(whole, "--workers", "0")
     words[words.index("--flights") + 1] = "5"
+    words += ["--webdataset", str(tmp_path / "shards")]
     assert cli.main(words) == 0
+    windows, shards = data.Dataset(whole), data.Dataset(tmp_path / "shards")
+    assert [one.stamp_ns for one in windows] == [one.stamp_ns for one in shards] != []
+    assert cli.main(words) == 1  # these shards are there
     after = checksums(whole)
     assert {name: after[name] for name in before if name.startswith("flights")} == {
         name: digest for name, digest in before.items() if name.startswith("flights")
