@@ -28,7 +28,7 @@ class DaggerConfig:
     """Steps of each world in an iteration, and how far back gradients go."""
     replay: int = 3
     """Iterations that are learnt from: this one and those before."""
-    updates: int = 16
+    updates: int = 6
     """Gradient steps in an iteration."""
     batch: int = 48
     """Stretches of flight (`horizon` steps of a world) in a gradient step."""

@@ -179,12 +179,6 @@ class RerunLogger:
             self._show_sensor(vehicle, packet, schema)
         DISPLAYS[schema.display](self, vehicle, packet, schema)
 
-    def log_scene(self, scene: SceneShapes) -> None:
-        """Show a scene that was not there at the beginning, and look at it from above."""
-        self._scene = scene
-        self._log_meshes()
-        self._send_blueprint()
-
     def log_path(self, position: NDArray[np.float64], *, vehicle: str | None = None) -> None:
         """Show where a vehicle is meant to fly.
 
