@@ -332,7 +332,7 @@ def absent_sensors(config: SimulationConfig) -> str:
     if not absent:
         return ""
     return (
-        f"Of the default sensors there is no {', '.join(absent)}: `sensors` replaces the default set, "
+        f"Absent of the default sensors: {', '.join(absent)}. `sensors` replaces the default set, "
         f"`{_ADDED}` adds to it."
     )
 
@@ -355,6 +355,11 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path} is binary, no settings; a mesh is named in them: scene: {{kind: mesh, file: {path}}}"
         ) from None
     except FileNotFoundError:
+        if path.suffix.lower() not in ("", ".yaml", ".yml"):
+            raise ConfigError(
+                f"{path}: no such file; settings are YAML, in which a mesh is "
+                f"scene: {{kind: mesh, file: {path.name}}}, or say --set scene.kind=mesh scene.file={path}"
+            ) from None
         raise ConfigError(
             f"no settings file {path}: `neurosim run --print-config > {path}` makes one"
         ) from None

@@ -28,6 +28,7 @@ from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
+from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.rollout import run_model, warm_flight
@@ -107,6 +108,7 @@ def fly(
     print_plan(console, model)
 
     summary = FlightSummary(describe_sensors(config.sensors))
+    sees_events = any(isinstance(sensor, EventSensorConfig) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
     with stop_at_signals(stop), _Files(model, folder, rerun=rerun, console=console) as files:
@@ -126,7 +128,9 @@ def fly(
                         progress.update(
                             task,
                             completed=packet.stamp_ns,
-                            rate=f"{summary.event_count / report.simulated_ns * 1e3:.2f} M events/s",
+                            rate=f"{summary.event_count / report.simulated_ns * 1e3:.2f} M events/s"
+                            if sees_events
+                            else "",
                             factor=f"{report.real_time_factor:.2f} x real time",
                         )
             files.close()

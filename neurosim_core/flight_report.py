@@ -104,6 +104,7 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
         facts.add_row("renders", f"{counts['renders']:,} ({groups})")
         if model.schedule.sparse:
             facts.add_row("left out", _describe_left_out(counts))
+    if any(isinstance(sensor, EventSensorConfig) for sensor in model.config.sensors.values()):
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")
@@ -133,6 +134,8 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     rows = [*setup.items(), *inside.items()]
     total = sum(seconds for _, seconds in rows)
     for name, seconds in rows:
+        if seconds < 0.005:
+            continue
         spent.add_row(name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %")
     console.print()
     console.print(spent, highlight=False)

@@ -317,5 +317,5 @@ def test_sensors_that_are_absent_are_said_first(tmp_path, monkeypatch, capsys):
     assert cli.main(["run", "scene.yaml", "--duration", "0.05", "--no-rrd"]) == 0
     first = capsys.readouterr().out.partition(" flies ")[0]
     assert "apartment with 1 room, seed" in first
-    assert "Of the default sensors there is no events, rgb, depth, odometry" in first
+    assert "Absent of the default sensors: events, rgb, depth, odometry." in first
     assert max(map(len, first.splitlines())) > 80  # lines are not broken for a pipe as for a narrow terminal

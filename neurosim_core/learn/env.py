@@ -53,7 +53,7 @@ def make_env(
     """Return a task in many worlds.
 
     Args:
-        task: Its name in the registry ("hover", "avoid", ...), or a task.
+        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
         worlds: N.
         device: Where everything is: auto, cpu, cuda:0.
         observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.

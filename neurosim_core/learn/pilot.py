@@ -193,7 +193,7 @@ def fly_policy(
         say: Told how it goes, line by line.
 
     Returns:
-        The mean speed of the last two seconds [m/s]; inf after a collision.
+        The mean speed of the last two seconds, or of all if it is shorter [m/s]; inf after a collision.
     """
     from neurosim_core import sim
     from neurosim_core.config import load_config
@@ -225,6 +225,7 @@ def fly_policy(
         if state.ended or state.failure is not None:
             say(f"{1e-9 * state.stamp_ns:4.1f} s  collision")
             return float("inf")
-    speed = float(np.mean(speeds[-2 * round(pilot.card["rate_hz"]) :]))
-    say(f"mean speed of the last 2 s: {speed:.2f} m/s")
+    last = speeds[-2 * round(pilot.card["rate_hz"]) :]
+    speed = float(np.mean(last))
+    say(f"mean speed of the last {len(last) / pilot.card['rate_hz']:g} s: {speed:.2f} m/s")
     return speed

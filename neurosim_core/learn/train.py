@@ -219,7 +219,9 @@ def read_config(folder: Path) -> TrainConfig:
     """
     file = folder / "run.json"
     if not file.is_file():
-        raise ValueError(f"{folder} is no run of training: it has no run.json")
+        raise ValueError(
+            f"{folder} is no run of training: it has no run.json; `neurosim learn hover` makes one"
+        )
     values = json.loads(file.read_text())
     values["teacher"] = PpoConfig(**values["teacher"])
     values["student"] = DaggerConfig(**values["student"])

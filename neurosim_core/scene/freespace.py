@@ -342,7 +342,7 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     if voxel != config.voxel_m:
         notes.append(
             f"Free space is mapped in voxels of {voxel:.3g} m instead of {config.voxel_m:g} m: "
-            f"the scene measures {' x '.join(f'{s:.3g}' for s in bounds[1] - bounds[0])} m."
+            f"the scene measures {' x '.join(f'{s:,.4g}' for s in bounds[1] - bounds[0])} m."
         )
     mesh = wp.Mesh(
         points=wp.array(scene.vertices, dtype=wp.vec3, device=device),

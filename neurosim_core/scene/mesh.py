@@ -122,9 +122,8 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     triangles = arrays["vertices"][arrays["faces"]].astype(np.float64)
     size = np.ptp(triangles, axis=(0, 1))
     if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
-        notes.append(
-            f"It is {size.max():.3g} m across; if that is wrong, declare unit_m (0.001 for millimetres)."
-        )
+        across = f"{size.max():,.0f}" if size.max() > 1.0 else f"{size.max():.3g}"
+        notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")
     return Scene(
         name=path.stem,
         lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
@@ -255,8 +254,8 @@ def _check_extent(parts: list[dict[str, Any]], path: Path) -> None:
     far = max(float(np.abs(part["positions"][part["faces"]]).max()) for part in parts if len(part["faces"]))
     if far > _EXTENT_MAX_M:
         raise SceneError(
-            f"{path}: reaches {far:.4g} m from the origin, allowed are {_EXTENT_MAX_M:g} m; declare unit_m "
-            "(0.001 for millimetres)"
+            f"{path}: reaches {far:,.0f} m from the origin, allowed are {_EXTENT_MAX_M:,.0f} m; declare "
+            "unit_m (0.001 for millimetres)"
         )
 
 

@@ -132,17 +132,19 @@ def _describe_free(space: FreeSpace) -> FreeSpaceReport:
 def rows(report: SceneReport) -> list[tuple[str, str]]:
     """Return the figures as text, a name and a value each."""
     low, high = report.bounds_m
-    size = " x ".join(f"{length:.2f}" for length in report.size_m)
+    size = " x ".join(f"{length:,.2f}" for length in report.size_m)
     corners = " to ".join("(" + ", ".join(f"{c:.2f}" for c in corner) + ")" for corner in (low, high))
+    edge_m = report.edge_median_m
+    edge = f"{100.0 * edge_m:.1f} cm" if edge_m < 10.0 else f"{edge_m:,.0f} m"
     textures = f"{report.texture_count}, {report.texel_count / 1e6:.1f} million texels"
     if report.untextured_share > 0.0:
         textures += f"; {100.0 * report.untextured_share:.0f} % of the area has none"
     table = [
         ("size", f"{size} m"),
         ("corners", f"{corners} m"),
-        ("triangles", f"{report.triangle_count:,}, median edge {100.0 * report.edge_median_m:.1f} cm"),
+        ("triangles", f"{report.triangle_count:,}, median edge {edge}"),
         ("vertices", f"{report.vertex_count:,}"),
-        ("area", f"{report.area_m2:.1f} m²"),
+        ("area", f"{report.area_m2:,.1f} m²"),
         ("objects", str(report.instance_count)),
         ("materials", f"{report.material_count}, {report.emissive_count} glow"),
         ("textures", textures),
@@ -153,8 +155,8 @@ def rows(report: SceneReport) -> list[tuple[str, str]]:
         table.append(("free space", f"none with {CLEARANCE_M:g} m clear"))
     elif free is not None:
         table += [
-            ("free space", f"{free.volume_m3:.1f} m³ over {free.floor_m2:.1f} m², {CLEARANCE_M:g} m clear"),
-            ("widest place", f"{free.widest_m:.2f} m to the nearest surface"),
+            ("free space", f"{free.volume_m3:,.1f} m³ over {free.floor_m2:,.1f} m², {CLEARANCE_M:g} m clear"),
+            ("widest place", f"{free.widest_m:,.2f} m to the nearest surface"),
             ("fly at", f"z = {free.height_m:.2f} m"),
         ]
     return table
@@ -190,7 +192,10 @@ def report_scene(
     Raises:
         SceneError: The file cannot be used.
         OSError: The picture cannot be written.
+        ValueError: `out` is no name of a picture.
     """
+    if out is not None and out.suffix.lower() not in Image.registered_extensions():
+        raise ValueError(f"{out}: the scene is drawn into a picture: {out.stem}.png")
     console = console or Console()
     start = time.perf_counter()
     if isinstance(file, Scene):

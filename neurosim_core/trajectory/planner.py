@@ -129,6 +129,12 @@ def plan_tour(space: FreeSpace, config: TourConfig, *, duration_s: float) -> Pat
         found = search(terrain.slowness, space.voxel_m, here, cost_max_m=_RING[1] * config.leg_length_m)
         goal = _next_goal(found.cost, places, visited, config.leg_length_m, rng)
         if goal is None:
+            size_m, leg_m = float(np.ptp(space.bounds_m, axis=0).max()), config.leg_length_m
+            if space.voxel_m > leg_m:
+                raise PlanningError(
+                    f"the scene is {size_m:,.0f} m across, too large for legs of {leg_m:g} m; if it is in "
+                    "millimetres, declare scene.unit_m: 0.001, else raise path.leg_length_m"
+                )
             raise PlanningError(
                 f"leg {len(legs)} of the tour has nowhere to go: at clearance_m = {config.clearance_m:g} "
                 f"only {len(places)} voxels of {space.voxel_m:g} m at flight height can be reached from "
@@ -201,9 +207,9 @@ def _next_goal(
     if not far > 0.0:
         return None
     length = min(leg_length_m, far / _RING[1])
-    ring = np.flatnonzero(
-        (way >= _RING[0] * length) & (way <= _RING[1] * length)
-    )  # holds the farthest at least
+    ring = np.flatnonzero((way >= _RING[0] * length) & (way <= _RING[1] * length))
+    if not len(ring):  # the voxels are wider than it
+        return None
     few = places[rng.choice(ring, size=_CANDIDATES)]
     apart = np.linalg.norm(few[:, None].astype(np.float64) - np.array(visited), axis=2).min(axis=1)
     return _voxel(few[int(apart.argmax())])

@@ -268,7 +268,7 @@ def _draw_strips(
             axes.plot(time_s, column, color=color, linewidth=1.6 if one else 1.0, solid_capstyle="round")
         axes.margins(x=0.0, y=0.12)
         finite = values[np.isfinite(values)]
-        if finite.size and finite.min() >= 0.0:
+        if finite.size and 0.0 <= finite.min() <= 0.5 * finite.max():  # else 0 would flatten the curve
             axes.set_ylim(0.0, 1.12 * max(float(finite.max()), 1e-9))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e7ea", linewidth=0.8)

@@ -98,7 +98,9 @@ def cloud_entity(vehicle: str, sensor: str) -> str:
 def title(field: FieldSchema) -> str:
     """Return what a field of a packet is called on a plot, with its unit."""
     unit = field.unit.replace("^2", "²")
-    name = field.name.removesuffix("_" + field.unit.replace("/", "_").replace("^", "")).replace("_", " ")
+    name = field.name.removesuffix("_" + field.unit.replace("/", "_").replace("^", "").lower()).replace(
+        "_", " "
+    )
     return f"{name} [{unit}]" if unit else name
 
 

@@ -146,6 +146,6 @@ def test_a_policy_flies_in_this_process(policy, hall):
     overrides |= {"device": "cpu", "render.lighting.mode": "unshadowed"}
     speed_m_s = fly_policy(str(policy), duration_s=0.2, overrides=overrides, say=said.append)
     assert 0.5 < speed_m_s < 2.0  # thrown at 0.8 m/s, and hardly slowed in that time
-    assert said[-1].startswith("mean speed of the last 2 s")
+    assert said[-1].startswith("mean speed of the last 0.2 s")
     with pytest.raises(ValueError, match="unknown policy 'nobody', known: "):
         shipped_policy("nobody")

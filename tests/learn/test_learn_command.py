@@ -14,7 +14,10 @@ from neurosim_core.cli import main
     ("arguments", "message"),
     [
         (["learn", "eval"], "say which run: neurosim learn eval runs/hover"),
-        (["learn", "eval", "nowhere"], "nowhere is no run of training: it has no run.json"),
+        (
+            ["learn", "eval", "nowhere"],
+            "nowhere is no run of training: it has no run.json; `neurosim learn hover` makes one",
+        ),
         (["learn", "hover", "runs/hover"], "a folder is for `neurosim learn eval`; say --out"),
         (["learn", "juggle", "--out", "{folder}/new"], "unknown task kind 'juggle', known: ["),
         (["learn", "hover", "--out", "{folder}"], "holds a run: give --resume, or another --out"),

@@ -808,7 +808,7 @@ def broken(name: str) -> tuple[str, bytes | str]:
         ("nan", "'bad' has NaN or infinite numbers in 1 corners"),
         ("nan in matrix", "'bad' has NaN or infinite numbers in its transform"),
         ("all flat", "empty, none of its 1 faces has an area"),
-        ("huge", r"reaches 1e\+06 m from the origin, allowed are 20000 m; declare unit_m"),
+        ("huge", r"reaches 1,000,000 m from the origin, allowed are 20,000 m; declare unit_m"),
         ("no mesh", "empty, there are no triangles"),
         ("cycle", "node 0 has two parents or is its own ancestor"),
         ("wrong vertex", "uses vertex 7 of 3"),

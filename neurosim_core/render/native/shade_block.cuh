@@ -38,7 +38,7 @@ for (int lane = 0; lane < LANES; ++lane) {
             total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
 }
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
-    return 0.01f * SHARPNESS * __builtin_sqrtf(points_shown / SAMPLES);
+    return 0.01f * SHARPNESS * wp::sqrt(points_shown / SAMPLES);
 };
 alignas(64) float direction[3][N], corner[3][N], normal[3][N], spread[N], share[N];
 alignas(64) int faces_of[N], owner[N];
