@@ -145,18 +145,27 @@ class EventBatch:
 
     def _on_host(self) -> EventBatch:
         """Return the same with NumPy arrays."""
-        if isinstance(self.offsets, np.ndarray):
+        tensors: Any = self
+        if isinstance(tensors.offsets, np.ndarray):
             return self
-        columns = {name: getattr(self, name).cpu().numpy() for name in ("offsets", "start_us", "stamp_us")}
-        return replace(self, raw=EventArrays(*(column.cpu().numpy() for column in self.raw)), **columns)
+        return replace(
+            self,
+            raw=EventArrays(*(column.cpu().numpy() for column in tensors.raw)),
+            offsets=tensors.offsets.cpu().numpy(),
+            start_us=tensors.start_us.cpu().numpy(),
+            stamp_us=tensors.stamp_us.cpu().numpy(),
+        )
 
-    def _as_given(self, grids: NDArray[np.float32]) -> Any:
+    def _as_given(self, grids: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return grids as what the events are: an array, or a tensor on their device."""
-        if isinstance(self.offsets, np.ndarray):
+        tensors: Any = self
+        if isinstance(tensors.offsets, np.ndarray):
             return grids
         import torch
 
-        return torch.from_numpy(grids).to(self.offsets.device)
+        made: Any = torch.from_numpy(grids).to(tensors.offsets.device)
+        given: NDArray[np.float32] = made
+        return given
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
