@@ -49,7 +49,11 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EventBatch:
-    """The events of several windows: those of window i are `raw[offsets[i]:offsets[i + 1]]`."""
+    """The events of several windows: those of window i are `raw[offsets[i]:offsets[i + 1]]`.
+
+    Where a `Loader` has put tensors in place of the arrays, grids are computed on the host as well, and are
+    tensors on the device of the events.
+    """
 
     raw: EventArrays
     """All events, window by window, shape [n]."""
@@ -86,22 +90,23 @@ class EventBatch:
             raise ValueError(f"bins must be at least 1, got {bins}")
         cells = self.width * self.height
         grids = np.empty((len(self), bins, self.height, self.width), np.float32)
+        host = self._on_host()
         for window, grid in enumerate(grids):
-            t, x, y, polarity = self.of(window)
+            t, x, y, polarity = host.of(window)
             place = y.astype(np.intp) * self.width + x
             sign = polarity * 2.0 - 1.0
             if bins == 1:
                 grid[0] = np.bincount(place, sign, cells).reshape(grid.shape[1:])
                 continue
-            span_us = int(self.stamp_us[window] - self.start_us[window])
-            moment = (t - self.start_us[window]) * ((bins - 1) / span_us)
+            span_us = int(host.stamp_us[window] - host.start_us[window])
+            moment = (t - host.start_us[window]) * ((bins - 1) / span_us)
             low = np.minimum(moment.astype(np.intp), bins - 2)
             place += low * cells
             late = sign * (moment - low)
             total = np.bincount(place, sign - late, bins * cells)
             total[cells:] += np.bincount(place, late, (bins - 1) * cells)
             grid[:] = total.reshape(grid.shape)
-        return grids
+        return self._as_given(grids)
 
     def surface(self, tau_s: float | Sequence[float] = (0.01, 0.05)) -> NDArray[np.float32]:
         """Return exp(-(end - t) / tau) of the last event of each pixel, 0 where none is in the window.
@@ -119,22 +124,48 @@ class EventBatch:
             raise ValueError(f"tau_s must be > 0, got {tau_s}")
         surfaces = np.empty((len(self), 2 * len(taus), self.height, self.width), np.float32)
         age_us = np.empty((2, self.height, self.width))
+        host = self._on_host()
         for window, surface in enumerate(surfaces):
-            t, x, y, polarity = self.of(window)
+            t, x, y, polarity = host.of(window)
             age_us.fill(np.inf)
-            age_us[polarity, y, x] = self.stamp_us[window] - t  # the last of equal pixels stays
+            age_us[polarity, y, x] = host.stamp_us[window] - t  # the last of equal pixels stays
             for index, tau in enumerate(taus):
                 np.exp(age_us * (-1e-6 / tau), out=surface[2 * index : 2 * index + 2], casting="same_kind")
-        return surfaces
+        return self._as_given(surfaces)
 
     def counts(self) -> NDArray[np.float32]:
         """Return the events of each pixel: channels darker and brighter, shape [B, 2, H, W]."""
         counts = np.empty((len(self), 2, self.height, self.width), np.float32)
+        host = self._on_host()
         for window, count in enumerate(counts):
-            _, x, y, polarity = self.of(window)
+            _, x, y, polarity = host.of(window)
             place = (polarity.astype(np.intp) * self.height + y) * self.width + x
             count[:] = np.bincount(place, minlength=count.size).reshape(count.shape)
-        return counts
+        return self._as_given(counts)
+
+    def _on_host(self) -> EventBatch:
+        """Return the same with NumPy arrays."""
+        tensors: Any = self
+        if isinstance(tensors.offsets, np.ndarray):
+            return self
+        return replace(
+            self,
+            raw=EventArrays(*(column.cpu().numpy() for column in tensors.raw)),
+            offsets=tensors.offsets.cpu().numpy(),
+            start_us=tensors.start_us.cpu().numpy(),
+            stamp_us=tensors.stamp_us.cpu().numpy(),
+        )
+
+    def _as_given(self, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return grids as what the events are: an array, or a tensor on their device."""
+        tensors: Any = self
+        if isinstance(tensors.offsets, np.ndarray):
+            return grids
+        import torch
+
+        made: Any = torch.from_numpy(grids).to(tensors.offsets.device)
+        given: NDArray[np.float32] = made
+        return given
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -115,6 +117,25 @@ def test_whole_batches_as_tensors(folder):
     assert batch.depth.shape == (4, 16, 24)
     assert batch.depth.dtype == torch.float32
     assert batch.events.raw.t.dtype == torch.int64
+    arrays = next(iter(data.Stream(folder, batch=4))).events
+    for found, wanted in (
+        (batch.events.voxel(5), arrays.voxel(5)),
+        (batch.events.voxel(1), arrays.voxel(1)),
+        (batch.events.surface(), arrays.surface()),
+        (batch.events.counts(), arrays.counts()),
+    ):
+        assert isinstance(found, torch.Tensor)
+        assert np.array_equal(found.numpy(), wanted)
+
+
+def test_the_training_step_of_the_tutorial_trains(folder, monkeypatch, capsys):
+    pytest.importorskip("torch")
+    page = (Path(__file__).resolve().parents[2] / "docs/tutorials/data-set.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(import torch\n.*?)```", page, flags=re.DOTALL)
+    monkeypatch.chdir(folder.parent)
+    code = code.replace('"data"', repr(folder.name)).replace("workers=2", "workers=0")
+    exec(compile(code, "data-set.md", "exec"), {"__name__": "__main__"})
+    assert re.fullmatch(r"6 batches, loss of the last \d+\.\d{3}\n", capsys.readouterr().out)
 
 
 SCRIPT = """
