@@ -246,7 +246,7 @@ def test_a_building_in_millimetres_shows_which_way_is_up(tmp_path):
     assert scene.notes[1].startswith("Up axis: z, from the geometry")
     # the same numbers in metres, 3.2 km high, are no building
     far = load_mesh_scene(MeshSceneConfig(file=tmp_path / "flat.glb"))
-    assert far.notes[1].startswith("Up axis: y, by default")
+    assert far.notes[2].startswith("Up axis: y, by default")
 
 
 def things() -> dict[str, trimesh.Trimesh]:
