@@ -256,7 +256,7 @@ def test_sensors_can_be_added_to_the_default_set(tmp_path):
 
 def test_sensors_that_a_file_leaves_out_are_named():
     absent = absent_sensors(load_config({"sensors": {"events": {"kind": "event_camera"}}}))
-    assert "no rgb, depth, imu, odometry" in absent
+    assert "Absent of the default sensors: rgb, depth, imu, odometry." in absent
     assert "`sensors+` adds" in absent
     assert absent_sensors(load_config()) == ""
 
