@@ -32,7 +32,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("steps", type=Path, nargs="?", help="events of light that is switched up and down")
     parser.add_argument("--lux", type=float, required=True, help="illuminance of the still surface [lux]")
     parser.add_argument(
-        "--contrast", type=float, default=2.0, help="bright over dark light of the steps (default: 2)"
+        "--contrast",
+        type=float,
+        metavar="RATIO",
+        help="bright over dark light of the steps; needed with them",
     )
     parser.add_argument(
         "--rise",
@@ -63,7 +66,9 @@ def _fit(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.fit.sensor import Stimulus, fit_sensor
 
-    if not arguments.contrast > 1.0:
+    if arguments.steps is not None and arguments.contrast is None:
+        raise ValueError("say how high the steps are: --contrast 4 if light goes from 1 to 4")
+    if arguments.contrast is not None and not arguments.contrast > 1.0:
         raise ValueError(f"--contrast is bright over dark light, above 1, got {arguments.contrast}")
     if not (arguments.lux >= 0.0 and arguments.rise >= 0.0):
         raise ValueError(f"--lux and --rise must be >= 0, got {arguments.lux} and {arguments.rise}")
@@ -80,7 +85,7 @@ def _fit(arguments: argparse.Namespace) -> int:
             height=reader.height,
             still=still,
             steps=steps,
-            contrast=arguments.contrast,
+            contrast=arguments.contrast or 2.0,  # of no steps
             rise_s=arguments.rise,
         )
         fit = fit_sensor(stimulus, repeats=arguments.repeats, progress=status.update)

@@ -157,3 +157,5 @@ def test_the_command_leaves_settings_and_a_picture(recordings, tmp_path, capsys,
     assert cli.main([*command, "-o", "cam.yaml"]) == 1
     assert "already there" in capsys.readouterr().err
     assert cli.main(["fit-sensor", "still.raw", "--lux", "300", "--contrast", "1", "-o", "x.yaml"]) == 1
+    assert cli.main(["fit-sensor", "still.raw", "steps.raw", "--lux", "300", "-o", "x.yaml"]) == 1
+    assert "say how high the steps are: --contrast" in capsys.readouterr().err
