@@ -101,7 +101,9 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
         return f"{shown}.kind: required, and not given"
     if kind == "union_tag_invalid":
         context = item["ctx"]
-        return f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}"
+        own = "; one of your own is found once its module is imported, or installed as a plugin"
+        hint = own if loc[0] == "sensors" else ""
+        return f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}{hint}"
     if kind == "value_error":
         reason = item["msg"].removeprefix("Value error, ")
         return f"{shown}: {reason}" if shown else reason
