@@ -358,7 +358,8 @@ def _read(path: Path) -> dict[str, Any]:
         if path.suffix.lower() not in ("", ".yaml", ".yml"):
             raise ConfigError(
                 f"{path}: no such file; settings are YAML, in which a mesh is "
-                f"scene: {{kind: mesh, file: {path.name}}}, or say --set scene.kind=mesh scene.file={path}"
+                f"scene: {{kind: mesh, file: {path.name}}}, "
+                f"or say --set scene.kind=mesh --set scene.file={path}"
             ) from None
         raise ConfigError(
             f"no settings file {path}: `neurosim run --print-config > {path}` makes one"
