@@ -32,7 +32,7 @@ _WRAP = np.array([_TIME_HIGH << 12 | 0xFFF, _TIME_HIGH << 12], np.uint16)
 """The last and the first value of the high half of a time."""
 _JITTER = 10
 """A high half that is smaller by no more than this came late, it did not wrap; as other decoders have it."""
-_EVT3_SIZE_MAX = 2048
+EVT3_SIZE_MAX = 2048
 
 
 class EventCodecError(ValueError):
@@ -95,7 +95,7 @@ class Evt3Encoder:
             EventCodecError: The sensor has more than 2048 columns or rows, an event is outside of it or has
                 another polarity, or times decrease.
         """
-        if width > _EVT3_SIZE_MAX or height > _EVT3_SIZE_MAX:
+        if width > EVT3_SIZE_MAX or height > EVT3_SIZE_MAX:
             raise EventCodecError(f"evt3 holds at most 2048 x 2048 pixels, not {width} x {height}; use mono")
         check_events(events, width, height)
         allocate = new_bytes if allocate is None else allocate

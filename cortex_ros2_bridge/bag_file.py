@@ -20,7 +20,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from cortex import messages
-from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder
+from cortex.evt3 import EVT3_SIZE_MAX, EventCodecError, EventColumns, Evt3Decoder
 from cortex.schema import schema_of
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.bag import BagBackend, BagPublisher
@@ -99,7 +99,7 @@ class BagWriter:
         schema = schema_of(type(message))
         seen = SeenTopic(topic, schema.name, schema.fingerprint, True, schema=schema.to_json())
         routes, _ = make_routes(Seen((seen,)), BridgeConfig())
-        wide = max(getattr(message, "width", 0), getattr(message, "height", 0)) > 2048  # too many for evt3
+        wide = max(getattr(message, "width", 0), getattr(message, "height", 0)) > EVT3_SIZE_MAX
         ways = []
         for route in routes:
             rule = rule_of(route)

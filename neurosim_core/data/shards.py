@@ -11,7 +11,7 @@ import json
 import shutil
 import tarfile
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,7 @@ def write_shards(samples: Iterable[Sample], folder: Path, *, windows: int = 1000
     while part := list(islice(numbered, 1)):
         names.append(f"windows-{len(names):06d}.tar")
         with tarfile.open(draft / names[-1], "w", format=tarfile.USTAR_FORMAT) as tar:
-            for number, sample in (each for some in (part, islice(numbered, windows - 1)) for each in some):
+            for number, sample in chain(part, islice(numbered, windows - 1)):
                 for name, data in _files(sample):
                     entry = tarfile.TarInfo(f"{number:08d}.{name}")  # its time is 0
                     entry.size = len(data)

@@ -85,7 +85,7 @@ def _fit(arguments: argparse.Namespace) -> int:
             height=reader.height,
             still=still,
             steps=steps,
-            contrast=arguments.contrast or 2.0,  # of no steps
+            contrast=arguments.contrast or Stimulus.contrast,  # of no steps
             rise_s=arguments.rise,
         )
         fit = fit_sensor(stimulus, repeats=arguments.repeats, progress=status.update)
