@@ -65,7 +65,7 @@ def test_ci_runs_the_test_command():
 
 
 def test_the_run_command(tmp_path):
-    """The last part of the command, of which 1.2 s are flown; what is before it has installed this environment."""
+    """The last part of the command, for 1.2 s; what is before it has installed this environment."""
     command = named("command", "bash")["run"].rsplit("&&", 1)[-1].strip()
     assert command == ".venv/bin/neurosim run"
     done = shell("neurosim run --duration 1.2", tmp_path)
