@@ -158,6 +158,13 @@ def _add_up(commands: _Commands) -> None:
         metavar="HOW",
         help="native, web, none, or a .rrd file; auto: native where there is a display, else web",
     )
+    up.add_argument(
+        "--web",
+        action="store_const",
+        dest="viewer",
+        const="web",
+        help="as --viewer web: a page with the viewer, and buttons that pause, step and reset the run",
+    )
     up.set_defaults(command=_up)
 
 
