@@ -77,7 +77,8 @@ def color_picture(kind: PictureKind, data: NDArray[Any]) -> NDArray[np.uint8]:
     """Return pixels as sRGB, uint8 [H, W, 3]; for all kinds but depth and values."""
     if kind == "segmentation":
         hue = (np.maximum(data, 0) * 0.618034) % 1.0  # steps of the golden ratio keep neighbours apart
-        return _on_nothing(_hsv(hue, 0.65, 0.85 - 0.25 * (np.maximum(data, 0) % 3 == 1)), data >= 0)
+        value = np.where(data == 0, 0.9, 0.85 - 0.25 * (np.maximum(data, 0) % 3 == 1))  # 0: mostly none
+        return _on_nothing(_hsv(hue, 0.65 * (data != 0), value), data >= 0)
     if kind == "normals":
         return _on_nothing(127.5 * (data + 1.0), np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1))
     if kind == "flow":
