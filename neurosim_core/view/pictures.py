@@ -85,9 +85,8 @@ def color_picture(kind: PictureKind, data: NDArray[Any]) -> NDArray[np.uint8]:
         known = np.isfinite(data).all(axis=-1)
         x, y = np.where(known[..., None], data, 0.0).astype(np.float64).transpose(2, 0, 1)
         length = np.hypot(x, y)
-        return _on_nothing(
-            _hsv(np.arctan2(y, x) / (2.0 * np.pi), length / max(1e-9, length.max()), 1.0), known
-        )
+        long = max(1e-9, float(np.quantile(length, 0.98)))  # a few near pixels would leave the others white
+        return _on_nothing(_hsv(np.arctan2(y, x) / (2.0 * np.pi), np.minimum(length / long, 1.0), 1.0), known)
     return data if data.ndim == 3 else np.repeat(data[..., None], 3, axis=-1)
 
 
