@@ -78,6 +78,8 @@ class BridgeConfig:
     """Whether the namespace goes before these, too, and before the names of frames."""
     frames: FrameNames = field(default_factory=FrameNames)
     """Names of frames in ROS."""
+    autostart: bool = True
+    """Whether it begins active; else ROS configures and activates it, as a managed node."""
     defaults: bool = True
     """Whether topics have routes that no entry of `routes` asks for."""
     include: tuple[str, ...] = ("*",)
@@ -348,6 +350,7 @@ SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "namespace": check_namespace,
     "frames": _frame_names,
     "isolate": _flag,
+    "autostart": _flag,
     "defaults": _flag,
     "include": _patterns,
     "exclude": _patterns,

@@ -92,13 +92,13 @@ class Outgoing:
         """Take in the calibration that goes with each image."""
         self._context.camera_info = info
 
-    def look(self) -> bool:
-        """See who listens; returns whether anybody does, or may later."""
+    def look(self, is_active: bool) -> bool:
+        """See who listens; returns whether anybody does, or may later, and messages may pass."""
         count = self._publisher.subscriber_count
         if self._latched:
             self._remind(count)
         self.subscriber_count = count
-        self.wanted = self._lasting or count > 0
+        self.wanted = is_active and (self._lasting or count > 0)
         return self.wanted
 
     def send(self, message: Any) -> None:
@@ -287,12 +287,12 @@ class Feed:
         """Whether it is subscribed to."""
         return self._subscriber is not None
 
-    def look(self) -> None:
+    def look(self, is_active: bool) -> None:
         """See who wants its messages, and subscribe or unsubscribe accordingly; count what was lost."""
-        wanted = [wants() for wants in self._taps.values()]
+        wanted = [is_active and wants() for wants in self._taps.values()]
         for output in self._outputs:
             before = output.wanted
-            wanted.append(output.look())
+            wanted.append(output.look(is_active))
             if output.wanted and not before:
                 with self._lock:
                     if self._last is not None:
