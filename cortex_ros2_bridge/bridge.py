@@ -192,7 +192,12 @@ class Bridge:
             logger.info("%d routes are open; --verbose or /diagnostics names them", len(self._links))
         self._cortex_gone(len(wanted))
         self._connections.watch_vehicles(seen)
-        if self._simulation is None and self.config.defaults and SERVED.keys() <= dict(seen.services).keys():
+        if (
+            self._simulation is None
+            and self.config.defaults
+            and not self.config.is_bag
+            and SERVED.keys() <= dict(seen.services).keys()
+        ):
             self._simulation = SimulationServices(
                 self._node, self._backend, self.config, lambda: self.state == ACTIVE
             )

@@ -173,7 +173,7 @@ def _bridge(
     """
     config = make(given)
     _load_converters(config)
-    stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
+    stop = _stop_at_signals(forced=not config.is_bag)
     from cortex_ros2_bridge.backend.choose import open_backend
     from cortex_ros2_bridge.bridge import Bridge
     from cortex_ros2_bridge.lifecycle import Lifecycle
@@ -217,7 +217,7 @@ def _load_converters(config: BridgeConfig) -> None:
 
 def _identity(config: BridgeConfig) -> str:
     """Return what a bridge is called in Cortex: two of one name publish the same topics."""
-    if config.backend.endswith(".mcap"):
+    if config.is_bag:
         return f"{config.node} into {config.backend}"
     return f"{config.node} in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'}, {config.namespace or '/'}"
 
@@ -281,7 +281,7 @@ def _what_there_is(node: Node) -> Seen:
 
 
 def _row(route: Route) -> tuple[str, str, str, str]:
-    arrow = "->" if route.direction == "out" else "<-"
+    _, arrow, _ = str(route).split()
     qos = route.qos
     return (
         route.cortex_topic,

@@ -95,6 +95,11 @@ class BridgeConfig:
     ros: RosArguments = field(default_factory=RosArguments)
     """What followed `--ros-args`; no setting of the file."""
 
+    @property
+    def is_bag(self) -> bool:
+        """Whether all goes into a bag, and nobody answers."""
+        return self.backend.endswith(".mcap")
+
     def ros_topic(self, name: str) -> str:
         """Return the full name of a topic or service in ROS: with its namespace, and remapped."""
         full = name if name in ROOTED and not self.isolate else self.namespace + name

@@ -108,7 +108,8 @@ class Connections:
         """
         self._seen = seen
         _warm_up(route.ros_type)
-        opens = {"out": self._open_out, "in": self._open_in, "call": self._open_call}
+        out = self._open_out
+        opens = {"out": out, "record": out, "in": self._open_in, "call": self._open_call}
         with contextlib.ExitStack() as stack:
             tally, listeners = opens[route.direction](route, stack)
             return Link(route=route, tally=tally, listeners=listeners, resources=stack.pop_all())
@@ -183,6 +184,8 @@ class Connections:
             self._context(route),
             latched=self._is_latched(route.cortex_topic),
         )
+        if route.direction == "record":  # thrusts are parts of what the vehicle can do
+            output.whereabouts = self._whereabouts_of(route)
         if route.ros_type == "sensor_msgs/msg/CameraInfo" and route.cortex_type != "cortex/CameraInfo":
             info = self._feed(route.cortex_topic + INFO, "cortex/CameraInfo", stack)
             self._tap(info, output.take_camera_info, lambda: True, stack)
@@ -199,9 +202,7 @@ class Connections:
             lambda: self._node.publisher(route.cortex_topic, kind),
         )
         target = Target(route, publisher, rule_of(route).convert, self._context(route))
-        whereabouts = self._vehicles.setdefault(
-            vehicle_of(route.cortex_topic), Whereabouts(vehicle_of(route.cortex_topic))
-        )
+        whereabouts = self._whereabouts_of(route)
 
         def subscribe() -> Incoming:
             incoming = Incoming(whereabouts, self._is_active)
@@ -224,6 +225,10 @@ class Connections:
         if service is not None:
             stack.callback(service.close)
         return caller.tally, lambda: subscription.publisher_count
+
+    def _whereabouts_of(self, route: Route) -> Whereabouts:
+        vehicle = vehicle_of(route.cortex_topic)
+        return self._vehicles.setdefault(vehicle, Whereabouts(vehicle))
 
     def _context(self, route: Route) -> convert.Context:
         return convert.Context(

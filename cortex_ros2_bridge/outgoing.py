@@ -60,6 +60,7 @@ class Outgoing:
         tally: What it has done.
         wanted: Whether anybody in ROS listens, or may later; as of the last look.
         subscriber_count: How many listen; as of the last look.
+        whereabouts: Of the vehicle whose commands these are; None: they are none.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Outgoing:
         self.tally = Tally(str(route))
         self.wanted = False
         self.subscriber_count = 0
+        self.whereabouts: Whereabouts | None = None
         self._publisher = publisher
         self._convert = convert
         self._context = context
@@ -107,6 +109,8 @@ class Outgoing:
         tally.receive()
         if isinstance(message, Events) and message.dropped_count:
             tally.drop(message.dropped_count)
+        if self.whereabouts is not None:
+            self._context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
             data = self._convert(message, self._context)
         except (ConvertError, cdr.CdrError) as error:
