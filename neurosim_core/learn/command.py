@@ -144,6 +144,7 @@ def fly_policy(arguments: argparse.Namespace, overrides: Mapping[str, Any]) -> i
         duration_s=arguments.duration or 6.0,
         seed=arguments.seed or 0,
         overrides=given,
+        save=arguments.save,
     )
     return 0 if speed_m_s < float("inf") else 1
 
