@@ -168,8 +168,8 @@ def held_out_windows(config: DenseConfig, data: Path | None) -> Iterator[Windows
     if data is None:
         seeds = range(_TEST_SEED, _TEST_SEED + config.test_flights)
         field = config.head.field
-        options = {"field": field, "duration_s": 3.0, "device": config.device}
-        sources = [flight_settings(config.size_px, seed, **options) for seed in seeds]
+        more: dict[str, Any] = {"field": field, "duration_s": 3.0, "device": config.device}
+        sources = [flight_settings(config.size_px, seed, **more) for seed in seeds]
     for number, source in enumerate(sources):
         for batch in Stream(source, batch=64, **_options(config)):
             found = windows_of(batch, config.head, config.bins)
