@@ -34,7 +34,7 @@ _KINDS: tuple[tuple[int, str, type, bool], ...] = (
     (9, "string_array_value", str, True),
 )
 """As in rcl_interfaces/ParameterType: number, field of ParameterValue, type, whether it is an array."""
-_FIXED = ("backend", "distro", "cortex_domain", "node", "namespace", "isolate")
+_FIXED = ("backend", "distro", "cortex_domain", "node", "namespace", "isolate", "autostart")
 """Settings that hold from the start to the end."""
 _LIVE = ("defaults", "include", "exclude")
 

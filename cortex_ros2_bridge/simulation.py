@@ -23,7 +23,7 @@ from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.backend.base import Backend
 from cortex_ros2_bridge.backend.names import service_path
 from cortex_ros2_bridge.config import BridgeConfig
-from cortex_ros2_bridge.incoming import ask
+from cortex_ros2_bridge.incoming import NOT_ACTIVE, ask
 from cortex_ros2_bridge.msgs import message_class
 
 logger = logging.getLogger(__name__)
@@ -50,15 +50,19 @@ class _Refused(Exception):
 class SimulationServices:
     """Answers for the simulator, until it is closed. One of several hosts answers for itself."""
 
-    def __init__(self, node: Node, backend: Backend, config: BridgeConfig) -> None:
+    def __init__(
+        self, node: Node, backend: Backend, config: BridgeConfig, is_active: Callable[[], bool]
+    ) -> None:
         """Open the services; without the ROS package, rclpy has none, which is said.
 
         Args:
             node: Who calls the simulator.
             backend: Where the services are.
             config: Names topics and frames.
+            is_active: Says whether requests may pass.
         """
         self._node = node
+        self._is_active = is_active
         self._frames = config.frame_names
         self._starts_paused = False
         self._resources = contextlib.ExitStack()
@@ -94,6 +98,8 @@ class SimulationServices:
     def _answer(self, answer: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
         found = _OK, ""
         try:
+            if not self._is_active():
+                _refuse(_INCORRECT_STATE, NOT_ACTIVE)
             answer(request, response)
         except _Refused as refused:
             found = refused.args
