@@ -1,4 +1,4 @@
-"""The commands `neurosim learn` and `neurosim deploy`."""
+"""The commands `neurosim learn`, `neurosim deploy` and `neurosim predict`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parsers(commands: _Commands) -> None:
-    """Add both commands."""
+    """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
     learn.add_argument("what", metavar="TASK", help="hover, hover-paper, depth, flow, pretrain, or `eval`")
     learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
@@ -65,6 +65,24 @@ def add_parsers(commands: _Commands) -> None:
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
+    predict = commands.add_parser(
+        "predict", help="tell depth or flow from the events of a running simulator, over Cortex"
+    )
+    predict.add_argument("network", type=Path, help="depth.pt or flow.pt of `neurosim learn`")
+    predict.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
+    predict.add_argument("--events", default="events", metavar="NAME", help="its camera (default: events)")
+    predict.add_argument("--device", default="cpu", help="of the network: cpu, cuda:0, ... (default: cpu)")
+    predict.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    predict.set_defaults(command=_predict)
+
+
+def _predict(arguments: argparse.Namespace) -> int:
+    need("torch")
+    from neurosim_core.learn.predict import predict
+
+    names = {"vehicle": arguments.vehicle, "events": arguments.events}
+    predict(arguments.network, **names, device=arguments.device, duration_s=arguments.duration)
+    return 0
 
 
 def _learn(arguments: argparse.Namespace) -> int:

@@ -57,6 +57,8 @@ class DenseConfig:
     """How many steps to train, however long they take; None: as `minutes` says."""
     room: int = 20_000
     """Windows that are kept to be seen again; of more, the oldest go."""
+    reuse: float = 4.0
+    """Worlds fly on when their windows have been seen so often, on average."""
     size_px: int = 48
     """Of the pictures of all flights that are flown here [px]."""
     test_flights: int = 8
@@ -166,7 +168,8 @@ def held_out_windows(config: DenseConfig, data: Path | None) -> Iterator[Windows
     if data is None:
         seeds = range(_TEST_SEED, _TEST_SEED + config.test_flights)
         field = config.head.field
-        sources = [flight_settings(config.size_px, seed, field=field, duration_s=3.0) for seed in seeds]
+        more: dict[str, Any] = {"field": field, "duration_s": 3.0, "device": config.device}
+        sources = [flight_settings(config.size_px, seed, **more) for seed in seeds]
     for number, source in enumerate(sources):
         for batch in Stream(source, batch=64, **_options(config)):
             found = windows_of(batch, config.head, config.bins)
@@ -283,8 +286,8 @@ def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
 @contextlib.contextmanager
 def _source(
     pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int
-) -> Iterator[Callable[[], object]]:
-    """Fill a pool for the first step; yield what to call before each step."""
+) -> Iterator[Callable[[int], None]]:
+    """Fill a pool for the first step; yield what to call before each step, with its number."""
     head, options = config.head, _options(config)
     if worlds:
         from neurosim_core.learn.dense_worlds import world_windows
@@ -293,7 +296,12 @@ def _source(
         flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
         while len(pool) < min(config.batch, worlds):
             pool.add(next(flown))
-        yield lambda: pool.add(next(flown))
+
+        def fly_on(step: int) -> None:
+            while pool.window_count * config.reuse < step * config.batch * config.sequence:
+                pool.add(next(flown))
+
+        yield fly_on
         return
     stop = threading.Event()
 
@@ -306,7 +314,7 @@ def _source(
     if data is not None:
         length = config.sequence + head.ahead
         fill(Stream(data, batch=64 * length, sequence=length, **options))
-        yield lambda: None
+        yield lambda _: None
         return
     with live_flights(live, flight_settings(config.size_px, 0, field=head.field), seed=config.seed) as names:
         stream = Stream(LiveSource(names, timeout_s=_SILENT_S), batch=1, **options)
@@ -315,13 +323,13 @@ def _source(
         try:
             while len(pool) < config.batch and filler.is_alive():
                 time.sleep(0.05)
-            yield lambda: None
+            yield lambda _: None
         finally:
             stop.set()
             filler.join(_SILENT_S)  # the next window ends it, as long as somebody flies
 
 
-def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[], object]) -> int:
+def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> int:
     """Train for the time that there is; return how many steps that were."""
     if len(pool) == 0:
         raise ValueError(
@@ -339,7 +347,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[]
     while (share := share_done()) < 1.0:
         for group in optimizer.param_groups:
             group["lr"] = config.rate * min(1.0, 10.0 * share + 0.01) * 0.5 * (1.0 + np.cos(np.pi * share))
-        more()
+        more(steps)
         voxel, target = (part.to(config.device) for part in pool.draw(config.batch, random))
         memory, predicted = None, []
         for window in voxel[: config.sequence]:
