@@ -29,8 +29,12 @@ def _shared_files() -> set[str]:
 
 
 def _threads() -> set[threading.Thread]:
-    """Threads, without the one that pyzmq starts with the first message that it sends without a copy."""
-    return {thread for thread in threading.enumerate() if not isinstance(thread, GarbageCollectorThread)}
+    """Threads, without those that stay: pyzmq's for messages without a copy, and the pool that renders."""
+    return {
+        thread
+        for thread in threading.enumerate()
+        if not isinstance(thread, GarbageCollectorThread) and not thread.name.startswith("neurosim-render")
+    }
 
 
 @pytest.fixture
