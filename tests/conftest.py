@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let the garbage collector pass over what stays anyway: modules and tests, a tenth of a second each time."""
+    """Let the garbage collector pass over what stays: to look takes a tenth of a second."""
     gc.collect()
     gc.freeze()
 
