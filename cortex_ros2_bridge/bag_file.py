@@ -1,7 +1,7 @@
 """Bags as files of messages of Cortex: written by the rules of the bridge, and read back.
 
 What is written is what the bridge would send, each message at its own stamp, but for drawings of events. What
-is read back are events, pictures, inertial measurements and odometry, of any bag, also of others' drivers.
+is read back are events, pictures, inertial measurements, odometry and commands, of any bag, also of others.
 
     with contextlib.closing(BagWriter(Path("flight.mcap"))) as bag:
         bag.write("/drone/imu", Imu(...))
@@ -26,8 +26,9 @@ from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.bag import BagBackend, BagPublisher
 from cortex_ros2_bridge.backend.base import BackendError, Buffer
 from cortex_ros2_bridge.config import BridgeConfig
-from cortex_ros2_bridge.convert import Context, ConvertError
+from cortex_ros2_bridge.convert import RULES, Context, ConvertError
 from cortex_ros2_bridge.convert.camera import pixel_type
+from cortex_ros2_bridge.convert.registry import Rule
 from cortex_ros2_bridge.event_codec import decode_mono, read_dvs
 from cortex_ros2_bridge.frames import rotate
 from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, rule_of, vehicle_of
@@ -98,7 +99,7 @@ class BagWriter:
     def _ways_of(self, topic: str, message: Any, frame_id: str) -> list[_Way]:
         schema = schema_of(type(message))
         seen = SeenTopic(topic, schema.name, schema.fingerprint, True, schema=schema.to_json())
-        routes, _ = make_routes(Seen((seen,)), BridgeConfig())
+        routes, _ = make_routes(Seen((seen,)), BridgeConfig(backend=".mcap"))
         wide = max(getattr(message, "width", 0), getattr(message, "height", 0)) > EVT3_SIZE_MAX
         ways = []
         for route in routes:
@@ -121,44 +122,64 @@ class BagReader:
 
     Args:
         path: A directory, or a file of type MCAP.
+        max_thrust_n: Thrust of an AttitudeTarget with thrust 1 [N]; None: of the default airframe.
 
     Raises:
         BagError: It is no bag, is damaged, or cannot be read.
 
     Attributes:
-        topics: Type in ROS of each topic that can be read.
+        topics: Type in ROS of each topic that can be read, but for commands.
+        commands: Likewise of commands, which are read where they are asked for.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, max_thrust_n: float | None = None) -> None:
         self._path = path
+        self._max_thrust_n = max_thrust_n
         try:
             self._reader = Reader(path)
             self._reader.open()
         except Exception as error:  # what rosbags raises for damage is not listed anywhere
             raise BagError(f"{path} is not a readable bag: {error}") from None
+        of_commands = [each for each in self._reader.connections if _rules_of(each)]
         self._connections = [each for each in self._reader.connections if each.msgtype in _DECODERS]
         drawn = {f"{each.topic}/image" for each in self._connections if each.msgtype in EVENT_TYPES}
         self._connections = [each for each in self._connections if each.topic not in drawn]
         self.topics = {each.topic: each.msgtype for each in self._connections}
+        self.commands = {each.topic: each.msgtype for each in of_commands}
+        self._connections += of_commands
 
     def messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
         """Yield topics and messages of Cortex in the order in which they were recorded.
 
         Args:
-            topics: Which of `topics`; none: all.
+            topics: Which of `topics` and `commands`; none: all of `topics`.
 
         Raises:
             BagError: The bag is damaged, or has a message that cannot be used.
         """
-        chosen = [each for each in self._connections if not topics or each.topic in topics]
+        chosen = [each for each in self._connections if each.topic in (topics or self.topics)]
         if not chosen:
             return
-        decoders: dict[int, Callable[[Buffer], Any]] = {each.id: _DECODERS[each.msgtype]() for each in chosen}
+        decoders = {each.id: self._decoder_of(each) for each in chosen}
         for connection, data in self._raw(chosen):
             try:
                 yield connection.topic, decoders[connection.id](data)
             except (cdr.CdrError, ConvertError, EventCodecError, struct.error, ValueError) as error:
                 raise BagError(f"{self._path}: {connection.topic}: {error}") from None
+
+    def _decoder_of(self, connection: Connection) -> Callable[[Buffer], Any]:
+        if connection.msgtype in _DECODERS:
+            return _DECODERS[connection.msgtype]()
+        rules = _rules_of(connection)
+        context = Context(vehicle=vehicle_of(connection.topic), max_thrust_n=self._max_thrust_n)
+
+        def decode(data: Buffer) -> Any:
+            made = (rule.convert(data, context) for rule in rules)
+            command = next((each for each in made if each is not None), None)
+            context.sequence += 1
+            return command
+
+        return decode
 
     def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, Buffer]]:
         try:
@@ -171,6 +192,13 @@ class BagReader:
         """Close the bag."""
         if self._reader.is_open:
             self._reader.close()
+
+
+def _rules_of(connection: Connection) -> list[Rule]:
+    """Return the rules by which the messages of a topic are commands."""
+    kind, topic = connection.msgtype, connection.topic
+    commands = [rule for rule in RULES if rule.direction == "in" and rule.ros_type == kind]
+    return [rule for rule in commands if topic.endswith(rule.name.removeprefix("{base}"))]
 
 
 def _image(data: Buffer) -> messages.Image:

@@ -173,9 +173,10 @@ def _bridge(
     """
     config = make(given)
     _load_converters(config)
-    stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
+    stop = _stop_at_signals(forced=not config.is_bag)
     from cortex_ros2_bridge.backend.choose import open_backend
     from cortex_ros2_bridge.bridge import Bridge
+    from cortex_ros2_bridge.lifecycle import Lifecycle
     from cortex_ros2_bridge.parameters import Parameters
 
     with contextlib.ExitStack() as stack:
@@ -187,12 +188,16 @@ def _bridge(
         )
         try:
             bridge = stack.enter_context(Bridge(config, backend, node))
-            parameters = Parameters(bridge, backend, make, given)
-            stack.callback(parameters.close)
+            for part in (
+                Parameters(bridge, backend, make, given),
+                Lifecycle(bridge, backend, f"{config.namespace}/{config.node}"),
+            ):
+                stack.callback(part.close)
             where = getattr(backend, "directory", None)
             into = f" into {where}/ (rosbag2)" if where is not None else ""
             how = f"{backend.name}{into}, {backend.distro}"
-            _say(f"{config.namespace}/{config.node}: {how}; waiting for Cortex topics, Ctrl-C ends")
+            what = "waiting for Cortex topics" if config.autostart else "unconfigured: ROS manages it"
+            _say(f"{config.namespace}/{config.node}: {how}; {what}, Ctrl-C ends")
             gc.collect()
             gc.freeze()  # what is there stays; the collector need not look at it again and again
             sys.setswitchinterval(SWITCH_S)
@@ -212,7 +217,7 @@ def _load_converters(config: BridgeConfig) -> None:
 
 def _identity(config: BridgeConfig) -> str:
     """Return what a bridge is called in Cortex: two of one name publish the same topics."""
-    if config.backend.endswith(".mcap"):
+    if config.is_bag:
         return f"{config.node} into {config.backend}"
     return f"{config.node} in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'}, {config.namespace or '/'}"
 
@@ -276,7 +281,7 @@ def _what_there_is(node: Node) -> Seen:
 
 
 def _row(route: Route) -> tuple[str, str, str, str]:
-    arrow = "->" if route.direction == "out" else "<-"
+    _, arrow, _ = str(route).split()
     qos = route.qos
     return (
         route.cortex_topic,

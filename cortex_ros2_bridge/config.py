@@ -78,6 +78,8 @@ class BridgeConfig:
     """Whether the namespace goes before these, too, and before the names of frames."""
     frames: FrameNames = field(default_factory=FrameNames)
     """Names of frames in ROS."""
+    autostart: bool = True
+    """Whether it begins active; else ROS configures and activates it, as a managed node."""
     defaults: bool = True
     """Whether topics have routes that no entry of `routes` asks for."""
     include: tuple[str, ...] = ("*",)
@@ -92,6 +94,11 @@ class BridgeConfig:
     """Modules, or .py files, that register conversions."""
     ros: RosArguments = field(default_factory=RosArguments)
     """What followed `--ros-args`; no setting of the file."""
+
+    @property
+    def is_bag(self) -> bool:
+        """Whether all goes into a bag, and nobody answers."""
+        return self.backend.endswith(".mcap")
 
     def ros_topic(self, name: str) -> str:
         """Return the full name of a topic or service in ROS: with its namespace, and remapped."""
@@ -348,6 +355,7 @@ SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "namespace": check_namespace,
     "frames": _frame_names,
     "isolate": _flag,
+    "autostart": _flag,
     "defaults": _flag,
     "include": _patterns,
     "exclude": _patterns,

@@ -30,6 +30,7 @@ PENDING_S = 1.0
 CALL_TIMEOUT_S = 30.0
 """How long a service may take to answer; `step` answers when the steps are over [s]."""
 ENDS = "the bridge ends"
+NOT_ACTIVE = "the bridge is not active"
 SERVICES = {
     "std_msgs/msg/Empty": "std_srvs/srv/Trigger",
     "std_msgs/msg/UInt32": "std_srvs/srv/Trigger",
@@ -70,12 +71,14 @@ class Incoming:
         publisher_count: How many there are in ROS; as of the last look.
     """
 
-    def __init__(self, whereabouts: Whereabouts) -> None:
+    def __init__(self, whereabouts: Whereabouts, is_active: Callable[[], bool]) -> None:
         """Prepare, without a target.
 
         Args:
             whereabouts: Of the vehicle that is commanded.
+            is_active: Says whether messages may pass.
         """
+        self._is_active = is_active
         self.whereabouts = whereabouts
         self.subscription: RosSubscription | None = None
         self.publisher_count = 0
@@ -119,6 +122,11 @@ class Incoming:
     def take(self, data: bytes) -> None:
         """Take in a message of ROS, from any thread."""
         with self._lock:
+            if not self._is_active():
+                for target in self._targets[:1]:
+                    target.tally.receive()
+                    target.tally.refuse(NOT_ACTIVE)
+                return
             for target in self._targets:
                 try:
                     command = self._convert(target, data)
@@ -194,7 +202,9 @@ class Incoming:
 class Caller:
     """Turns messages of ROS into requests to one Cortex service, one by one, on a thread of its own."""
 
-    def __init__(self, route: Route, node: Node, convert: Convert, context: Context) -> None:
+    def __init__(
+        self, route: Route, node: Node, convert: Convert, context: Context, is_active: Callable[[], bool]
+    ) -> None:
         """Start the thread.
 
         Args:
@@ -202,9 +212,11 @@ class Caller:
             node: Who calls.
             convert: Makes the request of CDR.
             context: What it needs to know besides.
+            is_active: Says whether requests may pass.
         """
         self.route = route
         self.tally = Tally(str(route))
+        self._is_active = is_active
         self._convert = convert
         self._context = context
         kind = CORTEX_TYPES[route.cortex_type]
@@ -252,7 +264,7 @@ class Caller:
 
     def _call(self, request: Any) -> str:
         """Call the service; returns why it did not do what was asked, empty if it did."""
-        reason, was_answered = ask(self._client, request)
+        reason, was_answered = ask(self._client, request) if self._is_active() else (NOT_ACTIVE, True)
         if not reason:
             self.tally.send()
         elif was_answered:

@@ -60,6 +60,7 @@ class Outgoing:
         tally: What it has done.
         wanted: Whether anybody in ROS listens, or may later; as of the last look.
         subscriber_count: How many listen; as of the last look.
+        whereabouts: Of the vehicle whose commands these are; None: they are none.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Outgoing:
         self.tally = Tally(str(route))
         self.wanted = False
         self.subscriber_count = 0
+        self.whereabouts: Whereabouts | None = None
         self._publisher = publisher
         self._convert = convert
         self._context = context
@@ -92,13 +94,13 @@ class Outgoing:
         """Take in the calibration that goes with each image."""
         self._context.camera_info = info
 
-    def look(self) -> bool:
-        """See who listens; returns whether anybody does, or may later."""
+    def look(self, is_active: bool) -> bool:
+        """See who listens; returns whether anybody does, or may later, and messages may pass."""
         count = self._publisher.subscriber_count
         if self._latched:
             self._remind(count)
         self.subscriber_count = count
-        self.wanted = self._lasting or count > 0
+        self.wanted = is_active and (self._lasting or count > 0)
         return self.wanted
 
     def send(self, message: Any) -> None:
@@ -107,6 +109,8 @@ class Outgoing:
         tally.receive()
         if isinstance(message, Events) and message.dropped_count:
             tally.drop(message.dropped_count)
+        if self.whereabouts is not None:
+            self._context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
             data = self._convert(message, self._context)
         except (ConvertError, cdr.CdrError) as error:
@@ -287,12 +291,12 @@ class Feed:
         """Whether it is subscribed to."""
         return self._subscriber is not None
 
-    def look(self) -> None:
+    def look(self, is_active: bool) -> None:
         """See who wants its messages, and subscribe or unsubscribe accordingly; count what was lost."""
-        wanted = [wants() for wants in self._taps.values()]
+        wanted = [is_active and wants() for wants in self._taps.values()]
         for output in self._outputs:
             before = output.wanted
-            wanted.append(output.look())
+            wanted.append(output.look(is_active))
             if output.wanted and not before:
                 with self._lock:
                     if self._last is not None:

@@ -58,7 +58,7 @@ class Route:
         return self.cortex_topic, self.cortex_type, self.ros_topic, self.ros_type
 
     def __str__(self) -> str:
-        arrow = "->" if self.direction == "out" else "<-"
+        arrow = "->" if self.direction in ("out", "record") else "<-"
         return f"{self.cortex_topic} {arrow} {self.ros_topic}"
 
 
@@ -143,7 +143,7 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
     routes: list[Route] = []
     images: dict[str, str] = {}
     unused = {(n, name): set[str]() for n, change in enumerate(config.routes) for name in change.options}
-    for route, rule in _candidates(seen):
+    for route, rule in _candidates(seen, config):
         if not _wanted(route.cortex_topic, config):
             continue
         fitting = [change for change in config.routes if _fits(change, route)]
@@ -163,13 +163,13 @@ def shared_topics(config: BridgeConfig) -> frozenset[str]:
 
 def known_options(route: Route) -> frozenset[str]:
     """Return the names of the options that a route has."""
-    more = {"out": {"queue"}, "in": {"stale_s", "stamp"}, "call": set[str]()}
+    more = {"out": {"queue"}, "record": {"queue"}, "in": {"stale_s", "stamp"}, "call": set[str]()}
     return rule_of(route).options | more[route.direction]
 
 
 def unfit(seen: Seen, config: BridgeConfig) -> list[str]:
     """Say which entries of `routes` fit nothing that is there, or that may have a route."""
-    routes = [route for route, _ in _candidates(seen) if _wanted(route.cortex_topic, config)]
+    routes = [route for route, _ in _candidates(seen, config) if _wanted(route.cortex_topic, config)]
     found = []
     for number, change in enumerate(config.routes):
         if any(_fits(change, route) for route in routes):
@@ -203,29 +203,34 @@ def odometry_of(vehicle: str, seen: Seen) -> str | None:
     return min(topics, key=lambda topic: (topic.rpartition("/")[2] not in _TF_SOURCES, topic), default=None)
 
 
-def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:
+def _candidates(seen: Seen, config: BridgeConfig) -> list[tuple[Route, Rule]]:
     found = []
     pictures = {t.topic for t in seen.topics if t.type_name in ("cortex/Image", "cortex/Events")}
     for topic in seen.topics:
         if not _is_known(topic):
             continue
         for rule in rules():
-            if rule.cortex_type != topic.type_name or rule.direction == "call":
-                continue
-            if (rule.direction == "out") != topic.published:
+            if rule.cortex_type != topic.type_name or not _may_go(rule, topic, config):
                 continue
             if rule.cortex_type == "cortex/CameraInfo" and topic.topic.removesuffix(INFO) in pictures:
                 continue  # goes with each picture, and with its stamp
             if rule.name == "/tf" and topic.topic.rpartition("/")[2] not in _TF_SOURCES:
                 continue
             found.append((_route(rule, topic.topic), rule))
-    for name, request in seen.services:
+    for name, request in () if config.is_bag else seen.services:
         found += [
             (_route(rule, name), rule)
             for rule in RULES
             if (rule.cortex_type, rule.direction) == (request, "call")
         ]
     return found
+
+
+def _may_go(rule: Rule, topic: SeenTopic, config: BridgeConfig) -> bool:
+    """Return whether a rule is for a topic that is published, or subscribed to, by others."""
+    if topic.published:
+        return rule.direction == "out" or (rule.direction == "record" and config.is_bag)
+    return rule.direction == "in" and not config.is_bag
 
 
 def _route(rule: Rule, topic: str) -> Route:

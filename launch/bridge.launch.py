@@ -28,6 +28,7 @@ ARGUMENTS = {
     "namespace": ("", "goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics"),
     "backend": ("auto", "auto, rclpy or dds; or the name of a bag to write, such as run.mcap"),
     "distro": ("", "ROS distribution for the backend dds; none: ROS_DISTRO"),
+    "autostart": ("true", "false: it waits until ROS configures and activates it, as a managed node"),
     "python": (sys.executable, "the Python that neurosim is installed for"),
 }
 """Defaults and explanations."""
@@ -40,20 +41,22 @@ def actions(context: Any) -> list[Any]:
     for name in ("config", "distro"):
         if values[name]:
             arguments += [f"--{name}", values[name]]
+    waits = [{"autostart": False}] if values["autostart"].lower() in ("false", "0") else []
     if Node is not None:
         node = Node(
             executable=values["python"],
             arguments=arguments,
             name="cortex_bridge",
             namespace=values["namespace"],
-            parameters=[values["params_file"]] if values["params_file"] else [],
+            parameters=[*([values["params_file"]] if values["params_file"] else []), *waits],
             output="screen",
         )
         return [node]
     if values["namespace"]:
         arguments += ["--namespace", values["namespace"]]
-    if values["params_file"]:
-        arguments += ["--ros-args", "--params-file", values["params_file"]]
+    ros = ["--params-file", values["params_file"]] if values["params_file"] else []
+    ros += ["-p", "autostart:=false"] if waits else []
+    arguments += ["--ros-args", *ros] if ros else []
     return [ExecuteProcess(cmd=[values["python"], *arguments], name="cortex_bridge", output="screen")]
 
 

@@ -145,6 +145,12 @@ def _add_fly(commands: _Commands) -> None:
         metavar="NAME",
         help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
     )
+    fly.add_argument(
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="--policy: record the flight (.h5), or film it (.webp, .gif)",
+    )
     fly.set_defaults(command=_fly)
 
 
@@ -157,6 +163,13 @@ def _add_up(commands: _Commands) -> None:
         default="auto",
         metavar="HOW",
         help="native, web, none, or a .rrd file; auto: native where there is a display, else web",
+    )
+    up.add_argument(
+        "--web",
+        action="store_const",
+        dest="viewer",
+        const="web",
+        help="as --viewer web: a page with the viewer, and buttons that pause, step and reset the run",
     )
     up.set_defaults(command=_up)
 
@@ -237,13 +250,15 @@ def _add_view(commands: _Commands) -> None:
 
 def _add_gallery(commands: _Commands) -> None:
     gallery = commands.add_parser(
-        "gallery", help="draw every sensor, pixel preset, lens and scene on one page"
+        "gallery", help="draw every sensor, pixel preset, lens and scene, and films, on one page"
     )
     gallery.add_argument(
         "--out", type=Path, default=Path("gallery.html"), metavar="HTML", help="default: gallery.html"
     )
     gallery.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    gallery.add_argument("--only", metavar="SECTION", help="sensors, pixels, lenses or scenes (default: all)")
+    gallery.add_argument(
+        "--only", metavar="SECTION", help="sensors, pixels, lenses, scenes or flights (default: all)"
+    )
     gallery.set_defaults(command=_gallery)
 
 
@@ -339,6 +354,8 @@ def _serve(arguments: argparse.Namespace) -> int:
 def _fly(arguments: argparse.Namespace) -> int:
     if arguments.policy is not None:
         return learn.fly_policy(arguments, _overrides(arguments))
+    if arguments.save is not None:
+        raise ValueError("--save goes with --policy; `neurosim serve --record DIR` records other flights")
     from neurosim_core.config import load_config
     from neurosim_core.live.controller import fly
 

@@ -92,13 +92,16 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
     if kind == "extra_forbidden":
         owner = _model_of(_follow(model, loc[:-1])[0])
         known = sorted(owner.model_fields) if owner else []
-        return f"{shown}: unknown key; {suggestion(str(loc[-1]), known)}known: {', '.join(known)}"
+        hint = suggestion(str(loc[-1]), known) or _deeper(owner, str(loc[-1]))
+        return f"{shown}: unknown key; {hint}known: {', '.join(known)}"
     if kind == "invalid_key":
         return _unreadable_key(_follow(model, loc[:-1]), value)
     if kind == "missing":
         return f"{shown}: required, and not given"
     if kind == "union_tag_not_found":
-        return f"{shown}.kind: required, and not given"
+        sensor = loc[0] == "sensors" and len(loc) == 2
+        hint = f" (there is no sensor {loc[1]!r}; a kind makes one)" if sensor else ""
+        return f"{shown}.kind: required, and not given{hint}"
     if kind == "union_tag_invalid":
         context = item["ctx"]
         own = "; one of your own is found once its module is imported, or installed as a plugin"
@@ -121,6 +124,15 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
         got += f"; if these are degrees, write {math.radians(value):.6g}"
     reason = item["msg"].partition(", unable to")[0].partition(", got")[0]
     return f"{shown}: {reason}{got}" if shown else f"{reason}{got}"
+
+
+def _deeper(owner: type[BaseModel] | None, key: str) -> str:
+    """Return "did you mean ...? " for a key that belongs one level deeper; nothing if it does not."""
+    for name, field in owner.model_fields.items() if owner else ():
+        groups = [choice for choice in _alternatives(field.annotation) if _is_model(choice)]
+        if any(key in group.model_fields for group in groups):
+            return f"did you mean '{name}.{key}'? "
+    return ""
 
 
 def _unreadable_key(found: tuple[Any, list[str]], key: Any) -> str:

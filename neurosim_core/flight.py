@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,8 @@ from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.rollout import run_model, warm_flight
 from neurosim_core.sim.state import make_state
 from neurosim_core.vehicle import DynamicsError
+from neurosim_core.view.film import SUFFIXES as FILMS
+from neurosim_core.view.film import save_film
 from neurosim_core.view.overview import FlightSummary, Track
 from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
@@ -217,6 +219,28 @@ def header_of(model: Model, config: SimulationConfig | None = None) -> Recording
         path_stamp_ns=stamps,
         path_position=model.path.evaluate(stamps).position,
     )
+
+
+@contextlib.contextmanager
+def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]:
+    """Give what takes the packets of a flight, and write them to a file at the end.
+
+    Args:
+        file: A recording (.h5), or a film of it (.webp, .gif).
+        model: What is flown.
+
+    Raises:
+        ValueError: The file is neither, or a film has nothing to show.
+        OSError: The file cannot be written.
+    """
+    if file.suffix not in (".h5", *FILMS):
+        raise ValueError(f"a flight is saved to a file that ends in .h5, {' or '.join(FILMS)}, got {file}")
+    with tempfile.TemporaryDirectory() as folder:
+        recording = file if file.suffix == ".h5" else Path(folder) / "flight.h5"
+        with RecordingWriter(recording, header_of(model)) as writer:
+            yield writer.write
+        if recording != file:
+            save_film(recording, file)
 
 
 @contextlib.contextmanager

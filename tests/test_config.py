@@ -133,7 +133,12 @@ def test_parameters_are_explained_as_they_are_written(vehicle: dict[str, Any], s
         ),
         (
             "sensors: {events: {kind: event_camera}, event: {lens: {width: 9}}}",
-            "sensors.event.kind: required, and not given; did you mean 'events'?",
+            "sensors.event.kind: required, and not given (there is no sensor 'event'; a kind makes one); "
+            "did you mean 'events'?",
+        ),
+        (
+            "sensors: {e: {kind: event_camera, horizontal_fov_rad: 1.2}}",
+            "sensors.e.horizontal_fov_rad: unknown key; did you mean 'lens.horizontal_fov_rad'? known:",
         ),
         (
             "vehicle: {wind_m_s: [3, 0, 0]}",

@@ -11,7 +11,7 @@ import struct
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rosbags.interfaces import Nodetype, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.interfaces import Qos as BagQos
@@ -91,11 +91,9 @@ class BagBackend:
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
-    ) -> BagSubscription:
-        """Subscribe to a topic on which nothing will come."""
-        check_name(topic)
-        check_type(type_name, self.distro)
-        return BagSubscription()
+    ) -> NoReturn:
+        """There are no subscriptions: nobody publishes."""
+        raise BackendError(f"{topic}: nobody publishes into a bag")
 
     def service(self, name: str, type_name: str, callback: Serve) -> None:
         """There are no services: nobody could ask."""
@@ -156,16 +154,6 @@ class BagPublisher:
     def close(self) -> None:
         """Record no more; what was recorded stays."""
         self._open = False
-
-
-class BagSubscription:
-    """Receives nothing."""
-
-    publisher_count = 0
-    lost_count = 0
-
-    def close(self) -> None:
-        """Receive nothing any more either."""
 
 
 class _BagTime:

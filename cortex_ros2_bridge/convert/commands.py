@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from cortex import messages
 from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
-from cortex_ros2_bridge.convert.records import record, vector
-from cortex_ros2_bridge.convert.registry import command, request
+from cortex_ros2_bridge.convert.records import header, pose_of, quaternion, record, vector
+from cortex_ros2_bridge.convert.registry import command, recorded, request
+from cortex_ros2_bridge.convert.state import rotor_speeds
 
 DEFAULT_MAX_THRUST_N = 50.13
 """Thrust of an AttitudeTarget with thrust 1 [N], if neither an option nor the simulator says otherwise.
@@ -166,6 +167,38 @@ def trajectory(message: Any, context: Context) -> messages.PoseCommand:
     return _pose_command(message, first.translation, first.rotation, context)
 
 
+recorded(messages.MotorCommand, "actuator_msgs/Actuators", "actuators")(rotor_speeds)
+
+
+@recorded(messages.AttitudeCommand, "mavros_msgs/AttitudeTarget", "attitude_target", "max_thrust_n")
+def recorded_attitude(message: messages.AttitudeCommand, context: Context) -> Any:
+    """Convert to mavros_msgs/AttitudeTarget; more thrust than the vehicle has is all of it."""
+    return _target(message, sum(_IGNORE_RATES), message.orientation, np.zeros(3), context)
+
+
+@recorded(messages.RateThrustCommand, "mavros_msgs/AttitudeTarget", "attitude_target", "max_thrust_n")
+def recorded_rates(message: messages.RateThrustCommand, context: Context) -> Any:
+    """Convert to mavros_msgs/AttitudeTarget, likewise."""
+    return _target(message, _IGNORE_ATTITUDE, np.array([0.0, 0.0, 0.0, 1.0]), message.body_rate, context)
+
+
+@recorded(messages.VelocityCommand, "geometry_msgs/TwistStamped", "command_velocity")
+def recorded_velocity(message: messages.VelocityCommand, context: Context) -> Any:
+    """Convert to geometry_msgs/TwistStamped in the map frame."""
+    turn = vector((0.0, 0.0, message.yaw_rate_rad_s))
+    twist = record("geometry_msgs/msg/Twist")(vector(message.velocity), turn)
+    head = header(message.stamp_ns, frames.WORLD, context)
+    return record("geometry_msgs/msg/TwistStamped")(head, twist)
+
+
+@recorded(messages.PoseCommand, "geometry_msgs/PoseStamped", "command_pose")
+def recorded_pose(message: messages.PoseCommand, context: Context) -> Any:
+    """Convert to geometry_msgs/PoseStamped in the map frame, level."""
+    half = 0.5 * message.yaw_rad
+    place = pose_of(message.position, (0.0, 0.0, math.sin(half), math.cos(half)))
+    return record("geometry_msgs/msg/PoseStamped")(header(message.stamp_ns, frames.WORLD, context), place)
+
+
 @request(messages.Reset, "std_msgs/Empty")
 def reset_empty(message: Any, context: Context) -> messages.Reset:
     """Convert std_msgs/Empty to a reset to what is configured."""
@@ -238,6 +271,16 @@ def max_thrust_n(context: Context) -> float:
     if chosen is None:
         chosen = context.max_thrust_n
     return DEFAULT_MAX_THRUST_N if chosen is None else float(chosen)
+
+
+def _target(message: Any, mask: int, orientation: Any, rate: Any, context: Context) -> Any:
+    return record("mavros_msgs/msg/AttitudeTarget")(
+        header(message.stamp_ns, context.frames.body_of(context.vehicle), context),
+        mask,
+        quaternion(orientation),
+        vector(rate),
+        min(message.thrust_n / max_thrust_n(context), 1.0),
+    )
 
 
 def _check_mask(mask: int) -> None:

@@ -46,8 +46,9 @@ FRAMES = Qos(depth=10)
 """Few large messages."""
 NEWEST = Qos(depth=1)
 LATCHED = Qos(durability="transient_local", depth=1)
-Direction = Literal["out", "in", "call"]
-"""out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+Direction = Literal["out", "in", "call", "record"]
+"""out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service;
+record: commands in Cortex go into bags, as the messages of ROS that would give them."""
 _EVENT_PACKET = "event_camera_msgs/msg/EventPacket"
 _EVENT_FIELDS = frozenset(field.name for field in fields(messages.Events))
 """What events with more than that, such as their truth, have too."""
@@ -87,6 +88,17 @@ def standard(
 
     def register(function: F) -> F:
         _add_rule(kind, ros_type, "out", name, qos, _encoded(function), default, options)
+        return function
+
+    return register
+
+
+def recorded(kind: type[Any], ros_type: str, name: str, *options: str) -> Callable[[F], F]:
+    """Register a conversion of commands for bags, as `standard`; `name` is below {base}."""
+
+    def register(function: F) -> F:
+        qos = NEWEST
+        _add_rule(kind, ros_type, "record", f"{{base}}/{name}", qos, _encoded(function), True, options)
         return function
 
     return register

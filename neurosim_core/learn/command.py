@@ -1,4 +1,4 @@
-"""The commands `neurosim learn` and `neurosim deploy`."""
+"""The commands `neurosim learn`, `neurosim deploy` and `neurosim predict`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,20 @@ if TYPE_CHECKING:
 
 
 def add_parsers(commands: _Commands) -> None:
-    """Add both commands."""
+    """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, hover-paper, depth, or `eval`")
+    learn.add_argument("what", metavar="TASK", help="hover, hover-paper, depth, flow, pretrain, or `eval`")
     learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
     learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
     learn.add_argument(
         "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
     )
-    learn.add_argument("--worlds", type=int, metavar="N", help="worlds of the student, or of `eval`")
+    learn.add_argument(
+        "--worlds",
+        type=int,
+        metavar="N",
+        help="worlds of the student, of `eval`, or to learn depth or flow from",
+    )
     learn.add_argument(
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
@@ -38,13 +43,15 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
-    learn.add_argument("--data", type=Path, metavar="DIR", help="depth: a data set to learn from")
-    learn.add_argument(
-        "--live", type=int, default=0, metavar="N", help="depth: or processes that fly meanwhile"
+    dense = learn.add_argument_group("depth, flow, pretrain")
+    dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
+    dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
+    dense.add_argument("--test", type=Path, metavar="DIR", help="a data set to test on")
+    dense.add_argument("--minutes", type=float, default=3.0, metavar="M", help="how long (default: 3)")
+    dense.add_argument("--size", type=int, default=48, metavar="PX", help="of flights (default: 48)")
+    dense.add_argument(
+        "--backbone", metavar="FILE", help="begin with the weights of another network, such as pretrain.pt"
     )
-    learn.add_argument("--test", type=Path, metavar="DIR", help="depth: a data set to test on")
-    learn.add_argument("--minutes", type=float, default=3.0, metavar="M", help="depth: how long (default: 3)")
-    learn.add_argument("--size", type=int, default=48, metavar="PX", help="depth: of flights (default: 48)")
     learn.set_defaults(command=_learn)
     deploy = commands.add_parser(
         "deploy", help="fly a simulator or a vehicle by a trained policy, over Cortex"
@@ -59,14 +66,32 @@ def add_parsers(commands: _Commands) -> None:
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
+    predict = commands.add_parser(
+        "predict", help="tell depth or flow from the events of a running simulator, over Cortex"
+    )
+    predict.add_argument("network", type=Path, help="depth.pt or flow.pt of `neurosim learn`")
+    predict.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
+    predict.add_argument("--events", default="events", metavar="NAME", help="its camera (default: events)")
+    predict.add_argument("--device", default="cpu", help="of the network: cpu, cuda:0, ... (default: cpu)")
+    predict.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    predict.set_defaults(command=_predict)
+
+
+def _predict(arguments: argparse.Namespace) -> int:
+    need("torch")
+    from neurosim_core.learn.predict import predict
+
+    names = {"vehicle": arguments.vehicle, "events": arguments.events}
+    predict(arguments.network, **names, device=arguments.device, duration_s=arguments.duration)
+    return 0
 
 
 def _learn(arguments: argparse.Namespace) -> int:
     need("torch")
     if arguments.what == "eval":
         return _evaluate(arguments)
-    if arguments.what == "depth":
-        return _learn_depth(arguments)
+    if arguments.what in ("depth", "flow", "pretrain"):
+        return _learn_dense(arguments)
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
     from neurosim_core.learn.train import default_config, train
@@ -90,22 +115,23 @@ def _learn(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _learn_depth(arguments: argparse.Namespace) -> int:
+def _learn_dense(arguments: argparse.Namespace) -> int:
     import torch
 
-    from neurosim_core.learn.depth_train import DepthConfig, train_depth
+    from neurosim_core.learn.dense_train import DenseConfig, train_dense
 
-    device = arguments.device or "auto"
+    device, task = arguments.device or "auto", arguments.what
     if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    config = DepthConfig(
-        device=device, seed=arguments.seed, minutes=arguments.minutes, size_px=arguments.size
-    )
-    folder = arguments.out or Path("runs") / "depth"
-    errors = train_depth(folder, config, data=arguments.data, live=arguments.live, test=arguments.test)
-    for name, error in errors.items():
+        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    config = DenseConfig(
+        task=task, device=device, seed=arguments.seed, minutes=arguments.minutes, size_px=arguments.size,
+        backbone=arguments.backbone,
+    )  # fmt: skip
+    folder = arguments.out or Path("runs") / task
+    source = {"data": arguments.data, "live": arguments.live, "worlds": arguments.worlds or 0}
+    for name, error in train_dense(folder, config, **source, test=arguments.test).items():
         print(f"{name}: {error}")
-    print(f"wrote {folder}/depth.pt and depth.json")
+    print(f"wrote {folder}/{task}.pt and {task}.json")
     return 0
 
 
@@ -141,6 +167,7 @@ def fly_policy(arguments: argparse.Namespace, overrides: Mapping[str, Any]) -> i
         duration_s=arguments.duration or 6.0,
         seed=arguments.seed or 0,
         overrides=given,
+        save=arguments.save,
     )
     return 0 if speed_m_s < float("inf") else 1
 

@@ -1,93 +1,51 @@
-"""Depth from events: a U-Net with memory, its loss, and the metrics of the field.
+"""Depth from events: the loss and the metrics of the field.
 
 References: Hidalgo-Carrio, Gehrig, Scaramuzza (2020), Learning Monocular Dense Depth from Events, for the
-recurrent U-Net, the multi-scale gradient loss and the cut-off distances; Eigen, Puhrsch, Fergus (2014), for
-the scale-invariant loss and the metrics; Ballas, Yao, Pal, Courville (2016), for the convolutional GRU.
+multi-scale gradient loss and the cut-off distances; Eigen, Puhrsch, Fergus (2014), for the scale-invariant
+loss and the metrics.
 """
 
 from __future__ import annotations
 
-import itertools
-from typing import NamedTuple
+import math
+from typing import ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 DEPTH_MAX_M = 80.0
 """What is farther away is no target."""
 CUTOFFS_M = (10.0, 20.0, 30.0)
 """Mean errors are given for what is nearer than these."""
-_STEP = 8
-"""Heights and widths are filled up to multiples of this: the network halves them three times."""
 _VARIANCE_SHARE = 0.5
 _GRADIENT_SHARE = 0.25
 _SCALES = (1, 2, 4, 8)
 
-Memory = tuple[Tensor, ...]
 
+class DepthHead:
+    """The logarithm of planar depth [log m] at the end of a window; targets are depth [m]."""
 
-class ConvGru(nn.Module):
-    """A gated recurrent unit whose products are convolutions."""
+    field: ClassVar[str] = "depth"
+    start: ClassVar[tuple[float, ...]] = (math.log(2.0),)
+    mirrored: ClassVar[tuple[float, ...]] = (1.0,)
+    ahead: ClassVar[int] = 0
 
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.gates = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1)
-        self.candidate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+    def target(self, value: Tensor) -> Tensor:
+        """See `Head.target`."""
+        return value[..., None, :, :]
 
-    def forward(self, x: Tensor, memory: Tensor) -> Tensor:
-        """Return the memory after an input, both of shape [B, C, H, W]."""
-        reset, update = torch.sigmoid(self.gates(torch.cat([x, memory], 1))).chunk(2, 1)
-        candidate = torch.tanh(self.candidate(torch.cat([x, reset * memory], 1)))
-        return torch.lerp(memory, candidate, update)
+    def loss(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """See `depth_loss`."""
+        return depth_loss(predicted, target)
 
+    def constant(self, targets: Tensor) -> Tensor:
+        """Return the mean of log depth of each pixel."""
+        known = _known(targets)
+        return torch.where(known, targets, 1.0).log().sum(0) / known.sum(0).clamp(min=1)
 
-def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, 1), nn.GroupNorm(4, outputs), nn.SiLU())
-
-
-class DepthNet(nn.Module):
-    """Predicts the logarithm of depth from voxels of events, window after window.
-
-    Args:
-        bins: Channels of a voxel.
-        channels: Of the finest level; coarser ones have 2, 4 and 4 times as many.
-        depth_m: What it predicts at first [m].
-    """
-
-    def __init__(self, bins: int = 5, channels: int = 16, depth_m: float = 2.0) -> None:
-        super().__init__()
-        self.bins, self.channels = bins, channels
-        c = channels
-        sizes = (c, 2 * c, 4 * c, 4 * c)
-        self.head = _block(bins, c)
-        self.down = nn.ModuleList(_block(a, b, 2) for a, b in itertools.pairwise(sizes))
-        self.memories = nn.ModuleList(ConvGru(size) for size in sizes[1:])
-        self.up = nn.ModuleList(_block(a + b, b) for a, b in zip(sizes[:0:-1], sizes[-2::-1], strict=True))
-        self.out = nn.Conv2d(c, 1, 1)
-        nn.init.zeros_(self.out.weight)
-        self.out.bias = nn.Parameter(torch.tensor([depth_m]).log())
-
-    def forward(self, voxel: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
-        """Return log depth [log m], shape [B, H, W], and the memory after the window.
-
-        Args:
-            voxel: Of a window, shape [B, bins, H, W].
-            memory: After the window before; None: there is none.
-        """
-        height, width = voxel.shape[-2:]
-        x = torch.sign(voxel) * torch.log1p(voxel.abs())  # pixels with many events do not drown the others
-        x = functional.pad(x, (0, -width % _STEP, 0, -height % _STEP))
-        levels = [self.head(x)]
-        kept = []
-        for index, (down, unit) in enumerate(zip(self.down, self.memories, strict=True)):
-            x = down(levels[-1])
-            kept.append(unit(x, torch.zeros_like(x) if memory is None else memory[index]))
-            levels.append(kept[-1])
-        x = levels.pop()
-        for up in self.up:
-            x = up(torch.cat([functional.interpolate(x, scale_factor=2.0), levels.pop()], 1))
-        return self.out(x)[:, 0, :height, :width], tuple(kept)
+    def errors(self) -> DepthErrorSums:
+        """See `Head.errors`."""
+        return DepthErrorSums()
 
 
 def depth_loss(log_depth: Tensor, depth_m: Tensor) -> Tensor:
@@ -140,7 +98,7 @@ class DepthErrors(NamedTuple):
         )
 
 
-class ErrorSums:
+class DepthErrorSums:
     """Adds up the errors of pictures."""
 
     def __init__(self) -> None:
@@ -149,8 +107,8 @@ class ErrorSums:
         self._si_log: list[float] = []
         self._count = 0
 
-    def add(self, log_depth: Tensor, depth_m: Tensor) -> None:
-        """Add pictures, shape [..., H, W]."""
+    def add(self, log_depth: Tensor, depth_m: Tensor, seen: Tensor | None = None) -> None:
+        """Add pictures, shape [..., H, W]; what was seen does not count."""
         for prediction, truth in zip(
             log_depth.reshape(-1, *log_depth.shape[-2:]),
             depth_m.reshape(-1, *depth_m.shape[-2:]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +18,8 @@ CARD = "neurosim"
 """Key of the metadata of a file: JSON that says what the policy was trained for."""
 CAMERA = "events"
 """Name of the event camera in `pilot_settings`."""
+_COLOUR = {"kind": "rgb", "rate_hz": 20.0, "lens": {"width": 320, "height": 240, "horizontal_fov_rad": 1.5}}
+"""What a flight is filmed with."""
 
 
 class Command(NamedTuple):
@@ -181,6 +184,7 @@ def fly_policy(
     duration_s: float = 6.0,
     seed: int = 0,
     overrides: Mapping[str, Any] | None = None,
+    save: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> float:
     """Throw a vehicle into the default apartment, and let a policy fly it, in this process.
@@ -190,6 +194,8 @@ def fly_policy(
         duration_s: For how long [s].
         seed: Of the throw: 1 m/s in some direction.
         overrides: Further settings by dotted key, such as {"scene.seed": 3}.
+        save: Record the flight to this file, with a colour camera beside what the policy sees;
+            where it ends in .webp or .gif, a film of it.
         say: Told how it goes, line by line.
 
     Returns:
@@ -197,18 +203,39 @@ def fly_policy(
     """
     from neurosim_core import sim
     from neurosim_core.config import load_config
-    from neurosim_core.packets import Events, Odometry
+    from neurosim_core.flight import saved_flight
 
     pilot = Pilot(shipped_policy(policy))
     settings = {**pilot_settings(pilot.card), "duration_s": duration_s}
-    config = load_config(settings, overrides=dict(overrides or {}))
-    model = sim.make_model(config)
+    if save is not None:
+        settings["sensors"]["rgb"] = _COLOUR
+    model = sim.make_model(load_config(settings, overrides=dict(overrides or {})))
+    with saved_flight(save, model) if save is not None else contextlib.nullcontext() as write:
+        return _fly(pilot, model, seed=seed, duration_s=duration_s, write=write, say=say)
+
+
+def _fly(
+    pilot: Pilot,
+    model: Any,
+    *,
+    seed: int,
+    duration_s: float,
+    write: Callable[[Any], None] | None,
+    say: Callable[[str], None],
+) -> float:
+    """Throw a vehicle, let a pilot fly it, and return its mean speed at the end, as `fly_policy`."""
+    from neurosim_core import sim
+    from neurosim_core.packets import Events, Odometry
+
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     start = sim.StartState(position=model.free_space.seed_m, velocity=[np.cos(angle), np.sin(angle), 0.0])
     state = sim.make_state(model, start=start)
     packets = sim.start(model, state)
     speeds: list[float] = []
     for step in range(round(duration_s * pilot.card["rate_hz"])):
+        if write is not None:
+            for packet in packets:
+                write(packet)
         odometry = next(p for p in packets if isinstance(p, Odometry))
         found = [p.numpy() for p in packets if isinstance(p, Events)]
         events = found[0] if found else (np.empty(0),) * 4

@@ -295,25 +295,34 @@ class EventSurface:
         self._sums: Any = wp.zeros((0, 0, 0, 0) if is_last else shape, dtype=wp.int32, device=device)
 
     def update(self, events: Any, now_ns: Any) -> None:
-        """Add the events of a step.
+        """Add the events of a step, and show them.
 
         Args:
             events: Of the camera in this step (`sensors.event_worlds.WorldEvents`).
             now_ns: Time of each world at the end of the step [ns], device array of int64, shape [N].
         """
+        self.add(events, now_ns)
+        self.show(now_ns)
+
+    def add(self, events: Any, end_ns: Any) -> None:
+        """Add events of a part of a step that ends at `end_ns`; `show` shows all that were added."""
         dim = (self.array.shape[0], self._lanes)
         where = [events.x, events.y, events.polarity, events.offsets]
         if isinstance(self.config, TimeSurface):
             self._launch(_note_last, dim, [events.t, *where, self._lanes], [self._last])
-            self._launch(_show_last, self.array.shape, [self._tau_us, self._last, now_ns], [self.array])
-            return
-        if isinstance(self.config, LeakySurface):
-            self._launch(_add_leaky, dim, [self._tau_us, events.t, *where, now_ns, self._lanes], [self._sums])
+        elif isinstance(self.config, LeakySurface):
+            self._launch(_add_leaky, dim, [self._tau_us, events.t, *where, end_ns, self._lanes], [self._sums])
         elif isinstance(self.config, Counts):
             self._launch(_add_counts, dim, [*where, self._lanes], [self._sums])
         else:
-            inputs = [events.t, *where, now_ns, self._step_us, self._lanes]
+            inputs = [events.t, *where, end_ns, self._step_us, self._lanes]
             self._launch(_add_voxels, dim, inputs, [self._sums])
+
+    def show(self, now_ns: Any) -> None:
+        """Write the surfaces at the end of a step."""
+        if isinstance(self.config, TimeSurface):
+            self._launch(_show_last, self.array.shape, [self._tau_us, self._last, now_ns], [self.array])
+            return
         planes = (self.array.shape[0] * self.array.shape[1], self.array.shape[2] * self.array.shape[3])
         flat = [self._sums.reshape(planes), self.array.reshape(planes)]
         self._launch(_show_sums, planes, [self._decay], flat)

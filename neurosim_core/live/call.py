@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,7 +45,8 @@ def call(arguments: argparse.Namespace) -> int:
         wide.print(Markdown(describe_status(_status(timeout_s))))
         return 0
     service, request = _request(arguments)
-    reply = _ask(service, request, timeout_s + GRACE_S * isinstance(request, Step))
+    with Node("call") as node:
+        reply = ask(node, service, request, timeout_s + GRACE_S * isinstance(request, Step))
     at = f"{reply.phase} at {reply.stamp_ns / NS_PER_S:g} s"
     if not reply.accepted:
         console.print(f"[red]refused[/] ({at}): {escape(reply.reason)}")
@@ -55,10 +57,10 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
-    """Return KEY=VALUE texts as parameters; values are read as YAML.
+    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text.
 
     Raises:
-        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false nor text.
+        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false, text nor a list.
     """
     values: dict[str, Any] = {}
     for setting in settings:
@@ -69,8 +71,10 @@ def parameters_of(settings: Sequence[str]) -> Parameters:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = None
+        if isinstance(value, list):
+            value = json.dumps(value)
         if not isinstance(value, bool | int | float | str):
-            raise ValueError(f"{key} takes a number, true, false or text, got {text!r}")
+            raise ValueError(f"{key} takes a number, true, false, text or a list, got {text!r}")
         values[key] = value
     return Parameters.of(values)
 
@@ -155,18 +159,28 @@ def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
             return f"/{arguments.what}", Trigger()
 
 
-def _ask(service: str, request: Any, timeout_s: float) -> SimulatorReply:
+def ask(node: Node, service: str, request: Any, timeout_s: float) -> SimulatorReply:
+    """Send a request to the simulator, and return its answer.
+
+    Args:
+        node: Sends it.
+        service: One of `topics.SERVICES`.
+        request: Of the type of the service.
+        timeout_s: How long to wait [s].
+
+    Raises:
+        RuntimeError: There is no simulator, or it does not answer in time.
+    """
     request_type, reply_type = SERVICES[service]
-    with Node("call") as node:
-        try:
-            reply: SimulatorReply = node.client(service, request_type, reply_type).call(request, timeout_s)
-        except ServiceTimeout:
-            raise RuntimeError(
-                f"the simulator has not answered within {timeout_s:g} s, and may still do it; "
-                "--timeout waits longer"
-            ) from None
-        except ServiceUnavailable:
-            raise RuntimeError(no_simulator(timeout_s)) from None
+    try:
+        reply: SimulatorReply = node.client(service, request_type, reply_type).call(request, timeout_s)
+    except ServiceTimeout:
+        raise RuntimeError(
+            f"the simulator has not answered within {timeout_s:g} s, and may still do it; "
+            "--timeout waits longer"
+        ) from None
+    except ServiceUnavailable:
+        raise RuntimeError(no_simulator(timeout_s)) from None
     return reply
 
 

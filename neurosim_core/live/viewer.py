@@ -22,6 +22,7 @@ from rich.console import Console
 from cortex import Node, Subscriber, TypeMismatch, latest
 from cortex.messages import Simulation
 from neurosim_core.config import ConfigError
+from neurosim_core.live.page import ControlPage
 from neurosim_core.live.session import LiveSession, ViewOptions
 from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
@@ -98,15 +99,14 @@ def view(
         if save is not None:
             outlet = FileTarget(save, say)
         else:
-            viewer = stack.enter_context(
-                RerunViewer(web=how == "web", port=port, waiting=lambda: not stop.is_set())
-            )
+            viewer = stack.enter_context(RerunViewer(web=how == "web", waiting=lambda: not stop.is_set()))
             outlet = ViewerTarget(viewer)
-            if how == "web":
-                say(f"open {viewer.page_url}")
-                if open_browser and not _has_no_display():
-                    webbrowser.open(viewer.page_url)
         node = stack.enter_context(Node("viewer"))
+        if how == "web":
+            page = stack.enter_context(ControlPage(node, viewer.page_url, port=port))
+            say(f"open {page.url}")
+            if open_browser and not _has_no_display():
+                webbrowser.open(page.url)
         try:
             status = watch(node, outlet, options, stop=stop, say=say, to_the_end=save is not None)
         except ViewerEnded as error:

@@ -34,6 +34,7 @@ from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan, SweepTiming
 from neurosim_core.settings import Settings, fill_from_preset
 
 NonNegative = Annotated[float, Field(ge=0.0)]
+_RAY = np.complex128  # the four numbers of a ray as one: NumPy moves those three times as fast
 _NEVER = -10.0  # |z| is at most 5.77
 
 
@@ -123,15 +124,17 @@ class LidarConfig(PictureSensorConfig):
 
     def packet(self, picture: NDArray[Any], **header: Any) -> PointCloud:
         """Return the points of a sweep, in the order of time; the picture has x, y, z, intensity."""
-        rows = picture.swapaxes(0, 1).reshape(-1, 4)
-        seen = np.flatnonzero(np.isfinite(rows[:, 0]))
-        ring, t = _rings_and_times(self.scan, round(self.span_s * 1e9))
+        span_ns = round(self.span_s * 1e9)
+        ring, t = _rings_and_times(self.scan, span_ns)
+        in_time = np.ascontiguousarray(picture.view(_RAY)[..., 0].T)
+        seen = np.flatnonzero(np.isfinite(in_time.view(np.float32).reshape(-1, 4)[:, 0]))
+        rows = in_time.ravel().take(seen).view(np.float32).reshape(-1, 4)
         return PointCloud(
-            points=rows[seen, :3],
-            intensity=rows[seen, 3],
-            ring=ring[seen],
-            t=t[seen],
-            start_ns=header["stamp_ns"] - round(self.span_s * 1e9),
+            points=rows[:, :3],
+            intensity=rows[:, 3],
+            ring=ring.take(seen),
+            t=t.take(seen),
+            start_ns=header["stamp_ns"] - span_ns,
             deskewed=self.deskew,
             **header,
         )

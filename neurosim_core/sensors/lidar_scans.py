@@ -36,12 +36,12 @@ class Scan(Settings):
     @property
     def width(self) -> int:
         """Columns."""
-        return int(self.directions().shape[1])
+        return _shape(self)[1]
 
     @property
     def height(self) -> int:
         """Rings."""
-        return int(self.directions().shape[0])
+        return _shape(self)[0]
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""
@@ -192,6 +192,12 @@ def _in_rows(rays: NDArray[Any]) -> NDArray[Any]:
     count = next((count for count in _ROWS if len(rays) % count == 0), 1)
     rows: NDArray[Any] = rays.reshape(-1, count, *rays.shape[1:]).swapaxes(0, 1)
     return rows
+
+
+@functools.lru_cache(maxsize=8)
+def _shape(scan: Scan) -> tuple[int, int]:
+    height, width = scan.directions().shape[:2]
+    return height, width
 
 
 @functools.lru_cache(maxsize=8)

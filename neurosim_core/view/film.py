@@ -63,7 +63,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
             if poses:
                 panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
             frames.append(_beside(panels))
-    options: dict[str, Any] = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
+    options: dict[str, Any] = {"quality": 60} if out.suffix == ".webp" else {}
     frames[0].save(
         out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
     )
@@ -71,7 +71,8 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
 
 def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:
     height, width = picture.shape[:2]
-    return Pillow.fromarray(picture).resize((round(width * _HEIGHT_PX / height), _HEIGHT_PX))
+    kernel = Pillow.Resampling.NEAREST if height < _HEIGHT_PX else Pillow.Resampling.BICUBIC
+    return Pillow.fromarray(picture).resize((round(width * _HEIGHT_PX / height), _HEIGHT_PX), kernel)
 
 
 def _beside(panels: list[Pillow.Image]) -> Pillow.Image:

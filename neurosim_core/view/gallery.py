@@ -1,10 +1,12 @@
-"""`neurosim gallery`: one page of every sensor, pixel preset, lens and scene, each beside its settings."""
+"""`neurosim gallery`: sensors, pixel presets, lenses, scenes and films, with their settings, on one page."""
 
 from __future__ import annotations
 
 import base64
 import html
+import importlib.util
 import io
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,13 @@ from numpy.typing import NDArray
 
 from neurosim_core import registry
 from neurosim_core.config import load_config
+from neurosim_core.flight import saved_flight
+from neurosim_core.learn.pilot import fly_policy
 from neurosim_core.packets import Events, Packet, PointCloud, as_numpy, join_events, schema_of
 from neurosim_core.sensors.event_presets import PRESETS
-from neurosim_core.sim.rollout import run
+from neurosim_core.sim.model import make_model
+from neurosim_core.sim.rollout import run, run_model
+from neurosim_core.sim.state import make_state
 from neurosim_core.view.pictures import color_picture, event_picture, picture_of
 
 _SIZE = {"width": 240, "height": 180}
@@ -50,9 +56,11 @@ _SCENES = (
     {"rooms": 2, "seed": 5},
 )
 _NUMBERS_MAX = 6
+_FILM_S = 4.0
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:75rem;
 padding:0 1rem;color:#222}
 h1,h2{font-weight:300}section{display:grid;grid-template-columns:repeat(auto-fill,minmax(16rem,1fr));gap:1.2rem}
+figure:has(img[src^='data:image/webp']){grid-column:1 / -1}
 figure{margin:0;border:1px solid #ddd;border-radius:4px;overflow:hidden}figure img{width:100%;display:block}
 figcaption{padding:.4rem .7rem;font-weight:600}pre{margin:0;padding:.5rem .7rem;background:#f5f5f5;
 font-size:12px;white-space:pre-wrap;overflow-wrap:anywhere}
@@ -76,6 +84,7 @@ def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -
         "pixels": lambda: _show_rig(_pixels(), device),
         "lenses": lambda: _show_rig(_views(), device),
         "scenes": lambda: [_show_scene(scene, device) for scene in _SCENES],
+        "flights": lambda: _films(device),
     }
     if only is not None and only not in made:
         raise ValueError(f"unknown section {only!r}, known: {', '.join(made)}")
@@ -85,7 +94,9 @@ def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -
         for title, items in sections.items()
     )
     page = f"<!doctype html><meta charset=utf-8><title>Neurosim</title><style>{_STYLE}</style>"
-    intro = "<h1>Neurosim: gallery</h1><p>Each picture is beside the settings that it takes.</p>"
+    intro = (
+        "<h1>Neurosim: gallery</h1><p>Each picture is above the settings or the commands that make it.</p>"
+    )
     path.write_text(f"{page}{intro}{body}", encoding="utf-8")
 
 
@@ -117,6 +128,29 @@ def _show_scene(scene: Mapping[str, Any], device: str) -> str:
     return _figure(title, {"scene": scene}, list(run(load_config(given))))
 
 
+def _films(device: str) -> list[str]:
+    """Return figures of films: the default flight, and a throw that the policy of the package ends."""
+    shown = []
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.webp"
+        model = make_model(load_config({"duration_s": _FILM_S, "device": device}))
+        with saved_flight(film, model) as write:
+            for packet in run_model(model, make_state(model)):
+                write(packet)
+        command = f"neurosim run --duration {_FILM_S:g} && neurosim view flight --save film.webp"
+        shown.append(
+            _framed("the default flight", _image("the default flight", film.read_bytes(), "webp"), command)
+        )
+        if importlib.util.find_spec("onnxruntime") is not None:
+            overrides = {"device": device}
+            fly_policy("hover", duration_s=_FILM_S, overrides=overrides, save=film, say=lambda line: None)
+            command = f"neurosim fly --policy hover --duration {_FILM_S:g} --save film.webp"
+            shown.append(
+                _framed("hover, learnt from events", _image("hover", film.read_bytes(), "webp"), command)
+            )
+    return shown
+
+
 def _show_rig(rig: Mapping[str, Any], device: str) -> list[str]:
     """Move a rig for a moment; return a figure for each sensor, those with pictures first."""
     packets = list(run(load_config({**_BASE, "sensors": rig, "device": device})))
@@ -136,9 +170,16 @@ def _figure(title: str, settings: Mapping[str, Any], packets: list[Packet]) -> s
 
         file = io.BytesIO()
         Image.fromarray(drawn).save(file, format="png")
-        shown = (
-            f'<img alt="{title}" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
-        )
+        shown = _image(title, file.getvalue(), "png")
+    return _framed(title, shown, text)
+
+
+def _image(title: str, content: bytes, kind: str) -> str:
+    """Return a picture that is inside of the page."""
+    return f'<img alt="{title}" src="data:image/{kind};base64,{base64.b64encode(content).decode()}">'
+
+
+def _framed(title: str, shown: str, text: str) -> str:
     return f"<figure>{shown}<figcaption>{title}</figcaption><pre>{html.escape(text.rstrip())}</pre></figure>"
 
 

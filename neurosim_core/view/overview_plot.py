@@ -20,13 +20,13 @@ from neurosim_core.view.plan import cut_plan
 from neurosim_core.view.rerun_layout import PICTURES, title
 
 WIDTH_PX, HEIGHT_PX = 1600, 900
-"""Size of the picture for up to four panels [px]; each further row of two makes it higher."""
+"""Size of the picture for up to four panels [px]; each further row of three makes it higher."""
 
 _DPI = 100
 _INK = "#1d2530"
 _FAINT = "#6b7682"
 _XYZ = ("#e03131", "#2f9e44", "#1c7ed6", "#f08c00", "#845ef7", "#12b886")
-# Layout in pixels from the top left corner: two columns of panels, then the plan.
+# Layout in pixels from the top left corner: two columns of panels, then the plan; rows of three below.
 _MARGIN = 40
 _TOP = 124
 _PANEL_W, _PANEL_H = 416, 312
@@ -80,12 +80,14 @@ def save_overview(
     strips = _strips(summary, track)
     sensors = sorted([*snapshot.packets, *snapshot.events], key=lambda name: _rank(snapshot, name))
     others = len(sensors) + bool(summary.texts)
-    rows = max(2, -(-(others + -(-len(strips) // _STRIPS_MAX)) // 2))
-    together = -(-len(strips) // max(1, min(2 * rows - others, len(strips) // 2)))
+    more_rows = max(0, -(-(others + -(-len(strips) // _STRIPS_MAX) - 4) // 3))
+    place_count = 4 + 3 * more_rows
+    together = -(-len(strips) // max(1, min(place_count - others, len(strips) // 2)))
     with mpl.rc_context(style):
-        page = _Page(mpl.figure.Figure(dpi=_DPI), HEIGHT_PX + (rows - 2) * _ROW_H)
+        page = _Page(mpl.figure.Figure(dpi=_DPI), HEIGHT_PX + more_rows * _ROW_H)
         _draw_title(page, scene, track, summary.event_count, real_time_factor)
-        places = iter([(x, _TOP + row * _ROW_H) for row in range(rows) for x in _COLUMN_X])
+        columns = [_COLUMN_X] * 2 + [(*_COLUMN_X, _PLAN_X)] * more_rows
+        places = iter([(x, _TOP + row * _ROW_H) for row, beside in enumerate(columns) for x in beside])
         for name in sensors:
             _draw_sensor(page, next(places), name, snapshot)
         if summary.texts:
@@ -282,7 +284,7 @@ def _draw_strips(
 def _draw_plan(page: _Page, scene: Scene, track: Track, snapshot: Snapshot) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    width, height = WIDTH_PX - _PLAN_X - _MARGIN, page.height_px - _TOP - 84
+    width, height = WIDTH_PX - _PLAN_X - _MARGIN, HEIGHT_PX - _TOP - 84
     bounds = scene.bounds_m
     height_m = float(np.median(track.position[:, 2])) if len(track.position) else float(bounds[:, 2].mean())
     plan = cut_plan(scene, height_m=height_m)
@@ -372,12 +374,11 @@ def _draw_path(page: _Page, axes: Any, track: Track, snapshot: Snapshot, place: 
             zorder=8,
             bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
         )
-    bottom = page.height_px
-    bar = page.axes(WIDTH_PX - _MARGIN - 180, bottom - 62, 180, 10)
+    bar = page.axes(WIDTH_PX - _MARGIN - 180, HEIGHT_PX - 62, 180, 10)
     page.figure.colorbar(line, cax=bar, orientation="horizontal").outline.set_visible(False)
     bar.tick_params(length=3, labelsize=9.5, pad=2)
     options = {"fontsize": 10.5, "color": _FAINT, "va": "center"}
-    page.text(WIDTH_PX - _MARGIN - 190, bottom - 57, "speed [m/s]", ha="right", **options)
+    page.text(WIDTH_PX - _MARGIN - 190, HEIGHT_PX - 57, "speed [m/s]", ha="right", **options)
 
 
 def _draw_scale_bar(page: _Page, axes: Any, size_m: float) -> None:
@@ -386,9 +387,9 @@ def _draw_scale_bar(page: _Page, axes: Any, size_m: float) -> None:
     length_m = max((m for m in lengths if m <= size_m / 5), default=lengths[0])
     axes.apply_aspect()
     shown = axes.get_window_extent().width / (axes.get_xlim()[1] - axes.get_xlim()[0])  # pixels a metre
-    bar = page.axes(_PLAN_X, page.height_px - 60, length_m * shown, 6)
+    bar = page.axes(_PLAN_X, HEIGHT_PX - 60, length_m * shown, 6)
     bar.set_xticks([])
     bar.set_yticks([])
     bar.set_facecolor(_INK)
     options = {"fontsize": 10.5, "color": _FAINT, "va": "center"}
-    page.text(_PLAN_X + length_m * shown + 10, page.height_px - 57, f"{length_m:g} m", **options)
+    page.text(_PLAN_X + length_m * shown + 10, HEIGHT_PX - 57, f"{length_m:g} m", **options)

@@ -77,16 +77,16 @@ def color_picture(kind: PictureKind, data: NDArray[Any]) -> NDArray[np.uint8]:
     """Return pixels as sRGB, uint8 [H, W, 3]; for all kinds but depth and values."""
     if kind == "segmentation":
         hue = (np.maximum(data, 0) * 0.618034) % 1.0  # steps of the golden ratio keep neighbours apart
-        return _on_nothing(_hsv(hue, 0.65, 0.85 - 0.25 * (np.maximum(data, 0) % 3 == 1)), data >= 0)
+        value = np.where(data == 0, 0.9, 0.85 - 0.25 * (np.maximum(data, 0) % 3 == 1))  # 0: mostly none
+        return _on_nothing(_hsv(hue, 0.65 * (data != 0), value), data >= 0)
     if kind == "normals":
         return _on_nothing(127.5 * (data + 1.0), np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1))
     if kind == "flow":
         known = np.isfinite(data).all(axis=-1)
         x, y = np.where(known[..., None], data, 0.0).astype(np.float64).transpose(2, 0, 1)
         length = np.hypot(x, y)
-        return _on_nothing(
-            _hsv(np.arctan2(y, x) / (2.0 * np.pi), length / max(1e-9, length.max()), 1.0), known
-        )
+        long = max(1e-9, float(np.quantile(length, 0.98)))  # a few near pixels would leave the others white
+        return _on_nothing(_hsv(np.arctan2(y, x) / (2.0 * np.pi), np.minimum(length / long, 1.0), 1.0), known)
     return data if data.ndim == 3 else np.repeat(data[..., None], 3, axis=-1)
 
 

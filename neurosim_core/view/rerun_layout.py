@@ -51,7 +51,7 @@ def body(vehicle: str) -> str:
 def picture_panel(vehicle: str, sensor: str, kind: str = "") -> Panel:
     """Return the panel of a camera; `kind` is what it shows, a key of `PICTURES`, if that is known."""
     rank = PICTURES.index(kind) if kind else len(PICTURES)
-    return Panel("picture", sensor, f"{body(vehicle)}/{sensor}", ("$origin/image",), rank)
+    return Panel("picture", sensor, f"{body(vehicle)}/{sensor}", ("$origin/image", "$origin/arrows"), rank)
 
 
 def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *, live: bool) -> list[Panel]:
@@ -78,6 +78,8 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
         return [Panel("bars", f"{sensor}: {title(f)}", f"{at}/{f.name}") for f in schema.fields if f.varying]
     if kind == "text":
         return [Panel("text", sensor, at)]
+    if kind == "contact":
+        return [Panel("text", "collisions", f"plots/{vehicle}/collisions")]
     if kind == "delay":
         return [Panel("plot", "link delay [ms]", f"plots/{vehicle}/links", legend=True)]
     if kind == "pose":

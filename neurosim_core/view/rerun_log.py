@@ -10,7 +10,9 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
     world/vehicles/<vehicle>/<sensor>       where the sensor sits; frustum and picture of a camera, points
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
+    world/vehicles/<vehicle>/<sensor>/arrows    flow, on a grid of pixels
     world/collisions/<vehicle>              where it touched the scene
+    plots/<vehicle>/collisions              the same as a list: a click on a line goes to its time
     events/<vehicle>/<sensor>               events of the last 0.1 s as points in x, y and time; not live
     plots/<vehicle>/<sensor>/rate           millions of events a second
     plots/<vehicle>/<sensor>/<field>        numbers, bars and texts; speed, height, rotor speeds of a pose
@@ -33,6 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.clock import NS_PER_S
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
@@ -55,6 +58,7 @@ from neurosim_core.view.rerun_shapes import (
     encode_events,
     encode_picture,
     event_colors,
+    flow_arrows,
 )
 
 _BATCH_NS = 50_000_000
@@ -428,6 +432,9 @@ class RerunLogger:
         if self._image_limit.passes(entity, now_ns):
             self._set_time(packet.stamp_ns)
             self._recording.log(entity, encode_picture(packet, compress=self._compress))
+            kind, data = picture_of(packet)
+            if kind == "flow":
+                self._recording.log(f"{body(vehicle)}/{packet.sensor}/arrows", flow_arrows(data))
 
     def _log_events(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         entity = f"{body(vehicle)}/{packet.sensor}/image"
@@ -456,6 +463,9 @@ class RerunLogger:
         self._set_time(packet.stamp_ns)
         point = self._rr.Points3D([packet.position], colors=[_COLLISION_COLOR], radii=[0.08])
         self._recording.log(f"world/collisions/{vehicle}", point)
+        x, y, z = packet.position
+        text = f"{packet.stamp_ns / NS_PER_S:.3f} s: at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        self._recording.log(f"plots/{vehicle}/collisions", self._rr.TextLog(text, level="WARN"))
 
     def _log_delay(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         link = packet.sensor.removesuffix("_link")

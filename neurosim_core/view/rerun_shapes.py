@@ -20,6 +20,30 @@ from neurosim_core.view.pictures import PALETTE, color_picture, event_classes, p
 from neurosim_core.view.rerun_sdk import import_rerun
 
 _TEXTURE_MAX_PX = 256
+_ARROW_COLOR = (29, 37, 48)
+
+
+def flow_arrows(flow: NDArray[np.float32]) -> Any:
+    """Return flow as arrows on a grid of pixels, the longest of them a step and a half of the grid.
+
+    Args:
+        flow: Shape [H, W, 2]; nan: not known.
+    """
+    step = max(8, flow.shape[1] // 16)
+    rows, columns = np.mgrid[step // 2 : flow.shape[0] : step, step // 2 : flow.shape[1] : step]
+    vectors = flow[rows, columns].reshape(-1, 2)
+    known = np.isfinite(vectors).all(axis=1)
+    vectors = vectors[known]
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=1e-9))
+    origins = np.stack([columns.ravel(), rows.ravel()], axis=1)[known] + 0.5
+    rr = import_rerun()
+    return rr.Arrows2D(
+        vectors=vectors * (1.5 * step / longest),
+        origins=origins,
+        colors=[_ARROW_COLOR],
+        radii=rr.Radius.ui_points(0.75),
+        draw_order=40.0,
+    )
 
 
 def encode_picture(packet: Packet, *, compress: bool = True) -> Any:

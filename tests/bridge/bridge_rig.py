@@ -61,12 +61,12 @@ class Rig:
 
     def reminded(self, topic: str) -> bool:
         """Whether the last message of a latched topic has been repeated for all who came."""
-        feeds = self.bridge._feeds.values()
+        feeds = self.bridge._connections.feeds.values()
         return not any(o._remind_s for f in feeds for o in f._outputs if o.route.ros_topic == topic)
 
     def has_calibration(self, topic: str) -> bool:
         """Whether the calibration that goes with each picture has come to what publishes on a topic."""
-        feeds = self.bridge._feeds.values()
+        feeds = self.bridge._connections.feeds.values()
         outputs = [o for f in feeds for o in f._outputs if o.route.ros_topic == topic]
         return bool(outputs) and all(o._context.camera_info is not None for o in outputs)
 

@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import importlib.util
 import json
+import re
 import sys
 import threading
 import time
@@ -96,6 +97,31 @@ class Peer:
     def has(self, package: str) -> bool:
         """Return whether a ROS package is installed."""
         return importlib.util.find_spec(package) is not None
+
+    def manage(self, node: str, labels: list[str]) -> list[Any]:
+        """Ask a managed node for transitions; return for each whether it was done, and the state then."""
+        kind = _class("lifecycle_msgs/msg/Transition")
+        answers = []
+        for label in labels:
+            (done,) = self.call(
+                f"{node}/change_state", "lifecycle_msgs/srv/ChangeState", transition=kind(label=label)
+            )
+            (state,) = self.call(f"{node}/get_state", "lifecycle_msgs/srv/GetState")
+            answers.append([done, state])
+        return answers
+
+    def transitions(self, node: str = "") -> Any:
+        """Return the transition graph of a managed node; by default of one of rclpy that is made here."""
+        service, kind = "get_transition_graph", "lifecycle_msgs/srv/GetAvailableTransitions"
+        if not node:
+            from rclpy.lifecycle import LifecycleNode
+
+            if not hasattr(self, "managed"):
+                self.managed = LifecycleNode("managed_of_rclpy")
+                self.executor.add_node(self.managed)
+            node = "/managed_of_rclpy"
+        (found,) = self.call(f"{node}/{service}", kind)
+        return sorted(re.findall(r"TransitionDescription\(.*?goal_state=.*?\)\)", found))
 
     def call(self, name: str, type_name: str = "std_srvs/srv/Trigger", **fields: Any) -> Any:
         """Call a service; return the fields of its response, as text where nested."""

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from bridge_rig import rig_of
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
+from runtime_directory import own_directory
 
+from cortex import messages as msg
 from cortex_ros2_bridge.backend.bag import BagBackend, bag_directory, stamp_reader
 from cortex_ros2_bridge.backend.base import BackendError, Qos
 from cortex_ros2_bridge.backend.choose import open_backend
+from cortex_ros2_bridge.bag_file import BagReader, BagWriter
 from cortex_ros2_bridge.typestore import type_hash, typestore
 
 CLOCK = "rosgraph_msgs/msg/Clock"
@@ -198,9 +203,8 @@ def test_a_topic_that_comes_back_goes_on(tmp_path: Path) -> None:
 
 def test_nobody_else_is_there(tmp_path: Path) -> None:
     bag = BagBackend(tmp_path / "bag")
-    subscription = bag.subscription("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), print)
-    assert (subscription.publisher_count, subscription.lost_count) == (0, 0)
-    subscription.close()
+    with pytest.raises(BackendError, match="nobody publishes into a bag"):
+        bag.subscription("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), print)
     assert (
         bag.service("/reset", "std_srvs/srv/Trigger", lambda request, response: pytest.fail("called")) is None
     )
@@ -230,3 +234,62 @@ def test_errors(tmp_path: Path) -> None:
         bag.publisher("/a", STRING, Qos())
     assert bag_directory(Path("a/b.mcap")) == Path("a/b")
     assert bag_directory(Path("a/b.1")) == Path("a/b.1")
+
+
+SPEEDS = np.array([100.0, 200.0, 300.0, 400.0])
+TURN = np.array([0.0, 0.6, 0.0, 0.8])
+THREE = np.array([1.0, -2.0, 3.5])
+COMMANDS: dict[str, Any] = {
+    "motor_speeds": msg.MotorCommand(5_000_000_001, SPEEDS),
+    "attitude": msg.AttitudeCommand(5_000_000_002, 10.0, TURN),
+    "rates": msg.RateThrustCommand(5_000_000_003, 12.5, THREE),
+    "velocity": msg.VelocityCommand(5_000_000_004, THREE, -0.25),
+    "position": msg.PoseCommand(5_000_000_005, THREE, 1.25),
+}
+ROS_TOPICS = {
+    "/drone/actuators": "actuator_msgs/msg/Actuators",
+    "/drone/attitude_target": "mavros_msgs/msg/AttitudeTarget",
+    "/drone/command_velocity": "geometry_msgs/msg/TwistStamped",
+    "/drone/command_pose": "geometry_msgs/msg/PoseStamped",
+}
+
+
+def test_commands_there_and_back(tmp_path: Path) -> None:
+    """As the topics by which ROS would give them, so that a bag that is played flies."""
+    with contextlib.closing(BagWriter(tmp_path / "flight.mcap")) as bag:
+        for mode, command in COMMANDS.items():
+            bag.write(f"/drone/command/{mode}", command)
+        bag.write("/drone/rotor_speeds", msg.RotorSpeeds(5_000_000_006, SPEEDS))
+    with contextlib.closing(BagReader(tmp_path / "flight.mcap")) as found:
+        assert found.commands == ROS_TOPICS
+        assert list(found.messages()) == []
+        read_back = [command for _, command in found.messages(*found.commands)]
+    assert [type(each) for each in read_back] == [type(each) for each in COMMANDS.values()]
+    for before, after in zip(COMMANDS.values(), read_back, strict=True):
+        assert after.stamp_ns == before.stamp_ns
+        for name in {"speed", "thrust_n", "orientation", "body_rate", "velocity", "position"}:
+            if hasattr(before, name):  # a thrust is a float32 in AttitudeTarget
+                assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-6), name
+    assert read_back[3].yaw_rate_rad_s == -0.25
+    assert read_back[4].yaw_rad == pytest.approx(1.25)
+
+
+def test_the_bridge_records_the_commands_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With thrusts as parts of what the simulator says the vehicle has; into a bag only."""
+    simulation = msg.Simulation("", "", ["drone"], "streaming", 100.0, thrust_max_n=[25.0])
+    for settings, opened in (({"backend": "run.mcap"}, True), ({}, False)):
+        with own_directory(monkeypatch), rig_of(settings) as rig:
+            said = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
+            said.publish(simulation)
+            commands = rig.simulator.publisher("/drone/command/rates", msg.RateThrustCommand)
+            rig.opens("/simulation")
+            rig.updates_during()
+            assert ("/drone/attitude_target" in rig.backend.publishers) == opened
+            if not opened:
+                continue
+            with rig.listening(commands, "/drone/attitude_target") as (target,):
+                rig.update_until(lambda: rig.bridge._connections._vehicles["drone"].max_thrust_n == 25.0)
+                commands.publish(COMMANDS["rates"])
+                (told,) = rig.update_until(target.messages)
+        assert (told.type_mask, told.thrust, told.body_rate.y) == (128, 0.5, -2.0)
+        assert told.header.frame_id == "drone/base_link"

@@ -20,6 +20,7 @@ from cortex import Node, message
 from cortex import messages as msg
 from cortex_ros2_bridge import bridge as bridge_module
 from cortex_ros2_bridge import incoming as incoming_module
+from cortex_ros2_bridge import links, neighbours
 from cortex_ros2_bridge import outgoing as outgoing_module
 from cortex_ros2_bridge.backend.base import BackendError, TopicInfo
 from cortex_ros2_bridge.config import ConfigError
@@ -63,7 +64,7 @@ def test_nothing_is_subscribed_to_until_ros_listens():
 def test_code_for_a_type_is_generated_before_its_first_message():
     """With the first message it would hold up all streams, for longer than Cortex keeps events at 10 MHz."""
     store = typestore()
-    for cached in (bridge_module._warm_up.cache_clear, store.cache.clear):
+    for cached in (links._warm_up.cache_clear, store.cache.clear):
         cached()
     with rig_of() as rig:
         rig.simulator.publisher("/drone/rgb", msg.Image)
@@ -494,7 +495,7 @@ def test_every_command_reaches_its_topic():
         rotors, target, twist, twist_stamped, pose = rig.subscribes(*(f"/drone/{t}" for t in topics))
         twist.publisher_count = 1
         rig.update_until(lambda: craft.connected() and state.subscriber_count == 1)
-        rig.update_until(lambda: rig.bridge._vehicles["drone"].now_ns == 1_000_000_000)
+        rig.update_until(lambda: rig.bridge._connections._vehicles["drone"].now_ns == 1_000_000_000)
 
         rotors.put(actuators(1.0, 2.0, 3.0, 4.0, stamp=1_000_000_000))
         command = craft.recv("motor_speeds")
@@ -550,7 +551,7 @@ def test_commands_that_must_not_fly_are_refused_counted_and_reported(caplog):
         (rotors,) = rig.subscribes("/drone/actuators")
         rotors.publisher_count = 1
         rig.update_until(lambda: craft.connected() and state.subscriber_count == 1)
-        rig.update_until(lambda: rig.bridge._vehicles["drone"].now_ns == 10_000_000_000)
+        rig.update_until(lambda: rig.bridge._connections._vehicles["drone"].now_ns == 10_000_000_000)
         reasons = []
         for command in (
             actuators(1.0, stamp=9_400_000_000),
@@ -562,7 +563,7 @@ def test_commands_that_must_not_fly_are_refused_counted_and_reported(caplog):
             b"\x00\x01\x00\x00" + b"\xff" * 64,
         ):
             rotors.put(command)
-            (target,) = rig.bridge._incoming.values()[0]._targets
+            (target,) = rig.bridge._connections.incoming.values()[0]._targets
             reasons.append(target.tally.reason)
         assert rig.tally(ROTORS).refused == rig.tally(ROTORS).received == 7
         rotors.put(actuators(5.0, stamp=9_600_000_000))
@@ -591,7 +592,7 @@ def test_after_a_reset_the_clock_of_the_new_run_counts():
         rotors.publisher_count = 1
         rig.update_until(lambda: craft.connected() and clock.subscriber_count == 1)
         clock.publish(msg.Clock(100_000_000_000, 0))
-        vehicle = rig.bridge._vehicles["drone"]
+        vehicle = rig.bridge._connections._vehicles["drone"]
         rig.update_until(lambda: vehicle.now_ns == 100_000_000_000)
         rotors.put(actuators(1.0, stamp=100_000_000_000))
         state.publish(odometry(0))
@@ -619,7 +620,7 @@ def test_options_of_staleness(options, stamp, passes):
         rotors.publisher_count = 1
         rig.update_until(lambda: craft.connected() and clock.subscriber_count == 1)
         clock.publish(msg.Clock(10_000_000_000, 0))
-        wait_for(lambda: rig.bridge._vehicles["drone"].now_ns)
+        wait_for(lambda: rig.bridge._connections._vehicles["drone"].now_ns)
         rotors.put(actuators(1.0, stamp=stamp))
         assert rig.tally(ROTORS).sent == passes
         if options == {"stamp": "now"}:
@@ -687,7 +688,7 @@ def test_a_command_waits_for_a_simulator_that_is_about_to_listen(monkeypatch):
         (rotors,) = rig.subscribes("/drone/actuators")
         rig.update_until(lambda: early.publisher_count == 1)
         early.close()
-        publisher = rig.bridge._cortex_publishers.values()[0]
+        publisher = rig.bridge._connections._cortex_publishers.values()[0]
         wait_for(lambda: publisher.subscriber_count == 0)
         rotors.put(actuators(1.0))
         rotors.put(actuators(2.0))
@@ -801,13 +802,13 @@ def test_another_bridge_is_said_and_named(monkeypatch, caplog):
             rig.update_until(lambda: "ROS gets all of it twice" in caplog.text)
         assert f"another bridge (bridge, process {os.getpid()} on" in caplog.text
         assert "publishes /drone/gyro and 1 more of our topics too" in caplog.text
-        monkeypatch.setattr(bridge_module, "TWICE_S", 0.0)
+        monkeypatch.setattr(neighbours, "TWICE_S", 0.0)
         rig.update_until(lambda: "another node publishes /drone/gyro" in caplog.text)
 
 
 def test_settings_that_fit_nothing_are_said_after_a_while(monkeypatch, caplog):
     monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
-    monkeypatch.setattr(bridge_module, "UNFIT_S", 0.1)
+    monkeypatch.setattr(neighbours, "UNFIT_S", 0.1)
     with rig_of({"routes": [{"cortex": "/dron/imu", "qos": "sensor_data"}]}) as rig:
         rig.simulator.publisher("/drone/imu", msg.Imu)
         rig.update_until(lambda: "no Cortex topic fits /dron/imu, did you mean /drone/imu?" in caplog.text)
@@ -859,7 +860,7 @@ def test_the_simulator_says_what_full_thrust_is():
         about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0], ranges))
         (target,) = rig.subscribes("/drone/attitude_target")
         rig.update_until(lambda: about.subscriber_count == 1)
-        rig.update_until(lambda: rig.bridge._vehicles["drone"].max_thrust_n == 8.0)
+        rig.update_until(lambda: rig.bridge._connections._vehicles["drone"].max_thrust_n == 8.0)
         rig.update_until(craft.connected)
         target.put(message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5))
         assert craft.recv("rates").thrust_n == 4.0

@@ -118,20 +118,21 @@ def test_the_bridge_with_all_its_arguments(fake_launch):
     assert {name: getattr(options, name) for name in given} == given
     command = commands(run(path, params_file="p.yaml"))["cortex_bridge"]
     assert command[-3:] == ["--ros-args", "--params-file", "p.yaml"]
+    command = commands(run(path, params_file="p.yaml", autostart="false"))["cortex_bridge"]
+    assert command[-5:] == ["--ros-args", "--params-file", "p.yaml", "-p", "autostart:=false"]
 
 
 def test_the_bridge_is_a_node_where_launch_ros_is(fake_launch_ros):
     """So that namespaces, remappings and parameters around it hold for it."""
-    (node,) = run(
-        ROOT / "launch" / "bridge.launch.py", namespace="/sim", distro="humble", params_file="p.yaml"
-    )
+    path = ROOT / "launch" / "bridge.launch.py"
+    (node,) = run(path, namespace="/sim", distro="humble", params_file="p.yaml", autostart="false")
     assert isinstance(node, Node)
     assert node.keywords == {
         "executable": sys.executable,
         "arguments": ["-m", "cortex_ros2_bridge", "--backend", "auto", "--distro", "humble"],
         "name": "cortex_bridge",
         "namespace": "/sim",
-        "parameters": ["p.yaml"],
+        "parameters": ["p.yaml", {"autostart": False}],
         "output": "screen",
     }
 

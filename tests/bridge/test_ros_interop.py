@@ -84,6 +84,11 @@ def ros_node(ros_domain: None) -> Iterator[RosNode]:
     node.end()
 
 
+def skip_services_of_others(bridge: BridgeProcess) -> None:
+    if bridge.backend == "dds" and os.environ.get("RMW_IMPLEMENTATION") != "rmw_cyclonedds_cpp":
+        pytest.skip("services through DDS need RMW_IMPLEMENTATION=rmw_cyclonedds_cpp")
+
+
 @pytest.fixture(params=["dds", "rclpy"])
 def bridge(request: pytest.FixtureRequest, ros_domain: None) -> Iterator[BridgeProcess]:
     """A bridge through DDS, in this Python without ROS; or through rclpy."""
@@ -179,8 +184,7 @@ def test_simulation_interfaces_of_a_real_node(bridge: BridgeProcess, ros_node: R
     package = "simulation_interfaces"
     if not ros_node.do("has", package=package):
         pytest.skip(f"the ROS package {package} is not installed")
-    if bridge.backend == "dds" and os.environ.get("RMW_IMPLEMENTATION") != "rmw_cyclonedds_cpp":
-        pytest.skip("services through DDS need RMW_IMPLEMENTATION=rmw_cyclonedds_cpp")
+    skip_services_of_others(bridge)
     asked = []
 
     def answer(request: Any) -> msg.SimulatorReply:
@@ -193,9 +197,31 @@ def test_simulation_interfaces_of_a_real_node(bridge: BridgeProcess, ros_node: R
         (features,) = ros_node.do(
             "call", name="/get_simulator_features", type_name=f"{package}/srv/GetSimulatorFeatures"
         )
-        assert "SetEntityState while the simulation is stopped" in features
+        assert "bodies of the settings are spawned" in features
         (result,) = ros_node.do(
             "call", name="/step_simulation", type_name=f"{package}/srv/StepSimulation", steps=7
         )
         assert "result=1" in result
         assert asked == [msg.Step(7)]
+
+
+def test_a_real_node_manages_the_bridge(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    """Down to unconfigured and up again; its graph of transitions is that of a managed node of rclpy."""
+    skip_services_of_others(bridge)
+    with Node("simulator") as simulator:
+        measured = simulator.publisher("/drone/imu", msg.Imu)
+        ros_node.do("subscribe", topic="/drone/imu", type_name="sensor_msgs/msg/Imu")
+        wait_for(lambda: measured.subscriber_count)
+        down = ros_node.do("manage", node="/cortex_bridge", labels=["deactivate", "activate", "deactivate"])
+        assert [done for done, _ in down] == [True] * 3
+        assert "label='inactive'" in down[-1][1]
+        wait_for(lambda: not measured.subscriber_count)
+        up = ros_node.do(
+            "manage", node="/cortex_bridge", labels=["cleanup", "activate", "configure", "activate"]
+        )
+        assert [done for done, _ in up] == [True, False, True, True]
+        wait_for(lambda: measured.subscriber_count)
+        wait_for(lambda: measured.publish(imu(5)) and ros_node.do("heard", topic="/drone/imu")[0])
+        ours, theirs = (ros_node.do("transitions", node=name) for name in ("/cortex_bridge", ""))
+        assert len(ours) == 25
+        assert ours == theirs

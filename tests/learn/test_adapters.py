@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,14 +138,22 @@ def test_a_policy_as_a_cortex_node_commands_what_it_does_in_process(policy, runt
     assert not flown.is_alive()
 
 
-def test_a_policy_flies_in_this_process(policy, hall):
+def test_a_policy_flies_in_this_process(policy, hall, tmp_path):
     from neurosim_core.learn.pilot import fly_policy, shipped_policy
 
     scene = hall.config.scene.model_dump()
     overrides = {f"scene.{key}": scene[key] for key in ("kind", "file", "up_axis", "unit_m", "inside_m")}
     said: list[str] = []
     overrides |= {"device": "cpu", "render.lighting.mode": "unshadowed"}
-    speed_m_s = fly_policy(str(policy), duration_s=0.2, overrides=overrides, say=said.append)
+    film = tmp_path / "flight.h5"
+    speed_m_s = fly_policy(str(policy), duration_s=0.2, overrides=overrides, save=film, say=said.append)
+    with ns.Recording(film) as flight:
+        counts = {name: flight.packet_count(name) for name in flight.sensors}
+        assert counts["rgb"] == 4
+        assert counts["odometry"] == 10
+        assert counts["events"] > 0
+    with pytest.raises(ValueError, match=r"ends in \.h5, \.webp or \.gif, got film\.mp4"):
+        fly_policy(str(policy), duration_s=0.2, overrides=overrides, save=Path("film.mp4"))
     assert 0.5 < speed_m_s < 2.0  # thrown at 0.8 m/s, and hardly slowed in that time
     assert said[-1].startswith("mean speed of the last 0.2 s")
     with pytest.raises(ValueError, match="unknown policy 'nobody', known: "):

@@ -123,13 +123,13 @@ def test_the_page_shows_events_that_move(tmp_path):
     ):
         try:
             assert viewer.stdout is not None
-            address = re.match(r"open (http://127\.0\.0\.1:\d+/\?url=\S+)\n", viewer.stdout.readline())
+            address = re.match(r"open (http://127\.0\.0\.1:\d+/)\n", viewer.stdout.readline())
             assert address is not None
             simulator.announce()
             with publishing(simulator), browsers.sync_playwright() as driver:
                 browser: Any = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
                 page = browser.new_page(viewport={"width": 1000, "height": 700})
-                page.goto(f"{address[1]}&renderer=webgl")
+                page.goto(address[1])
 
                 def take() -> bytes:
                     picture: bytes = page.screenshot(timeout=SEEN_S * 1e3)

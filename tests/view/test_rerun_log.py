@@ -185,6 +185,9 @@ def test_collisions_clearance_and_path(tmp_path):
         logger.log_scalar("clearance", 5, 0.25)
     rows = read(tmp_path / "f.rrd")
     assert [(t, v["positions"]) for t, v in rows["/world/collisions/drone"]] == [(7, [[1.0, 2.0, 3.0]])]
+    [(stamp_ns, line)] = rows["/plots/drone/collisions"]
+    assert stamp_ns == 7
+    assert "at (1.00, 2.00, 3.00) m" in str(line)
     assert [(t, v["scalars"]) for t, v in rows["/plots/drone/clearance"] if t is not None] == [(5, [0.25])]
     assert rows["/world/paths/drone"][0][1]["strips"] == [path.tolist()]
 

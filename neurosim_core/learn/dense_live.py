@@ -1,6 +1,6 @@
-"""Processes that fly and stream over Cortex what depth is learned from, each scene after scene.
+"""Processes that fly and stream over Cortex what networks learn from, each scene after scene.
 
-`python -m neurosim_core.learn.depth_live NAMESPACE SETTINGS SEED` is one of them: flight k has the seeds
+`python -m neurosim_core.learn.dense_live NAMESPACE SETTINGS SEED` is one of them: flight k has the seeds
 SEED + k of scene, path and noise. It flies as fast as its readers take what it sends.
 """
 
@@ -19,10 +19,15 @@ _SEEDS_APART = 10_000
 
 
 def flight_settings(
-    size_px: int, seed: int, *, duration_s: float = 6.0, device: str = "cpu"
+    size_px: int, seed: int, *, field: str = "depth", duration_s: float = 6.0, device: str = "cpu"
 ) -> dict[str, Any]:
-    """Return the settings of a flight through an apartment of its own; one camera has events and depth."""
+    """Return the settings of a flight through an apartment of its own; one camera has events and a field."""
     lens = {"width": size_px, "height": size_px, "horizontal_fov_rad": 1.5}
+    truth: dict[str, dict[str, Any]] = {
+        "events": {},
+        "depth": {"depth": {"kind": "depth", "lens": lens, "rate_hz": 20.0}},
+        "flow": {"flow": {"kind": "optical_flow", "lens": lens, "rate_hz": 20.0, "occlusion": False}},
+    }
     return {
         "duration_s": duration_s,
         "device": device,
@@ -34,7 +39,7 @@ def flight_settings(
             "events": {
                 "kind": "event_camera", "lens": lens, "sampling_rate_hz": 200.0, "packet_rate_hz": 20.0,
             },
-            "depth": {"kind": "depth", "lens": lens, "rate_hz": 20.0},
+            **truth[field],
         },
     }  # fmt: skip
 
@@ -42,7 +47,7 @@ def flight_settings(
 @contextlib.contextmanager
 def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> Iterator[list[str]]:
     """Run processes that stream flights, and end them; yield their namespaces, for `ns.data.LiveSource`."""
-    names = [f"/depth{index}" for index in range(count)]
+    names = [f"/flight{index}" for index in range(count)]
     commands = [
         [sys.executable, "-m", __name__, name, json.dumps(settings), str(seed + _SEEDS_APART * index)]
         for index, name in enumerate(names)

@@ -1,0 +1,365 @@
+"""Training of dense predictions: the same from recordings, processes that fly meanwhile, and worlds."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurosim_core.data import LiveSource, Stream
+from neurosim_core.data.batch import Batch
+from neurosim_core.learn.dense import DenseNet, Head
+from neurosim_core.learn.dense_live import flight_settings, live_flights
+from neurosim_core.learn.depth import DepthHead
+from neurosim_core.learn.flow import FlowHead
+from neurosim_core.learn.future import FutureHead
+
+_log = logging.getLogger(__name__)
+HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}
+"""What can be learned, by the name of its command."""
+_SILENT_S = 120.0
+"""Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
+_TEST_SEED = 1_000_000
+"""Of the first flight that is only tested on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseConfig:
+    """How it is learned."""
+
+    task: str = "depth"
+    """One of `HEADS`."""
+    window_s: float = 0.05
+    """Length of a window of events [s]."""
+    bins: int = 5
+    """Channels of a voxel."""
+    channels: int = 16
+    """Of the network's finest level."""
+    sequence: int = 4
+    """Consecutive windows through which gradients go back."""
+    batch: int = 8
+    """Sequences of a step."""
+    rate: float = 2e-3
+    """Highest learning rate; it rises over the first tenth of the time and falls along a cosine."""
+    minutes: float = 3.0
+    """How long to train [min]; waiting for the first windows is not counted."""
+    steps: int | None = None
+    """How many steps to train, however long they take; None: as `minutes` says."""
+    room: int = 20_000
+    """Windows that are kept to be seen again; of more, the oldest go."""
+    reuse: float = 4.0
+    """Worlds fly on when their windows have been seen so often, on average."""
+    size_px: int = 48
+    """Of the pictures of all flights that are flown here [px]."""
+    test_flights: int = 8
+    """Flights in scenes that are not trained in."""
+    backbone: str | None = None
+    """File of a network whose weights to begin with; see `DenseNet.take_backbone`."""
+    device: str = "cpu"
+    """Of the network, and of worlds."""
+    seed: int = 0
+    """Of the order, the weights and the flights."""
+
+    @property
+    def head(self) -> Head:
+        """What is predicted."""
+        return HEADS[self.task]
+
+    def net(self) -> DenseNet:
+        """Return an untrained network."""
+        return DenseNet(self.head.start, self.bins, self.channels)
+
+
+class Windows(NamedTuple):
+    """Windows of some flights."""
+
+    source: Sequence[str]
+    """Name of the flight of each."""
+    start_ns: Sequence[int]
+    stamp_ns: Sequence[int]
+    voxel: Tensor
+    """What the network sees, shape [B, bins, H, W]."""
+    target: Tensor
+    """As the head says, shape [B, C, H, W]."""
+
+
+def windows_of(batch: Batch, head: Head, bins: int) -> Windows:
+    """Return the windows of a batch."""
+    assert batch.events is not None
+    value = batch.events.counts() if head.field == "events" else getattr(batch, head.field)
+    target = head.target(torch.from_numpy(value))
+    voxel = torch.from_numpy(batch.events.voxel(bins))
+    return Windows(batch.source, batch.start_ns.tolist(), batch.stamp_ns.tolist(), voxel, target)
+
+
+class WindowPool:
+    """Windows to be seen again, in sequences that follow on each other; filled from any source.
+
+    Args:
+        length: Windows of a sequence.
+        room: Most windows.
+        mirrored: Factor of each channel of a target in a mirrored picture.
+    """
+
+    def __init__(self, *, length: int, room: int, mirrored: Sequence[float] = (1.0,)) -> None:
+        self._length, self._most = length, max(1, room // length)
+        self._sign = torch.tensor(mirrored)[:, None, None]
+        self._sequences: list[tuple[Tensor, Tensor]] = []
+        self._begun: dict[str, list[tuple[int, Tensor, Tensor]]] = {}
+        self._oldest = 0
+        self._lock = threading.Lock()
+        self.window_count = 0
+        """Windows that have come."""
+
+    def __len__(self) -> int:
+        return len(self._sequences)
+
+    def add(self, windows: Windows) -> None:
+        """Take windows; those of a flight come in the order of time, those of several in any."""
+        voxels, targets = windows.voxel.half(), windows.target.clone()
+        for row, name in enumerate(windows.source):
+            begun = self._begun.setdefault(name, [])
+            if begun and begun[-1][0] != windows.start_ns[row]:
+                begun.clear()  # a new flight, or a window is missing
+            begun.append((windows.stamp_ns[row], voxels[row], targets[row]))
+            self.window_count += 1
+            if len(begun) == self._length:
+                _, voxel, target = zip(*begun, strict=True)
+                self._keep(torch.stack(voxel), torch.stack(target))
+                begun.clear()
+
+    def _keep(self, voxel: Tensor, target: Tensor) -> None:
+        with self._lock:
+            if len(self._sequences) < self._most:
+                self._sequences.append((voxel, target))
+                return
+            self._sequences[self._oldest] = (voxel, target)
+            self._oldest = (self._oldest + 1) % self._most
+
+    def draw(self, count: int, random: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Return sequences, half of them mirrored, shapes [T, B, bins, H, W] and [T, B, C, H, W]."""
+        with self._lock:
+            picked = [self._sequences[k] for k in random.integers(len(self._sequences), size=count)]
+        mirrored = (random.random(count) < 0.5).tolist()
+        sign = self._sign.to(picked[0][1].device)
+        voxel = [v.flip(-1) if m else v for (v, _), m in zip(picked, mirrored, strict=True)]
+        target = [t.flip(-1) * sign if m else t for (_, t), m in zip(picked, mirrored, strict=True)]
+        return torch.stack(voxel, 1).float(), torch.stack(target, 1)
+
+    def targets(self) -> Tensor:
+        """Return the targets of all windows, shape [n, C, H, W]."""
+        with self._lock:
+            return torch.cat([target for _, target in self._sequences])
+
+
+def held_out_windows(config: DenseConfig, data: Path | None) -> Iterator[Windows]:
+    """Yield the windows of test flights in order: of a data set, or of flights in scenes of their own."""
+    sources: list[Any] = [data]
+    if data is None:
+        seeds = range(_TEST_SEED, _TEST_SEED + config.test_flights)
+        field = config.head.field
+        more: dict[str, Any] = {"field": field, "duration_s": 3.0, "device": config.device}
+        sources = [flight_settings(config.size_px, seed, **more) for seed in seeds]
+    for number, source in enumerate(sources):
+        for batch in Stream(source, batch=64, **_options(config)):
+            found = windows_of(batch, config.head, config.bins)
+            yield found._replace(source=[f"{number} {name}" for name in found.source])
+
+
+def _options(config: DenseConfig) -> dict[str, Any]:
+    return {"window_s": config.window_s, "fields": list(dict.fromkeys(["events", config.head.field]))}
+
+
+def evaluate(
+    predict: Callable[..., tuple[Tensor, Any]], tested: Iterable[Windows], head: Head, device: str = "cpu"
+) -> Any:
+    """Return the errors over flights, each from its first window to its last, with memory.
+
+    Args:
+        predict: Called with a voxel [1, bins, H, W] and the memory of the window before, or None.
+        tested: In order.
+        head: What is predicted.
+        device: Where the network is.
+    """
+    sums, memory, flight = head.errors(), None, None
+    due: list[tuple[Tensor, Tensor]] = []
+    """What was predicted and is not yet compared, with what was seen."""
+    with torch.no_grad():
+        for windows in tested:
+            for name, voxel, target in zip(windows.source, windows.voxel, windows.target, strict=True):
+                if name != flight:
+                    memory, flight = None, name
+                    due.clear()
+                predicted, memory = predict(voxel[None].to(device), memory)
+                due.append((predicted.cpu(), voxel[None]))
+                if len(due) > head.ahead:
+                    before, seen = due.pop(0)
+                    sums.add(before, target[None], seen)
+    return sums.result()
+
+
+def train_dense(
+    folder: Path,
+    config: DenseConfig,
+    *,
+    data: Path | None = None,
+    live: int = 0,
+    worlds: int = 0,
+    test: Path | None = None,
+) -> dict[str, Any]:
+    """Train, test in scenes not seen, and leave all in a folder.
+
+    Args:
+        folder: Gets `TASK.pt` and `TASK.json`.
+        config: What, and how.
+        data: Learn from a data set or recordings with events and what is to be predicted.
+        live: Or from so many processes that fly meanwhile, and stream over Cortex.
+        worlds: Or from so many worlds, on the device of the network.
+        test: A data set to test on; None: flights in scenes of their own.
+
+    Returns:
+        Errors of the network, of the network with its events zeroed, and of the mean of each pixel.
+
+    Raises:
+        ValueError: Not exactly one source is given, there is too little data, or the backbone does not fit.
+    """
+    if bool(data) + bool(live) + bool(worlds) != 1:
+        raise ValueError("say what to learn from: --data DIR, --live N, or --worlds N")
+    torch.manual_seed(config.seed)
+    head, net = config.head, config.net()
+    if config.backbone is not None:
+        net.take_backbone(Path(config.backbone))
+    if live:
+        torch.set_num_threads(1)  # threads that wait for each other beside processes that fly are slower
+    pool = WindowPool(length=config.sequence + head.ahead, room=config.room, mirrored=head.mirrored)
+    with _source(pool, config, data, live, worlds) as more:
+        steps = _fit(net.to(config.device), pool, config, more)
+    constant = head.constant(pool.targets()).cpu()[None]
+    tested = [*held_out_windows(config, test)]
+    net.eval()
+    errors = {
+        "network": evaluate(net, tested, head, config.device),
+        "events zeroed": evaluate(lambda v, m: net(torch.zeros_like(v), m), tested, head, config.device),
+        "mean of each pixel": evaluate(lambda _voxel, _memory: (constant, None), tested, head),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
+    weights = {name: value.cpu() for name, value in net.state_dict().items()}
+    torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
+    told = {
+        "config": asdict(config),
+        "steps": steps,
+        "training windows": pool.window_count,
+        "test windows": sum(len(windows.source) for windows in tested),
+        "errors": {name: error._asdict() for name, error in errors.items()},
+    }
+    (folder / f"{config.task}.json").write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+    return errors
+
+
+def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
+    """Return a network that `train_dense` left, and what it predicts.
+
+    Raises:
+        ValueError: The file is none of these.
+    """
+    saved = torch.load(file, map_location="cpu", weights_only=True)
+    if not isinstance(saved, dict) or saved.get("task") not in HEADS:
+        raise ValueError(f"{file} is no network of `neurosim learn {' or '.join(HEADS)}`")
+    weights = saved.pop("net")
+    config = DenseConfig(**saved)
+    net = config.net()
+    net.load_state_dict(weights)
+    return net.eval(), config
+
+
+@contextlib.contextmanager
+def _source(
+    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int
+) -> Iterator[Callable[[int], None]]:
+    """Fill a pool for the first step; yield what to call before each step, with its number."""
+    head, options = config.head, _options(config)
+    if worlds:
+        from neurosim_core.learn.dense_worlds import world_windows
+
+        settings = flight_settings(config.size_px, config.seed, field=head.field, device=config.device)
+        flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
+        while len(pool) < min(config.batch, worlds):
+            pool.add(next(flown))
+
+        def fly_on(step: int) -> None:
+            while pool.window_count * config.reuse < step * config.batch * config.sequence:
+                pool.add(next(flown))
+
+        yield fly_on
+        return
+    stop = threading.Event()
+
+    def fill(stream: Stream) -> None:
+        for batch in stream:
+            pool.add(windows_of(batch, head, config.bins))
+            if stop.is_set():
+                return
+
+    if data is not None:
+        length = config.sequence + head.ahead
+        fill(Stream(data, batch=64 * length, sequence=length, **options))
+        yield lambda _: None
+        return
+    with live_flights(live, flight_settings(config.size_px, 0, field=head.field), seed=config.seed) as names:
+        stream = Stream(LiveSource(names, timeout_s=_SILENT_S), batch=1, **options)
+        filler = threading.Thread(target=fill, args=(stream,), daemon=True)
+        filler.start()
+        try:
+            while len(pool) < config.batch and filler.is_alive():
+                time.sleep(0.05)
+            yield lambda _: None
+        finally:
+            stop.set()
+            filler.join(_SILENT_S)  # the next window ends it, as long as somebody flies
+
+
+def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> int:
+    """Train for the time that there is; return how many steps that were."""
+    if len(pool) == 0:
+        raise ValueError(
+            f"there are no {config.sequence + config.head.ahead} consecutive windows to learn from"
+        )
+    head, random = config.head, np.random.default_rng(config.seed)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=1e-4)
+    begin_s, steps = time.monotonic(), 0
+
+    def share_done() -> float:
+        if config.steps is not None:
+            return steps / config.steps
+        return (time.monotonic() - begin_s) / (60.0 * config.minutes)
+
+    while (share := share_done()) < 1.0:
+        for group in optimizer.param_groups:
+            group["lr"] = config.rate * min(1.0, 10.0 * share + 0.01) * 0.5 * (1.0 + np.cos(np.pi * share))
+        more(steps)
+        voxel, target = (part.to(config.device) for part in pool.draw(config.batch, random))
+        memory, predicted = None, []
+        for window in voxel[: config.sequence]:
+            one, memory = net(window, memory)
+            predicted.append(one)
+        loss = head.loss(torch.stack(predicted), target[head.ahead :])
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimizer.step()
+        steps += 1
+        if steps % 100 == 0:
+            told = (steps, 100.0 * share, loss.item(), pool.window_count)
+            _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
+    return steps

@@ -1,0 +1,88 @@
+"""Windows of many worlds that fly together: voxels and what is true stay on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.learn.dense import Head
+from neurosim_core.learn.dense_train import Windows
+from neurosim_core.learn.surfaces import Counts, EventSurface, SurfaceConfig, VoxelGrid
+from neurosim_core.sim.model import Model, make_model, refit
+from neurosim_core.sim.simulation import Simulation
+
+_SCENES = 8
+_PATHS_MAX = 64
+"""Most paths that are flown at a time; further worlds share them."""
+
+
+def world_windows(
+    settings: Mapping[str, Any], head: Head, *, worlds: int, bins: int, window_s: float
+) -> Iterator[Windows]:
+    """Yield the windows of all worlds, one of each at a time, for ever; the next overwrites their tensors.
+
+    Generated scenes are eight, of the seeds from that of the settings on. When a flight is over, all worlds
+    fly other paths, and one of these scenes has been replaced by the next.
+
+    Raises:
+        ValueError: A window is not a whole number of control periods.
+    """
+    base = load_config(dict(settings))
+    steps = round(window_s * base.control.rate_hz)
+    if steps < 1 or abs(steps / base.control.rate_hz - window_s) > 1e-9:
+        raise ValueError(f"windows must be whole periods of control.rate_hz, got {window_s} s")
+    window_ns, first = round(1e9 * window_s), int(settings["seed"])
+    scenes: list[Model] = []
+    camera: Any = base.sensors["events"]
+    surfaces: list[SurfaceConfig] = [VoxelGrid(bins=bins), *([Counts()] if head.field == "events" else [])]
+    drawn = [
+        EventSurface(
+            config, world_count=worlds, width=camera.lens.width, height=camera.lens.height, step_s=window_s,
+            device=base.device,
+        )
+        for config in surfaces
+    ]  # fmt: skip
+    end_ns: Any = wp.zeros(worlds, dtype=wp.int64, device=base.device)
+    number = 0
+    while True:
+        count = _SCENES if hasattr(base.scene, "seed") else 1
+        scenes += [make_model(_seeded(base, first + number + k)) for k in range(len(scenes), count)]
+        flown = _simulate(base, scenes, worlds, first + number * _PATHS_MAX)
+        names = [f"{number} {world}" for world in range(worlds)]
+        for start_ns in range(0, flown.model.duration_ns - window_ns + 1, window_ns):
+            stamp_ns = start_ns + window_ns
+            end_ns.fill_(stamp_ns)
+            for _ in range(steps):
+                observation = flown.rollout(1)
+                for surface in drawn:
+                    surface.add(observation.frames["events"], end_ns)
+            for surface in drawn:
+                surface.show(end_ns)
+            value = drawn[1].array if len(drawn) > 1 else observation.images[head.field]
+            target = head.target(wp.to_torch(value))
+            stamps = [start_ns] * worlds, [stamp_ns] * worlds
+            yield Windows(names, *stamps, wp.to_torch(drawn[0].array), target)
+        number += 1
+        del scenes[: count > 1]
+
+
+def _seeded(config: SimulationConfig, seed: int) -> SimulationConfig:
+    if not hasattr(config.scene, "seed"):
+        return config
+    scene = config.scene.model_copy(update={"seed": seed})
+    return config.model_copy(update={"scene": scene})
+
+
+def _simulate(base: SimulationConfig, scenes: list[Model], worlds: int, seed: int) -> Simulation:
+    """Return worlds at the begin of paths of their own."""
+    paths = [base.path.model_copy(update={"seed": seed + k}) for k in range(min(worlds, _PATHS_MAX))]
+    models = [
+        refit(scenes[k % len(scenes)], base.model_copy(update={"path": path}), replan=True)
+        for k, path in enumerate(paths)
+    ]
+    flown = Simulation(base, worlds=worlds, models=models, seeds=seed)
+    flown.reset()
+    return flown
