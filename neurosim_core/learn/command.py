@@ -41,6 +41,7 @@ def add_parsers(commands: _Commands) -> None:
         default="unseen",
         help="eval: where to fly: seen, unseen (default), or the file of a scene",
     )
+    learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
@@ -148,7 +149,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from neurosim_core.learn.train import evaluate_run
 
     for name, evaluation in evaluate_run(
-        arguments.run, scenes=arguments.scenes, device=arguments.device, worlds=arguments.worlds
+        arguments.run,
+        scenes=arguments.scenes,
+        device=arguments.device,
+        worlds=arguments.worlds,
+        speed_m_s=arguments.speed,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
