@@ -283,7 +283,7 @@ def test_the_bridge_records_the_commands_of_others(monkeypatch: pytest.MonkeyPat
             said = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
             said.publish(simulation)
             commands = rig.simulator.publisher("/drone/command/rates", msg.RateThrustCommand)
-            rig.update_until(lambda: RECORDED <= {topic.topic for topic in look(rig._node).topics})
+            rig.update_until(lambda: {topic.topic for topic in look(rig._node).topics} >= RECORDED)
             rig.updates_during()
             assert ("/drone/attitude_target" in rig.backend.publishers) == opened
             if not opened:
