@@ -19,21 +19,11 @@ from cortex_ros2_bridge.bridge import Bridge
 from cortex_ros2_bridge.config import BridgeConfig, RouteChange
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.options import OPTIONS
+from cortex_ros2_bridge.parameter_values import kind_of, message_of, value_of
 from cortex_ros2_bridge.routes import Route, known_options
 
 logger = logging.getLogger(__name__)
 
-_KINDS: tuple[tuple[int, str, type, bool], ...] = (
-    (1, "bool_value", bool, False),
-    (2, "integer_value", int, False),
-    (3, "double_value", float, False),
-    (4, "string_value", str, False),
-    (6, "bool_array_value", bool, True),
-    (7, "integer_array_value", int, True),
-    (8, "double_array_value", float, True),
-    (9, "string_array_value", str, True),
-)
-"""As in rcl_interfaces/ParameterType: number, field of ParameterValue, type, whether it is an array."""
 _FIXED = ("backend", "distro", "cortex_domain", "node", "namespace", "isolate", "autostart")
 """Settings that hold from the start to the end."""
 _LIVE = ("defaults", "include", "exclude")
@@ -49,7 +39,11 @@ class Described(NamedTuple):
 
 
 class Parameters:
-    """Answers the six services of parameters, until it is closed."""
+    """Answers the six services of parameters, until it is closed.
+
+    `make` makes settings of parameters by their dotted names, and raises `ValueError` for wrong ones; `given`
+    are those of the start.
+    """
 
     def __init__(
         self,
@@ -58,14 +52,6 @@ class Parameters:
         make: Callable[[Mapping[str, Any]], BridgeConfig],
         given: Mapping[str, Any],
     ) -> None:
-        """Open the services.
-
-        Args:
-            bridge: Whose settings they are.
-            backend: Where the services are.
-            make: Makes settings of parameters by their dotted names; raises `ValueError` for wrong ones.
-            given: Parameters that were set at the start.
-        """
         self._bridge = bridge
         self._make = make
         self._given = dict(given)
@@ -81,8 +67,7 @@ class Parameters:
             ("SetParametersAtomically", self._set_together),
         ):
             service = backend.service(f"{node}/{service_path(name)}", f"rcl_interfaces/srv/{name}", answer)
-            if service is not None:
-                self._resources.callback(service.close)
+            self._resources.callback(service.close)
 
     def close(self) -> None:
         """Withdraw the services."""
@@ -137,18 +122,18 @@ class Parameters:
             each = known.get(name, Described(None, "", False))
             response.descriptors = [
                 *response.descriptors,
-                make(name=name, type=_kind(each.value)[0], description=each.text, read_only=each.fixed),
+                make(name=name, type=kind_of(each.value)[0], description=each.text, read_only=each.fixed),
             ]
         return response
 
     def _types(self, request: Any, response: Any) -> Any:
         known = self.all()
-        response.types = bytes(_kind(known[n].value)[0] if n in known else 0 for n in request.names)
+        response.types = bytes(kind_of(known[n].value)[0] if n in known else 0 for n in request.names)
         return response
 
     def _get(self, request: Any, response: Any) -> Any:
         known = self.all()
-        response.values = [_message(known[n].value if n in known else None) for n in request.names]
+        response.values = [message_of(known[n].value if n in known else None) for n in request.names]
         return response
 
     def _list(self, request: Any, response: Any) -> Any:
@@ -171,7 +156,7 @@ class Parameters:
         return response
 
     def _result(self, parameters: Iterable[Any]) -> Any:
-        reason = self.set({parameter.name: _value(parameter.value) for parameter in parameters})
+        reason = self.set({parameter.name: value_of(parameter.value) for parameter in parameters})
         make = message_class("rcl_interfaces/msg/SetParametersResult")
         return make(successful=not reason, reason=reason)
 
@@ -209,28 +194,3 @@ def _may_be_new(name: str) -> bool:
 
 def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
-
-
-def _kind(value: Any) -> tuple[int, str]:
-    """Return the type of a value as rcl_interfaces/ParameterType, and the field that holds it."""
-    one = value[0] if isinstance(value, list) and value else "" if isinstance(value, list) else value
-    for number, field, kind, is_array in _KINDS:
-        if is_array == isinstance(value, list) and type(one) is kind:
-            return number, field
-    return 0, ""
-
-
-def _message(value: Any) -> Any:
-    message = message_class("rcl_interfaces/msg/ParameterValue")()
-    message.type, field = _kind(value)
-    if field:
-        setattr(message, field, value)
-    return message
-
-
-def _value(message: Any) -> Any:
-    for number, field, _, is_array in _KINDS:
-        if number == message.type:
-            value = getattr(message, field)
-            return list(value) if is_array else value
-    return None

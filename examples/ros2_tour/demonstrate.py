@@ -103,6 +103,14 @@ CALLS: tuple[tuple[str, str, dict[str, Any], Callable[[Any], Any]], ...] = (
     ("/get_entities", "simulation_interfaces/GetEntities", {}, lambda r: r.entities == ["drone"]),
     ("/get_entity_state", "simulation_interfaces/GetEntityState", {"entity": "drone"},
      lambda r: r.state.header.frame_id == "map"),
+    ("/get_spawnables", "simulation_interfaces/GetSpawnables", {},
+     lambda r: [each.uri for each in r.spawnables] == ["body:ball"]),
+    ("/spawn_entity", "simulation_interfaces/SpawnEntity", {"uri": "body:ball"},
+     lambda r: r.entity_name == "ball"),
+    ("/delete_entity", "simulation_interfaces/DeleteEntity", {"entity": "ball"},
+     lambda r: r.result.result == 1),
+    ("/set_parameters", "rcl_interfaces/SetParameters", {}, lambda r: list(r.results) == []),
+    ("/cortex_bridge/get_state", "lifecycle_msgs/GetState", {}, lambda r: r.current_state.label == "active"),
     ("/cortex_bridge/list_parameters", "rcl_interfaces/ListParameters", {}, lambda r: r.result.names),
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The commands `neurosim learn` and `neurosim deploy`."""
+"""The commands `neurosim learn`, `neurosim deploy` and `neurosim predict`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parsers(commands: _Commands) -> None:
-    """Add both commands."""
+    """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
     learn.add_argument("what", metavar="TASK", help="hover, hover-paper, depth, flow, pretrain, or `eval`")
     learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
@@ -41,10 +41,14 @@ def add_parsers(commands: _Commands) -> None:
         default="unseen",
         help="eval: where to fly: seen, unseen (default), or the file of a scene",
     )
+    learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
     dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
+    dense.add_argument(
+        "--ray", metavar="ADDRESS", help="those of --live fly on a Ray cluster: local, auto, host:port"
+    )
     dense.add_argument("--test", type=Path, metavar="DIR", help="a data set to test on")
     dense.add_argument("--minutes", type=float, default=3.0, metavar="M", help="how long (default: 3)")
     dense.add_argument("--size", type=int, default=48, metavar="PX", help="of flights (default: 48)")
@@ -65,6 +69,24 @@ def add_parsers(commands: _Commands) -> None:
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
+    predict = commands.add_parser(
+        "predict", help="tell depth or flow from the events of a running simulator, over Cortex"
+    )
+    predict.add_argument("network", type=Path, help="depth.pt or flow.pt of `neurosim learn`")
+    predict.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
+    predict.add_argument("--events", default="events", metavar="NAME", help="its camera (default: events)")
+    predict.add_argument("--device", default="cpu", help="of the network: cpu, cuda:0, ... (default: cpu)")
+    predict.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    predict.set_defaults(command=_predict)
+
+
+def _predict(arguments: argparse.Namespace) -> int:
+    need("torch")
+    from neurosim_core.learn.predict import predict
+
+    names = {"vehicle": arguments.vehicle, "events": arguments.events}
+    predict(arguments.network, **names, device=arguments.device, duration_s=arguments.duration)
+    return 0
 
 
 def _learn(arguments: argparse.Namespace) -> int:
@@ -109,7 +131,12 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
         backbone=arguments.backbone,
     )  # fmt: skip
     folder = arguments.out or Path("runs") / task
-    source = {"data": arguments.data, "live": arguments.live, "worlds": arguments.worlds or 0}
+    source = {
+        "data": arguments.data,
+        "live": arguments.live,
+        "ray": arguments.ray,
+        "worlds": arguments.worlds or 0,
+    }
     for name, error in train_dense(folder, config, **source, test=arguments.test).items():
         print(f"{name}: {error}")
     print(f"wrote {folder}/{task}.pt and {task}.json")
@@ -122,7 +149,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from neurosim_core.learn.train import evaluate_run
 
     for name, evaluation in evaluate_run(
-        arguments.run, scenes=arguments.scenes, device=arguments.device, worlds=arguments.worlds
+        arguments.run,
+        scenes=arguments.scenes,
+        device=arguments.device,
+        worlds=arguments.worlds,
+        speed_m_s=arguments.speed,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurosim_core.data import LiveSource, Stream
+from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
 from neurosim_core.learn.dense import DenseNet, Head
 from neurosim_core.learn.dense_live import flight_settings, live_flights
@@ -57,6 +57,8 @@ class DenseConfig:
     """How many steps to train, however long they take; None: as `minutes` says."""
     room: int = 20_000
     """Windows that are kept to be seen again; of more, the oldest go."""
+    reuse: float = 4.0
+    """Worlds fly on when their windows have been seen so often, on average."""
     size_px: int = 48
     """Of the pictures of all flights that are flown here [px]."""
     test_flights: int = 8
@@ -166,7 +168,8 @@ def held_out_windows(config: DenseConfig, data: Path | None) -> Iterator[Windows
     if data is None:
         seeds = range(_TEST_SEED, _TEST_SEED + config.test_flights)
         field = config.head.field
-        sources = [flight_settings(config.size_px, seed, field=field, duration_s=3.0) for seed in seeds]
+        more: dict[str, Any] = {"field": field, "duration_s": 3.0, "device": config.device}
+        sources = [flight_settings(config.size_px, seed, **more) for seed in seeds]
     for number, source in enumerate(sources):
         for batch in Stream(source, batch=64, **_options(config)):
             found = windows_of(batch, config.head, config.bins)
@@ -211,6 +214,7 @@ def train_dense(
     *,
     data: Path | None = None,
     live: int = 0,
+    ray: str | None = None,
     worlds: int = 0,
     test: Path | None = None,
 ) -> dict[str, Any]:
@@ -221,6 +225,7 @@ def train_dense(
         config: What, and how.
         data: Learn from a data set or recordings with events and what is to be predicted.
         live: Or from so many processes that fly meanwhile, and stream over Cortex.
+        ray: Address of a cluster of Ray where those of `live` fly instead; see `data.ray_source.cluster`.
         worlds: Or from so many worlds, on the device of the network.
         test: A data set to test on; None: flights in scenes of their own.
 
@@ -239,7 +244,7 @@ def train_dense(
     if live:
         torch.set_num_threads(1)  # threads that wait for each other beside processes that fly are slower
     pool = WindowPool(length=config.sequence + head.ahead, room=config.room, mirrored=head.mirrored)
-    with _source(pool, config, data, live, worlds) as more:
+    with _source(pool, config, data, live, worlds, ray) as more:
         steps = _fit(net.to(config.device), pool, config, more)
     constant = head.constant(pool.targets()).cpu()[None]
     tested = [*held_out_windows(config, test)]
@@ -282,9 +287,9 @@ def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
 
 @contextlib.contextmanager
 def _source(
-    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int
-) -> Iterator[Callable[[], object]]:
-    """Fill a pool for the first step; yield what to call before each step."""
+    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
+) -> Iterator[Callable[[int], None]]:
+    """Fill a pool for the first step; yield what to call before each step, with its number."""
     head, options = config.head, _options(config)
     if worlds:
         from neurosim_core.learn.dense_worlds import world_windows
@@ -293,7 +298,12 @@ def _source(
         flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
         while len(pool) < min(config.batch, worlds):
             pool.add(next(flown))
-        yield lambda: pool.add(next(flown))
+
+        def fly_on(step: int) -> None:
+            while pool.window_count * config.reuse < step * config.batch * config.sequence:
+                pool.add(next(flown))
+
+        yield fly_on
         return
     stop = threading.Event()
 
@@ -306,22 +316,28 @@ def _source(
     if data is not None:
         length = config.sequence + head.ahead
         fill(Stream(data, batch=64 * length, sequence=length, **options))
-        yield lambda: None
+        yield lambda _: None
         return
-    with live_flights(live, flight_settings(config.size_px, 0, field=head.field), seed=config.seed) as names:
-        stream = Stream(LiveSource(names, timeout_s=_SILENT_S), batch=1, **options)
+    settings = flight_settings(config.size_px, 0, field=head.field)
+    with contextlib.ExitStack() as stack:
+        if ray is None:
+            names = stack.enter_context(live_flights(live, settings, seed=config.seed))
+            source: Any = LiveSource(names, timeout_s=_SILENT_S)
+        else:
+            source = RaySource(settings, simulators=live, address=ray, first=config.seed)
+        stream = Stream(source, batch=1, **options)
         filler = threading.Thread(target=fill, args=(stream,), daemon=True)
         filler.start()
         try:
             while len(pool) < config.batch and filler.is_alive():
                 time.sleep(0.05)
-            yield lambda: None
+            yield lambda _: None
         finally:
             stop.set()
             filler.join(_SILENT_S)  # the next window ends it, as long as somebody flies
 
 
-def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[], object]) -> int:
+def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> int:
     """Train for the time that there is; return how many steps that were."""
     if len(pool) == 0:
         raise ValueError(
@@ -339,7 +355,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[]
     while (share := share_done()) < 1.0:
         for group in optimizer.param_groups:
             group["lr"] = config.rate * min(1.0, 10.0 * share + 0.01) * 0.5 * (1.0 + np.cos(np.pi * share))
-        more()
+        more(steps)
         voxel, target = (part.to(config.device) for part in pool.draw(config.batch, random))
         memory, predicted = None, []
         for window in voxel[: config.sequence]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -56,10 +57,10 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
-    """Return KEY=VALUE texts as parameters; values are read as YAML.
+    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text.
 
     Raises:
-        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false nor text.
+        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false, text nor a list.
     """
     values: dict[str, Any] = {}
     for setting in settings:
@@ -70,8 +71,10 @@ def parameters_of(settings: Sequence[str]) -> Parameters:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = None
+        if isinstance(value, list):
+            value = json.dumps(value)
         if not isinstance(value, bool | int | float | str):
-            raise ValueError(f"{key} takes a number, true, false or text, got {text!r}")
+            raise ValueError(f"{key} takes a number, true, false, text or a list, got {text!r}")
         values[key] = value
     return Parameters.of(values)
 

@@ -31,6 +31,7 @@ from neurosim_core.sim import (
     integrate_period,
     make_fleet,
     make_state,
+    move_bodies,
     observe,
     plan_paths,
     prepare_step,
@@ -193,9 +194,12 @@ class VehicleEngine:
         self._state = state
 
     def configure(self, model: Model) -> None:
-        """Go on with other settings: gains and links."""
+        """Go on with other settings: gains, links, and bodies, for which nothing may be being rendered."""
         if model.config.control.gains != self.model.config.control.gains:
             forget_controllers(self.state)
+        if model.config.bodies != self.model.config.bodies:
+            self.forget_plan()
+            move_bodies(self.state.groups, model.config.bodies)
         self.model = model
 
     def begin_step(self, mode: CommandMode, setpoint: NDArray[Any] | None) -> PendingStep:

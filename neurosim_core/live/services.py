@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
 import threading
 from collections import deque
@@ -28,6 +29,8 @@ CHANGEABLE = (
     "live.command_deadline_s",
     "links.NAME.SETTING",
     "control.gains.GAIN",
+    "bodies.NAME.present",
+    "bodies.NAME.motion.SETTING",
     "vehicles.NAME.links.NAME.SETTING",
     "vehicles.NAME.control.gains.GAIN",
 )
@@ -56,11 +59,23 @@ def change_parameters(
             raise ValueError(f"{key} cannot be changed during a run{hint}; allowed are {allowed}")
         if value is None:
             raise ValueError(f"{key}: no value is given")
+        if key.startswith("bodies.") and (name := key.split(".")[1]) not in config.bodies:
+            raise ValueError(f"no body is called {name}, known: {', '.join(config.bodies) or 'none'}")
     try:
-        return load_config(config.model_dump(mode="json"), overrides=dict(values))
+        return load_config(config.model_dump(mode="json"), overrides=_with_lists(values))
     except ConfigError as error:
         reasons = str(error).splitlines()[1:]
         raise ValueError("; ".join(line.strip() for line in reasons)) from None
+
+
+def _with_lists(values: Mapping[str, bool | int | float | str | None]) -> dict[str, Any]:
+    """Return values in which texts such as "[1, 2, 3]" are lists: a message has none."""
+    return {
+        key: json.loads(value)
+        if isinstance(value, str) and re.fullmatch(r"\[[-+.\deE, ]*\]", value)
+        else value
+        for key, value in values.items()
+    }
 
 
 @dataclass(eq=False)

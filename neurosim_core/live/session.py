@@ -216,6 +216,9 @@ class LiveSession:
             log = partial(self._log_packet, vehicle, sensor.name)
             subscribe(at(sensor.name), message_type(packet_type(sensor.kind)), log, sensor=sensor.name)
         subscribe(at("collision"), msg.Collision, partial(self._log_packet, vehicle, "collision"))
+        for field in ("depth", "flow"):
+            log = partial(self._log_packet, vehicle, f"predicted_{field}")
+            subscribe(topics.predicted_topic(vehicle, field), msg.Image, log)
         for mode, command in topics.COMMANDS.items():
             log = partial(self._log_command, vehicle, mode)
             subscribe(topics.command_topic(vehicle, mode), command, log, is_ordered=False)

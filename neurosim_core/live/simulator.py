@@ -449,6 +449,8 @@ class Simulator:
         """Change settings."""
         if config.live.real_time_factor != self.config.live.real_time_factor:
             self._pacer.set_factor(config.live.real_time_factor)
+        if self._cameras is not None and config.bodies != self.config.bodies:
+            self._cameras.finish(self._stop.is_set)
         self.config = config
         for vehicle in self.vehicles:
             vehicle.configure(config.of(vehicle.name))

@@ -10,6 +10,7 @@
 /VEHICLE/SENSOR                   Events, Image, Imu, Odometry, or a type derived from the sensor's packets
 /VEHICLE/SENSOR/info              CameraInfo of a camera (latched)
 /VEHICLE/SENSOR/transform         Transform: the pose of a sensor that is not at the body itself (latched)
+/VEHICLE/predicted/FIELD          Image: depth or flow, as `neurosim predict` says (seen by the viewer)
 /VEHICLE/LINK/delivery            Delivery: what a simulated link did to each message
 /VEHICLE/command/MODE             commands of one mode; see COMMANDS
 /reset /step /pause /resume /set_parameters    services; see SERVICES
@@ -73,6 +74,11 @@ def info_topic(vehicle: str, sensor: str) -> str:
 def transform_topic(vehicle: str, sensor: str) -> str:
     """Topic of the pose of a sensor on its vehicle."""
     return f"/{vehicle}/{sensor}/transform"
+
+
+def predicted_topic(vehicle: str, field: str) -> str:
+    """Topic of what a network says of the pixels of an event camera: depth or flow."""
+    return f"/{vehicle}/predicted/{field}"
 
 
 def delivery_topic(vehicle: str, link: str) -> str:

@@ -48,7 +48,7 @@ from neurosim_core.render.coverage import (
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
-from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer, requested_outputs
+from neurosim_core.render.outputs import RADIANCE, RenderOutputs, allocated_radiance_writer
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
@@ -144,13 +144,12 @@ def _cover_pixel(
     ...
 
 
-def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
+def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are pixels, for all terms."""
     radiance_of = pixel_shader(terms)
     radiance_beyond = pixel_shader(terms, beyond=True)
-    requested = requested_outputs(outputs)
-    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
-    write_radiance = radiance_writer(outputs, supersampled=False)
+    locate_tile = tile_locator(terms, images=True, instants=True)
+    write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
@@ -174,6 +173,8 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         col = place.left + 4 * (in_tile // 16 % 2) + in_tile % 4
         row = place.top + 4 * (in_tile // 32) + in_tile // 4 % 4
         if not place.rendered or col >= view.width or row >= view.height:
+            return
+        if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
         origin = view.p_WC[instant]
@@ -255,7 +256,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 total += radiance_of(
                     scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
-        write_radiance(scene, total / whole, 1, instant, place.slot, row, col, out)
+        write_radiance(scene, total / whole, instant, place.slot, row, col, out)
 
     return average_pixels
 
@@ -301,11 +302,10 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
     return wp.func_native(code)(shade_block)
 
 
-def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
+def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
-    requested = requested_outputs(outputs)
-    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
-    write_radiance = radiance_writer(outputs, supersampled=False)
+    locate_tile = tile_locator(terms, images=True, instants=True)
+    write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree)
     shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
     shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
@@ -329,6 +329,8 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         left = place.left + (index % 2) * _SIDE
         top = place.top + (index // 2 % 2) * _SIDE
         if not place.rendered or left >= view.width or top >= view.height:
+            return
+        if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
         origin = view.p_WC[instant]
@@ -385,7 +387,7 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     radiance[lane] = total[lane] / float(RAY_COUNT)
         for y in range(rows):
             for x in range(columns):
-                write_radiance(scene, radiance[_SIDE * y + x], 1, instant, place.slot, top + y, left + x, out)
+                write_radiance(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)
 
     return average_blocks
 
@@ -403,11 +405,16 @@ def antialiasing_kernels(
         terms: Terms of the first pass.
         is_cuda: Whether it is for CUDA.
     """
-    written = tuple(name for name in RADIANCE if name in outputs)
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
     if is_cuda:
-        return group_kernels(written, plain)
-    return ((_block_kernel if _in_blocks(terms) else _pixel_kernel)(written, plain),)
+        return group_kernels(tuple(name for name in RADIANCE if name in outputs), plain)
+    return (_cpu_kernel(plain),)
+
+
+@cache
+def _cpu_kernel(terms: RenderTerms) -> wp.Kernel:
+    """Return one kernel for all outputs: checking which are allocated takes less than to compile each set."""
+    return (_block_kernel if _in_blocks(terms) else _pixel_kernel)(terms)
 
 
 def _in_blocks(terms: RenderTerms) -> bool:

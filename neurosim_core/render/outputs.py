@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,assignment,return-value"
+# mypy: disable-error-code="index,attr-defined,assignment,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """Render outputs: their arrays, and the functions that write a pixel of them."""
@@ -172,3 +172,22 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
                 out.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
     return write_radiance
+
+
+@cache
+def allocated_radiance_writer() -> wp.Function:
+    """Return the function that writes the light of a pixel to those of its outputs that are allocated."""
+    write_log, write_rgb, write_linear = (radiance_writer((name,), supersampled=False) for name in RADIANCE)
+
+    @wp.func
+    def write_allocated_radiance(
+        scene: SceneData, radiance: wp.vec3, instant: int, slot: int, row: int, col: int, out: RenderOutputs
+    ) -> None:
+        if out.log_radiance.shape[0] > 0:
+            write_log(scene, radiance, 1, instant, slot, row, col, out)
+        if out.rgb.shape[0] > 0:
+            write_rgb(scene, radiance, 1, instant, slot, row, col, out)
+        if out.radiance.shape[0] > 0:
+            write_linear(scene, radiance, 1, instant, slot, row, col, out)
+
+    return write_allocated_radiance

@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from neurosim_core.render.outputs import FACE, OUTPUTS
+from neurosim_core.render.outputs import FACE, OUTPUTS, requested_outputs
 from neurosim_core.render.raycast_packets import packet_kernel
 from neurosim_core.render.raycast_pixels import pixel_kernel
 from neurosim_core.render.render_terms import RenderTerms
@@ -35,6 +35,10 @@ def raycast_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
     unknown = sorted(set(outputs) - {*OUTPUTS, FACE})
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")
+    if not requested_outputs(outputs).radiance and "returns" not in outputs:  # materials do not matter
+        terms = terms._replace(
+            textured=False, emissive=False, baked=False, finest_level=False, nearest_texel=False
+        )
     return _kernel(tuple(name for name in (*OUTPUTS, FACE) if name in outputs), terms)
 
 

@@ -92,6 +92,10 @@ class MotionConfig(Settings):
     """Constant angular velocity in the frame of the body [rad/s]."""
 
 
+_ABSENT = MotionConfig(position_m=(0.0, 0.0, -1e6))
+"""Where a body is that is not in the scene: nothing of it is larger than a pixel from there."""
+
+
 class BodyConfig(Settings):
     """A rigid body that moves by itself."""
 
@@ -101,6 +105,8 @@ class BodyConfig(Settings):
     """How it looks: {kind: plain | checker | picture, ...}; null: grey, and a mesh as its file says."""
     motion: MotionConfig = MotionConfig()
     """Where it is and how it moves."""
+    present: bool = True
+    """Whether it is in the scene; else it waits out of sight until a live simulator is told to show it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,7 +174,8 @@ class Motion:
 
 def upload_motions(bodies: Mapping[str, BodyConfig], device: str) -> wp.array[Motion]:
     """Return the motions of bodies on a device, shape [B]."""
-    return wp.array([_motion(body.motion) for body in bodies.values()], dtype=Motion, device=device)
+    motions = [_motion(body.motion if body.present else _ABSENT) for body in bodies.values()]
+    return wp.array(motions, dtype=Motion, device=device)
 
 
 def _motion(config: MotionConfig) -> Motion:

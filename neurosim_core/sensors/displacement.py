@@ -105,6 +105,7 @@ class DisplacementRule:
         rate: Rate,
         p_BC: wp.vec3d,
         q_BC: wp.quatd,
+        motions: Any = None,
         spacing_px: int = PROBE_SPACING_PX,
     ) -> None:
         """Allocate the buffers.
@@ -116,6 +117,7 @@ class DisplacementRule:
             rate: The clock whose ticks are chosen from.
             p_BC: Position of the camera on the body [m].
             q_BC: Orientation of the camera against the body, xyzw.
+            motions: Of the bodies, device array of `scene.bodies.Motion`; None: as the scene has them.
             spacing_px: Distance between probes [px].
         """
         self.coarse_count = 0
@@ -142,7 +144,7 @@ class DisplacementRule:
         self._poses.q_WC, self._poses.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
         self._points = zeros((rows, self._probe_count), wp.vec4d)
         self._seen = zeros((rows, self._probe_count), wp.vec3d)
-        self._make_bodies(arrays, rows)
+        self._make_bodies(arrays, rows, motions)
         self._moved = zeros((rows, rows), float)
         self._moved_on_host = HostCopy(self._moved)
         self._slots, self._step_s = zeros(self._block, int), zeros(self._block, wp.float64)
@@ -154,7 +156,7 @@ class DisplacementRule:
         self._measured: dict[int, int] = {}
         self._ahead = _AHEAD_MIN
 
-    def _make_bodies(self, arrays: SceneArrays, rows: int) -> None:
+    def _make_bodies(self, arrays: SceneArrays, rows: int, motions: Any) -> None:
         """Take over the bodies of a scene, if it has any."""
         moving = arrays.bodies
         self._kernels = rule_kernels(moving is not None)
@@ -166,13 +168,19 @@ class DisplacementRule:
         if moving is None:
             return
         self._body_count = len(moving.bodies)
-        self._motions = upload_motions({body.name: body.config for body in moving.bodies}, self._device)
+        if motions is None:
+            motions = upload_motions({body.name: body.config for body in moving.bodies}, self._device)
+        self._motions = motions
         self._body_poses = make_body_poses(rows + 1, self._body_count, self._device)
         self._body_rows: Any = wp.array(np.arange(rows + 1, dtype=np.int32), dtype=int, device=self._device)
         self._stamps = HostInput(wp.zeros((rows + 1, 1), dtype=wp.int64, device=self._device))
         self._bodies.mesh = moving.mesh
         self._bodies.corners = wp.array(bounding_points(moving.bodies), dtype=wp.vec3d, device=self._device)
         self._bodies.p_WO, self._bodies.q_WO = self._body_poses.p_WO, self._body_poses.q_WO
+
+    def begin_again(self) -> None:
+        """Have the next tick rendered, whatever has moved."""
+        self._started = False
 
     def choose(
         self,

@@ -3,6 +3,7 @@
 from neurosim_core.sim.integrate import COLLISION, forget_controllers
 from neurosim_core.sim.model import Model, find_device, make_fleet, make_model, plan_paths, refit
 from neurosim_core.sim.observation import Observation, Samples
+from neurosim_core.sim.render_group import move_bodies
 from neurosim_core.sim.rollout import (
     PendingStep,
     acquire_rooms,
@@ -50,6 +51,7 @@ __all__ = [
     "make_fleet",
     "make_model",
     "make_state",
+    "move_bodies",
     "observe",
     "plan_paths",
     "prepare_step",

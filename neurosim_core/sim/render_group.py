@@ -7,7 +7,7 @@ read. Instants are [world, K] in this order in all arrays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -246,7 +246,7 @@ def make_render_group(
         instants=wp.array(np.arange(timed_rows, dtype=np.int32), dtype=int, device=device),
         motions=motions,
         body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
-        rule=_make_rule(group, scene, p_BC, q_BC),
+        rule=_make_rule(group, scene, p_BC, q_BC, motions),
         make_room=make_room,
         chosen_slots=_chosen_slots(group, in_flight, capacity, device),
     )
@@ -374,7 +374,19 @@ def _world_frames(
     return found
 
 
-def _make_rule(group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd) -> DisplacementRule | None:
+def move_bodies(groups: Iterable[RenderGroupState], bodies: Mapping[str, BodyConfig]) -> None:
+    """Let the same bodies move otherwise from now on; nothing may be being rendered."""
+    for group in groups:
+        if group.motions is not None:
+            wp.copy(group.motions, upload_motions(bodies, group.device))
+            wp.synchronize_device(group.device)
+            if group.rule is not None:
+                group.rule.begin_again()
+
+
+def _make_rule(
+    group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd, motions: Any
+) -> DisplacementRule | None:
     if group.max_displacement_px is None:
         return None
     if not isinstance(scene, SceneArrays):
@@ -394,6 +406,7 @@ def _make_rule(group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd) -
         rate=group.rate,
         p_BC=p_BC,
         q_BC=q_BC,
+        motions=motions,
     )
 
 

@@ -197,7 +197,7 @@ def test_simulation_interfaces_of_a_real_node(bridge: BridgeProcess, ros_node: R
         (features,) = ros_node.do(
             "call", name="/get_simulator_features", type_name=f"{package}/srv/GetSimulatorFeatures"
         )
-        assert "SetEntityState while the simulation is stopped" in features
+        assert "bodies of the settings are spawned" in features
         (result,) = ros_node.do(
             "call", name="/step_simulation", type_name=f"{package}/srv/StepSimulation", steps=7
         )

@@ -231,10 +231,12 @@ def test_worlds_give_the_windows_of_runs(scene):
         next(world_windows(config, HEADS["flow"], worlds=2, bins=5, window_s=0.0505))
 
 
-def test_training_from_worlds_sees_new_windows_at_each_step(tmp_path, flights, scene, monkeypatch):
+def test_worlds_fly_on_when_their_windows_have_been_seen(tmp_path, flights, scene, monkeypatch):
     monkeypatch.setattr(dense_train, "flight_settings", lambda *_, **__: settings(scene))
-    train_dense(tmp_path, DenseConfig(task="flow", steps=3, batch=1, channels=4), worlds=2, test=flights)
-    assert json.loads((tmp_path / "flow.json").read_text())["training windows"] == 2 * (4 + 3)
+    config = DenseConfig(task="flow", steps=3, batch=1, channels=4, reuse=0.25)
+    train_dense(tmp_path, config, worlds=2, test=flights)
+    told = json.loads((tmp_path / "flow.json").read_text())
+    assert told["training windows"] == 32  # the last step begins when 8 were seen: a quarter of them
 
 
 def test_a_backbone_is_taken_from_torch_and_from_onnx(tmp_path):

@@ -161,9 +161,8 @@ def test_settings_are_read_as_yaml():
     [
         ("nothing", "a setting is KEY=VALUE, got 'nothing'"),
         ("=3", "a setting is KEY=VALUE, got '=3'"),
-        ("a=[1, 2]", r"a takes a number, true, false or text, got '\[1, 2\]'"),
-        ("a=", "a takes a number, true, false or text, got ''"),
-        ("a=[1", r"a takes a number, true, false or text, got '\[1'"),
+        ("a=", "a takes a number, true, false, text or a list, got ''"),
+        ("a=[1", r"a takes a number, true, false, text or a list, got '\[1'"),
     ],
 )
 def test_settings_that_are_none_are_refused(setting, text):

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from live_rig import IMU, ODOMETRY, LiveRig, drain, make_config, models_of
 from processes import SOON_S, wait_for
+from small_room import room_scene
 
 from cortex.messages import (
     Clock,
@@ -22,6 +23,7 @@ from cortex.messages import (
     Imu,
     MotorCommand,
     Odometry,
+    Parameters,
     PoseCommand,
     Reset,
     RotorSpeeds,
@@ -845,3 +847,60 @@ def test_status_is_told_about_five_times_a_second():
         assert second.wall_ns - first.wall_ns >= 190 * MS
         assert second.sequence == first.sequence + 1
         wait_for(lambda: status.recv(SOON_S).phase == "waiting")
+
+
+# Bodies
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "streaming"])
+def test_a_body_is_brought_in_and_taken_out(mode: str, tmp_path: Path):
+    """By /set_parameters, whose answer comes when what was flown before has been rendered without it."""
+    lens = {"width": 32, "height": 24, "horizontal_fov_rad": 1.2}
+    depth = {"kind": "depth", "lens": lens, "rate_hz": 100}
+    config = make_config(
+        sensors={"depth": depth},
+        **{
+            "live.mode": mode,
+            "live.command_every": 1000,
+            "live.real_time_factor": 0.0,
+            "renderer": "warp",
+            "scene": room_scene(tmp_path),
+            "path": {"kind": "hover", "position_m": [0.0, 0.0, 1.5]},
+            "bodies": {"box": {"shape": {"kind": "box", "size_m": [0.5, 2.0, 2.0]}, "present": False}},
+        },
+    )
+
+    def ask(rig: LiveRig, **values: Any) -> str:
+        values = {f"bodies.box.{name.replace('__', '.')}": value for name, value in values.items()}
+        return rig.call("/set_parameters", Parameters.of(values)).reason
+
+    with LiveRig(config) as rig:
+        pictures = rig.listen("/drone/depth", Image)
+        announced = rig.listen("/simulation", Simulation)
+        assert rig.call("/pause", Trigger()).accepted
+        rig.send(rig.hover())
+
+        def sees(stamp_ns: int) -> float:
+            """Fly on to a stamp, and return how far it is to what is ahead then [m]."""
+            begin_ns = rig.simulator.stamp_ns
+            assert rig.call(
+                "/step", Step(count=(stamp_ns - begin_ns) // PERIOD_NS, timeout_s=SOON_S)
+            ).accepted
+            while (picture := pictures.recv(SOON_S)).stamp_ns < stamp_ns:
+                pass
+            return float(picture.data[12, 16, 0])
+
+        empty_m = sees(4 * PERIOD_NS)
+        assert empty_m > 3.0
+        assert ask(rig, present=True, motion__position_m="[2.0, 0.0, 1.5]") == ""
+        assert sees(8 * PERIOD_NS) == pytest.approx(empty_m - (4.0 - 1.75), abs=0.02)
+        assert ask(rig, motion__position_m="[2.5, 0.0, 1.5]") == ""
+        assert sees(12 * PERIOD_NS) == pytest.approx(empty_m - (4.0 - 2.25), abs=0.02)
+        assert ask(rig, present=False) == ""
+        assert sees(16 * PERIOD_NS) == pytest.approx(empty_m, abs=0.02)
+        said = [yaml.safe_load(each.config)["bodies"]["box"]["present"] for each in drain(announced, least=4)]
+        assert said == [False, True, True, False]
+        assert (
+            "no body is called"
+            in rig.call("/set_parameters", Parameters.of({"bodies.x.present": True})).reason
+        )

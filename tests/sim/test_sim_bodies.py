@@ -193,3 +193,42 @@ def test_a_run_without_cameras_loads_no_body(room):
     assert model.bodies == ()
     with pytest.raises(ValueError, match=r"lost.glb: no such file"):
         sim.make_model(ns.load_config(settings(room, "cpu", lost)))
+
+
+BOX = {"shape": {"kind": "box", "size_m": [0.2, 0.6, 0.6]}, "surface": BLACK}
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_a_body_is_shown_moved_and_hidden_while_time_goes_on(room, device, adaptive):
+    """From then on pictures are those of a run with the body there always; its appearance makes events."""
+
+    def model_of(**body: Any) -> sim.Model:
+        config = settings(room, device, {"box": {**BOX, **body}})
+        if adaptive:
+            config["sensors"]["events"]["max_displacement_px"] = 0.5
+        return sim.make_model(ns.load_config(config))
+
+    def fly(model: sim.Model, state: sim.State) -> list[Packet]:
+        rotors = np.full(model.airframe.rotor_count, model.airframe.hover_rotor_speed_rad_s)
+        return [packet for _ in range(10) for packet in sim.step(model, state, rotors)]
+
+    def depths(packets: list[Packet]) -> list[np.ndarray]:
+        return [p.data for p in packets if isinstance(p, Image) and p.sensor == "depth"]
+
+    near = {"position_m": [2.1, 0.2, 0.0]}
+    far = {"position_m": [3.1, -0.5, 0.0]}
+    models = [model_of(present=False), model_of(motion=near), model_of(motion=far), model_of(present=False)]
+    changing = sim.make_state(models[0])
+    flown = [fly(models[0], changing)]
+    for model in models[1:]:
+        sim.move_bodies(changing.groups, model.config.bodies)
+        flown.append(fly(models[0], changing))
+    for index, model in enumerate(models):
+        state = sim.make_state(model)
+        expected = [fly(model, state) for _ in models][index]
+        for ours, theirs in zip(depths(flown[index]), depths(expected), strict=True):
+            assert np.array_equal(ours, theirs)
+    assert depths(flown[1])[-1][24, 30] == pytest.approx(1.9, abs=1e-3)  # the camera sits 0.1 m ahead
+    fired = [len(events_of(packets)) for packets in flown]
+    assert fired[0] == 0
+    assert min(fired[1:]) > 200  # about 200 pixels see it come or go

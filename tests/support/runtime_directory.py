@@ -7,6 +7,7 @@ import gc
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -14,9 +15,13 @@ from pathlib import Path
 
 import pytest
 from processes import processes_with, shared_mappings, wait_for
+from registry_forks import forks
 from zmq.utils.garbage import GarbageCollectorThread
 
+from cortex import registry
 from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, sweep
+
+_SPAWN = registry._spawn
 
 
 def _shared_files() -> set[str]:
@@ -24,8 +29,12 @@ def _shared_files() -> set[str]:
 
 
 def _threads() -> set[threading.Thread]:
-    """Threads, without the one that pyzmq starts with the first message that it sends without a copy."""
-    return {thread for thread in threading.enumerate() if not isinstance(thread, GarbageCollectorThread)}
+    """Threads, without those that stay: pyzmq's for messages without a copy, and the pool that renders."""
+    return {
+        thread
+        for thread in threading.enumerate()
+        if not isinstance(thread, GarbageCollectorThread) and not thread.name.startswith("neurosim-render")
+    }
 
 
 @pytest.fixture
@@ -48,6 +57,8 @@ def own_directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     base = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
     monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(base))
     monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
+    if sys.platform == "linux":
+        monkeypatch.setattr(registry, "_spawn", forks(_SPAWN))
     threads, files = _threads(), _shared_files()
     try:
         yield base
