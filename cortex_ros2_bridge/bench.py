@@ -1,7 +1,7 @@
 """`cortex-ros2-bridge bench`: what does the bridge cost here; one `name value unit` a line.
 
-There are three processes: a Cortex publisher, the bridge, and a DDS subscriber. Messages are stamped when
-they are published: a latency is all from `publish` in Cortex to the callback in DDS.
+There are three processes: a Cortex publisher, the bridge, and a subscriber in ROS. Messages are stamped when
+they are published: a latency is all from `publish` in Cortex to the callback in ROS.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from cortex import Node
 from cortex.messages import Events, Image, Imu
 
 WIDTH, HEIGHT = 640, 480
-EVENTS_PER_PACKET = 10_000
 TICK_NS = 1_000_000
 MATCH_S = 20.0
 """Longest wait until everybody has found each other [s]."""
@@ -37,6 +36,7 @@ PROFILE = "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface n
 </Interfaces><AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>\
 <Peers><Peer address='127.0.0.1'/></Peers></Discovery></Domain></CycloneDDS>"
 """Only this machine, unless the environment says otherwise."""
+QUANTILES = {"median": 0.5, "p90": 0.9, "p99": 0.99, "max": 1.0}
 
 
 class Stream(NamedTuple):
@@ -45,15 +45,30 @@ class Stream(NamedTuple):
     topic: str
     ros_topic: str
     ros_type: str
-    every: int
-    """Ticks of a millisecond between two messages."""
 
 
 STREAMS = {
-    "image": Stream("/bench/rgb", "/bench/rgb/image_raw", "sensor_msgs/msg/Image", 10),
-    "events": Stream("/bench/events", "/bench/events", "event_camera_msgs/msg/EventPacket", 1),
-    "imu": Stream("/bench/imu", "/bench/imu", "sensor_msgs/msg/Imu", 1),
+    "image": Stream("/bench/rgb", "/bench/rgb/image_raw", "sensor_msgs/msg/Image"),
+    "events": Stream("/bench/events", "/bench/events", "event_camera_msgs/msg/EventPacket"),
+    "imu": Stream("/bench/imu", "/bench/imu", "sensor_msgs/msg/Imu"),
 }
+"""The Imu comes at 1 kHz, and so do packets of events."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """What is sent, and how."""
+
+    seconds: float = 5.0
+    """For how long [s]."""
+    encoding: str = "evt3"
+    """Of the events."""
+    backend: str = "dds"
+    """Of bridge and subscriber."""
+    image_hz: int = 50
+    """Pictures a second [Hz], a divisor of 1000."""
+    events_per_s: int = 2_000_000
+    """Events a second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +78,9 @@ class Result:
     sent: int
     received: int
     lost_in_bridge: int
-    """As /diagnostics say; others were lost in DDS."""
-    latency_ms: tuple[float, float, float]
-    """Median, 99th percentile and maximum [ms]."""
+    """As /diagnostics say; others were lost in ROS."""
+    latency_ms: dict[str, float]
+    """By the names of `QUANTILES` [ms]."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -73,46 +88,44 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="cortex-ros2-bridge bench", description="Measure the bridge on this machine."
     )
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of each measurement [s]")
-    parser.add_argument("--encoding", default="evt3", choices=["evt3", "mono"], help="of the events")
+    default = Load()
+    parser.add_argument("--seconds", type=float, default=default.seconds, help="of each measurement [s]")
+    parser.add_argument("--encoding", default=default.encoding, choices=["evt3", "mono"], help="of events")
+    parser.add_argument("--backend", default=default.backend, choices=["dds", "rclpy"])
+    parser.add_argument("--image-hz", type=int, default=default.image_hz, help="640x480 pictures a second")
+    parser.add_argument("--events-per-s", type=int, default=default.events_per_s)
     parser.add_argument("--role", choices=["publish", "subscribe"], help=argparse.SUPPRESS)
     parser.add_argument("--streams", default="", help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
-    if options.seconds <= 0.0:
-        parser.error(f"--seconds must be > 0, got {options.seconds:g}")
-    if options.role == "publish":
-        return _publish(options.streams.split(","), options.seconds)
-    if options.role == "subscribe":
-        return _subscribe(options.streams.split(","))
-    print(f"# {platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, "
-          f"NumPy {np.__version__}, events as {options.encoding}")  # fmt: skip
-    for streams in (("imu",), ("image", "events"), ("image", "events", "imu")):
-        for name, result in end_to_end(streams, seconds=options.seconds, encoding=options.encoding).items():
-            title = f"{'+'.join(streams)}.{name}"
+    given = vars(parser.parse_args(arguments))
+    role, streams = given.pop("role"), given.pop("streams")
+    load = Load(**given)
+    if load.seconds <= 0.0 or load.image_hz < 1 or 1000 % load.image_hz or load.events_per_s < 1000:
+        parser.error("--seconds must be > 0, --image-hz divide 1000, --events-per-s be 1000 or more")
+    if role == "publish":
+        return _publish(streams.split(","), load)
+    if role == "subscribe":
+        return _subscribe(streams.split(","), load.backend)
+    print(f"# {platform.machine()}, {os.cpu_count()} CPUs at a load of {os.getloadavg()[0]:.1f}, "
+          f"Python {platform.python_version()}, NumPy {np.__version__}; {load}")  # fmt: skip
+    for together in (("imu",), ("image", "events"), ("image", "events", "imu")):
+        for name, result in end_to_end(together, load).items():
+            title = f"{'+'.join(together)}.{name}"
             print(f"{title}.received {result.received} of {result.sent} messages")
             print(f"{title}.lost_in_bridge {result.lost_in_bridge} messages")
-            for which, value in zip(("median", "p99", "max"), result.latency_ms, strict=True):
+            for which, value in result.latency_ms.items():
                 print(f"{title}.latency_{which} {value:.3f} ms", flush=True)
     return 0
 
 
-def end_to_end(streams: Sequence[str], *, seconds: float, encoding: str = "evt3") -> dict[str, Result]:
-    """Send streams through a bridge, all at once.
-
-    Args:
-        streams: Names of `STREAMS`.
-        seconds: For how long [s].
-        encoding: Of the events.
-
-    Returns:
-        What became of each.
+def end_to_end(streams: Sequence[str], load: Load) -> dict[str, Result]:
+    """Send streams of `STREAMS` through a bridge, all at once; return what became of each.
 
     Raises:
         RuntimeError: A process ended early, or they did not find each other.
     """
     with tempfile.TemporaryDirectory(prefix="ctx-") as folder:
         settings = {"routes": [{"cortex": STREAMS["events"].topic, "type": STREAMS["events"].ros_type,
-                                "options": {"encoding": encoding}}]}  # fmt: skip
+                                "options": {"encoding": load.encoding}}]}  # fmt: skip
         config = Path(folder, "bridge.yaml")
         config.write_text(yaml.safe_dump(settings), encoding="utf-8")
         environment = {
@@ -121,15 +134,18 @@ def end_to_end(streams: Sequence[str], *, seconds: float, encoding: str = "evt3"
             "ROS_DOMAIN_ID": str(1 + secrets.randbelow(100)),
             "CYCLONEDDS_URI": os.environ.get("CYCLONEDDS_URI", PROFILE),
         }
-        names = ",".join(streams)
+        given = [f"--{name.replace('_', '-')}={value}" for name, value in vars(load).items()]
 
         def run(*words: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
             return _process([sys.executable, "-m", "cortex_ros2_bridge", *words], environment)
 
+        def part(role: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+            return run("bench", "--role", role, "--streams", ",".join(streams), *given)
+
         with (
-            run("--backend", "dds", "--config", str(config)),
-            run("bench", "--role", "subscribe", "--streams", names) as subscriber,
-            run("bench", "--role", "publish", "--streams", names, "--seconds", str(seconds)) as publisher,
+            run("--backend", load.backend, "--config", str(config)),
+            part("subscribe") as subscriber,
+            part("publish") as publisher,
         ):
             sent = _hear(publisher)
             print("end", file=subscriber.stdin, flush=True)
@@ -137,10 +153,9 @@ def end_to_end(streams: Sequence[str], *, seconds: float, encoding: str = "evt3"
     return {name: Result(sent=sent[name], **got[name]) for name in streams}
 
 
-def _makers() -> dict[str, Callable[[int, int], Any]]:
-    """Return what makes the message of a stream of a stamp [ns] and a number."""
+def _makers(count: int) -> dict[str, Callable[[int, int], Any]]:
+    """Return what makes the message of a stream of a stamp [ns] and a number; packets have `count` events."""
     rng = np.random.default_rng(1)
-    count = EVENTS_PER_PACKET
     pool = [
         (rng.integers(0, WIDTH, count, np.uint16), rng.integers(0, HEIGHT, count, np.uint16),
          np.sort(rng.integers(0, 1000, count)) * (np.arange(count) > 0), rng.integers(0, 2, count, np.uint8))
@@ -163,9 +178,9 @@ def _makers() -> dict[str, Callable[[int, int], Any]]:
     }
 
 
-def _publish(streams: Sequence[str], seconds: float) -> int:
+def _publish(streams: Sequence[str], load: Load) -> int:
     """Publish at the given rates, and print how many messages of each stream that were."""
-    makers = _makers()
+    makers, every = _makers(load.events_per_s // 1000), {"image": 1000 // load.image_hz}
     kinds: dict[str, type[Any]] = {"image": Image, "events": Events, "imu": Imu}
     sent = dict.fromkeys(streams, 0)
     with Node("bench") as node:
@@ -175,12 +190,12 @@ def _publish(streams: Sequence[str], seconds: float) -> int:
                 raise RuntimeError(f"nobody subscribes to {STREAMS[name].topic}")
         time.sleep(0.5)  # until DDS has matched for good, too
         begin_ns = time.monotonic_ns()
-        for tick in range(int(seconds * 1e9) // TICK_NS):
+        for tick in range(int(load.seconds * 1e9) // TICK_NS):
             wait_ns = begin_ns + tick * TICK_NS - time.monotonic_ns()
             if wait_ns > 0:
                 time.sleep(wait_ns * 1e-9)
             for name, publisher in publishers.items():
-                if tick % STREAMS[name].every == 0:
+                if tick % every.get(name, 1) == 0:
                     publisher.publish(makers[name](time.monotonic_ns(), sent[name]))
                     sent[name] += 1
         time.sleep(1.5)  # until all has arrived, and the bridge has said what it lost
@@ -188,7 +203,7 @@ def _publish(streams: Sequence[str], seconds: float) -> int:
     return 0
 
 
-def _subscribe(streams: Sequence[str]) -> int:
+def _subscribe(streams: Sequence[str], backend_name: str) -> int:
     """Receive until told to end, and print how much that was and how late."""
     from cortex_ros2_bridge import cdr, diagnostics
     from cortex_ros2_bridge.backend.base import Qos
@@ -212,7 +227,7 @@ def _subscribe(streams: Sequence[str]) -> int:
 
         return take
 
-    backend = open_backend("dds", node_name="bench_subscriber")
+    backend = open_backend(backend_name, node_name="bench_subscriber")
     try:
         for name in streams:
             stream = STREAMS[name]
@@ -223,11 +238,11 @@ def _subscribe(streams: Sequence[str]) -> int:
         backend.close()
     found = {}
     for name, values in latencies.items():
-        quantiles = np.quantile(values, (0.5, 0.99, 1.0)) / 1e6 if values else np.full(3, np.nan)
+        at = np.quantile(values, list(QUANTILES.values())) / 1e6 if values else [np.nan] * len(QUANTILES)
         found[name] = {
             "received": len(values),
             "lost_in_bridge": lost[name],
-            "latency_ms": quantiles.tolist(),
+            "latency_ms": dict(zip(QUANTILES, map(float, at), strict=True)),
         }
     print(json.dumps(found), flush=True)
     return 0

@@ -188,11 +188,9 @@ def _bridge(
         )
         try:
             bridge = stack.enter_context(Bridge(config, backend, node))
-            for part in (
-                Parameters(bridge, backend, make, given),
-                Lifecycle(bridge, backend, f"{config.namespace}/{config.node}"),
-            ):
-                stack.callback(part.close)
+            if not config.is_bag:
+                stack.callback(Parameters(bridge, backend, make, given).close)
+                stack.callback(Lifecycle(bridge, backend, f"{config.namespace}/{config.node}").close)
             where = getattr(backend, "directory", None)
             into = f" into {where}/ (rosbag2)" if where is not None else ""
             how = f"{backend.name}{into}, {backend.distro}"

@@ -95,6 +95,10 @@ class BridgeConfig:
     ros: RosArguments = field(default_factory=RosArguments)
     """What followed `--ros-args`; no setting of the file."""
 
+    def __post_init__(self) -> None:
+        if self.is_bag and not self.autostart:
+            raise ConfigError(f"autostart: false: nobody can activate a bag ({self.backend})")
+
     @property
     def is_bag(self) -> bool:
         """Whether all goes into a bag, and nobody answers."""

@@ -38,7 +38,11 @@ def refuse(code: int, reason: str) -> NoReturn:
 
 
 class Entities:
-    """Answers for vehicles and bodies."""
+    """Answers for vehicles and bodies.
+
+    `call` calls a service of the simulator, and raises `Refused` if it does not do what was asked; `news`
+    returns the newest message of a topic.
+    """
 
     def __init__(
         self,
@@ -46,13 +50,6 @@ class Entities:
         news: Callable[[str, type[Any]], Any],
         frame_names: FrameNames,
     ) -> None:
-        """Prepare.
-
-        Args:
-            call: Calls a service of the simulator; raises `Refused` if it does not do what was asked.
-            news: Returns the newest message of a topic.
-            frame_names: Names of frames.
-        """
         self._call = call
         self._news = news
         self._frames = frame_names

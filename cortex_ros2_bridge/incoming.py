@@ -40,17 +40,9 @@ SERVICES = {
 
 
 class Target:
-    """One route from ROS to Cortex: the topic that a command may become one of."""
+    """One route from ROS to Cortex: the topic that a command may become one of, if it is meant for it."""
 
     def __init__(self, route: Route, publisher: Publisher[Any], convert: Convert, context: Context) -> None:
-        """Connect the two ends.
-
-        Args:
-            route: The route; its options `stale_s` and `stamp` are ours.
-            publisher: Of the Cortex topic.
-            convert: Makes the command of CDR; None: the message is for another target.
-            context: What it needs to know besides.
-        """
         self.route = route
         self.tally = Tally(str(route))
         self.context = context
@@ -72,12 +64,6 @@ class Incoming:
     """
 
     def __init__(self, whereabouts: Whereabouts, is_active: Callable[[], bool]) -> None:
-        """Prepare, without a target.
-
-        Args:
-            whereabouts: Of the vehicle that is commanded.
-            is_active: Says whether messages may pass.
-        """
         self._is_active = is_active
         self.whereabouts = whereabouts
         self.subscription: RosSubscription | None = None
@@ -200,20 +186,14 @@ class Incoming:
 
 
 class Caller:
-    """Turns messages of ROS into requests to one Cortex service, one by one, on a thread of its own."""
+    """Turns messages of ROS into requests to one Cortex service, one by one, on a thread of its own.
+
+    The Cortex topic of its route is the name of the service.
+    """
 
     def __init__(
         self, route: Route, node: Node, convert: Convert, context: Context, is_active: Callable[[], bool]
     ) -> None:
-        """Start the thread.
-
-        Args:
-            route: The route; its Cortex topic is the name of the service.
-            node: Who calls.
-            convert: Makes the request of CDR.
-            context: What it needs to know besides.
-            is_active: Says whether requests may pass.
-        """
         self.route = route
         self.tally = Tally(str(route))
         self._is_active = is_active

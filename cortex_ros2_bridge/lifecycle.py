@@ -88,19 +88,9 @@ class Managed(Protocol):
 
 
 class Lifecycle:
-    """Answers the services of a managed node, until it is closed."""
+    """Answers the services of a managed node of a full name, until it is closed."""
 
     def __init__(self, managed: Managed, backend: Backend, node: str) -> None:
-        """Open the services and the topic.
-
-        Args:
-            managed: What is managed.
-            backend: Where they are.
-            node: Full name of the node.
-
-        Raises:
-            ValueError: The backend has no services, and nothing would ever begin.
-        """
         self._managed = managed
         self._lock = threading.Lock()
         self._resources = contextlib.ExitStack()
@@ -113,10 +103,7 @@ class Lifecycle:
         }
         for name, (kind, answer) in answers.items():
             service = backend.service(f"{node}/{name}", f"lifecycle_msgs/srv/{kind}", answer)
-            if service is not None:
-                self._resources.callback(service.close)
-            elif managed.state != ACTIVE:
-                raise ValueError(f"autostart: false needs services, which the backend {backend.name} has not")
+            self._resources.callback(service.close)
         self._events = backend.publisher(
             f"{node}/transition_event", "lifecycle_msgs/msg/TransitionEvent", Qos()
         )

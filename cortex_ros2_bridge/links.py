@@ -26,7 +26,6 @@ class Shared(Generic[V]):
     """Things that several routes use: opened for the first of them, and closed after the last."""
 
     def __init__(self) -> None:
-        """Hold nothing."""
         self._held: dict[Any, tuple[V, int]] = {}
 
     def take(self, stack: contextlib.ExitStack, key: Any, make: Callable[[], V]) -> V:
@@ -65,7 +64,7 @@ class Link:
 
 
 class Connections:
-    """Opens routes, and follows what they need besides; all on the thread that calls.
+    """Opens routes while `is_active` lets messages pass, and follows what they need besides.
 
     Attributes:
         feeds: Cortex topics.
@@ -76,14 +75,6 @@ class Connections:
     def __init__(
         self, config: BridgeConfig, backend: Backend, node: Node, is_active: Callable[[], bool]
     ) -> None:
-        """Prepare; nothing is connected.
-
-        Args:
-            config: Names topics and frames.
-            backend: The ROS side.
-            node: The Cortex side.
-            is_active: Says whether messages may pass.
-        """
         self.feeds: Shared[Feed] = Shared()
         self.incoming: Shared[Incoming] = Shared()
         self.publishers: Shared[RosPublisher] = Shared()
@@ -222,8 +213,7 @@ class Connections:
         subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
         stack.callback(subscription.close)
         service = self._backend.service(route.ros_topic, SERVICES[route.ros_type], caller.serve)
-        if service is not None:
-            stack.callback(service.close)
+        stack.callback(service.close)
         return caller.tally, lambda: subscription.publisher_count
 
     def _whereabouts_of(self, route: Route) -> Whereabouts:

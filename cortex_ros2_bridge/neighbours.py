@@ -19,12 +19,6 @@ class Neighbours:
     """Looks at both sides for what is wrong."""
 
     def __init__(self, backend: Backend, node: Node) -> None:
-        """Prepare.
-
-        Args:
-            backend: The ROS side.
-            node: The Cortex side.
-        """
         self._backend = backend
         self._node = node
         self._unfit_s: float | None = None

@@ -66,15 +66,6 @@ class Outgoing:
     def __init__(
         self, route: Route, publisher: RosPublisher, convert: Convert, context: Context, *, latched: bool
     ) -> None:
-        """Connect the two ends.
-
-        Args:
-            route: The route.
-            publisher: Of the ROS topic.
-            convert: Makes CDR of a message; None: there is nothing to send.
-            context: What it needs to know besides.
-            latched: Whether the Cortex topic gives its last message to whoever comes later.
-        """
         self.route = route
         self.tally = Tally(str(route))
         self.wanted = False
@@ -163,11 +154,6 @@ class StaticTransforms:
     """All transforms that do not change, in one message: /tf_static keeps one for whoever comes later."""
 
     def __init__(self, frames: FrameNames) -> None:
-        """Begin without any.
-
-        Args:
-            frames: Names of frames.
-        """
         self._frames = frames
         self._transforms: dict[str, tuple[str, Transform]] = {}
         self._vehicles: tuple[str, ...] = ()
@@ -225,14 +211,6 @@ class Feed:
     """
 
     def __init__(self, node: Node, topic: str, kind: type[Any] | None, *, latched: bool) -> None:
-        """Prepare; nothing is subscribed to yet.
-
-        Args:
-            node: Who subscribes.
-            topic: The topic.
-            kind: Class of its messages.
-            latched: Whether the topic gives its last message to whoever comes later.
-        """
         self.topic = topic
         self._taps: dict[Callable[[Any], None], Callable[[], bool]] = {}
         self._outputs: tuple[Outgoing, ...] = ()
@@ -390,11 +368,6 @@ class Whereabouts:
     """
 
     def __init__(self, vehicle: str) -> None:
-        """Know nothing.
-
-        Args:
-            vehicle: Its name.
-        """
         self.odometry: Odometry | None = None
         self.max_thrust_n: float | None = None
         self.ranges: CommandRanges | None = None

@@ -39,7 +39,11 @@ class Described(NamedTuple):
 
 
 class Parameters:
-    """Answers the six services of parameters, until it is closed."""
+    """Answers the six services of parameters, until it is closed.
+
+    `make` makes settings of parameters by their dotted names, and raises `ValueError` for wrong ones; `given`
+    are those of the start.
+    """
 
     def __init__(
         self,
@@ -48,14 +52,6 @@ class Parameters:
         make: Callable[[Mapping[str, Any]], BridgeConfig],
         given: Mapping[str, Any],
     ) -> None:
-        """Open the services.
-
-        Args:
-            bridge: Whose settings they are.
-            backend: Where the services are.
-            make: Makes settings of parameters by their dotted names; raises `ValueError` for wrong ones.
-            given: Parameters that were set at the start.
-        """
         self._bridge = bridge
         self._make = make
         self._given = dict(given)
@@ -71,8 +67,7 @@ class Parameters:
             ("SetParametersAtomically", self._set_together),
         ):
             service = backend.service(f"{node}/{service_path(name)}", f"rcl_interfaces/srv/{name}", answer)
-            if service is not None:
-                self._resources.callback(service.close)
+            self._resources.callback(service.close)
 
     def close(self) -> None:
         """Withdraw the services."""

@@ -46,19 +46,14 @@ _FEATURES = (0, 1, 8, 10, 11, 12, 14, 20, 24, 25, 26, 31, 32)
 
 
 class SimulationServices:
-    """Answers for the simulator, until it is closed. One of several hosts answers for itself."""
+    """Answers for the simulator, until it is closed. One of several hosts answers for itself.
+
+    Without the ROS package, rclpy has no such services, which is said.
+    """
 
     def __init__(
         self, node: Node, backend: Backend, config: BridgeConfig, is_active: Callable[[], bool]
     ) -> None:
-        """Open the services; without the ROS package, rclpy has none, which is said.
-
-        Args:
-            node: Who calls the simulator.
-            backend: Where the services are.
-            config: Names topics and frames.
-            is_active: Says whether requests may pass.
-        """
         self._node = node
         self._is_active = is_active
         self._starts_paused = False
@@ -82,15 +77,13 @@ class SimulationServices:
                 path = config.ros_topic(f"/{service_path(name)}")
                 serve = functools.partial(self._answer, answer)
                 service = backend.service(path, f"{PACKAGE}/srv/{name}", serve)
-                if service is not None:
-                    self._resources.callback(service.close)
+                self._resources.callback(service.close)
         except ValueError as error:
             logger.info("no services of %s: %s", PACKAGE, error)
         service = backend.service(
             config.ros_topic("/set_parameters"), "rcl_interfaces/srv/SetParameters", self._set_parameters
         )
-        if service is not None:
-            self._resources.callback(service.close)
+        self._resources.callback(service.close)
 
         self.close = self._resources.close  # withdraws the services; a call that is under way is given up
 

@@ -31,14 +31,13 @@ class Totals:
 
 
 class Tally(Totals):
-    """Counts what happens to the messages of one route, from any thread.
+    """Counts what happens to the messages of one route, whose name the log gets, from any thread.
 
     Attributes:
         reason: Why the last message was lost, refused or clamped; empty if none was.
     """
 
     def __init__(self, name: str) -> None:
-        """Begin at nothing; the name is that of the route, for the log."""
         super().__init__()
         self.name = name
         self.reason = ""

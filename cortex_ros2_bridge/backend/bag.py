@@ -95,9 +95,9 @@ class BagBackend:
         """There are no subscriptions: nobody publishes."""
         raise BackendError(f"{topic}: nobody publishes into a bag")
 
-    def service(self, name: str, type_name: str, callback: Serve) -> None:
-        """There are no services: nobody could ask."""
-        check_name(name)
+    def service(self, name: str, type_name: str, callback: Serve) -> NoReturn:
+        """There are no services: nobody asks."""
+        raise BackendError(f"{name}: nobody asks a bag")
 
     def topics(self) -> list[TopicInfo]:
         """Nobody else is there."""

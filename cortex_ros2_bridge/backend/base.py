@@ -122,10 +122,8 @@ class Backend(Protocol):
             ValueError: The type is unknown, or the topic's name is not valid.
         """
 
-    def service(self, name: str, type_name: str, callback: Serve) -> RosService | None:
+    def service(self, name: str, type_name: str, callback: Serve) -> RosService:
         """Answer requests to a service such as of type "std_srvs/srv/Trigger", on a thread of the backend.
-
-        None: this backend has no services.
 
         Raises:
             ValueError: The type is unknown, or the name is not valid.

@@ -69,19 +69,14 @@ def user_data_of_type(type_name: str, distro: str) -> bytes:
 
 
 class Graph:
-    """Follows discovery on a thread of its own, and announces a node once it knows how."""
+    """Follows discovery on a thread of its own, and announces a node once it knows how.
+
+    Without a distribution, that of the first node of ROS that is seen decides the layout.
+    """
 
     def __init__(
         self, participant: DomainParticipant, *, node_name: str, namespace: str, distro: str | None
     ) -> None:
-        """Begin to follow discovery.
-
-        Args:
-            participant: Participant whose endpoints are announced.
-            node_name: Name of the node.
-            namespace: Its namespace, "/" for none.
-            distro: Distribution whose layout is announced; None: that of the first node of ROS that is seen.
-        """
         self._participant = participant
         self._key: bytes = participant.guid.bytes
         self._node = node_name, namespace

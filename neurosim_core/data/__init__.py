@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neurosim_core.data.batch import Batch, EventBatch, Sample, collate
     from neurosim_core.data.live import LiveSource
+    from neurosim_core.data.ray_source import RaySource
     from neurosim_core.data.shards import write_shards
     from neurosim_core.data.stream import Dataset, Stream
     from neurosim_core.data.tonic import TonicDataset
@@ -19,6 +20,7 @@ _HOME = {
     "EventBatch": "batch",
     "LiveSource": "live",
     "Loader": "torch_loader",
+    "RaySource": "ray_source",
     "Sample": "batch",
     "Stream": "stream",
     "TonicDataset": "tonic",
@@ -32,6 +34,7 @@ __all__ = [
     "EventBatch",
     "LiveSource",
     "Loader",
+    "RaySource",
     "Sample",
     "Stream",
     "TonicDataset",

@@ -6,8 +6,14 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neurosim_core.overrides import add_set_option, read_settings, set_options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from neurosim_core.data.make import DatasetPlan
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -22,6 +28,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--flights", type=int, required=True, metavar="N", help="how many")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this one")
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="fly on a Ray cluster: local, auto, or host:port; --workers at a time",
+    )
     parser.add_argument(
         "--flights-per-scene", type=int, default=10, metavar="N", help="flights in one generated scene"
     )
@@ -43,7 +54,7 @@ def _make(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.config import load_config
     from neurosim_core.data.card import write_card
-    from neurosim_core.data.make import DatasetPlan, make_flights, prepare, write_checksums
+    from neurosim_core.data.make import DatasetPlan, prepare, write_checksums
     from neurosim_core.signals import stop_at_signals
 
     overrides = read_settings(arguments.settings)
@@ -68,14 +79,14 @@ def _make(arguments: argparse.Namespace) -> int:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with stop_at_signals(stop), Progress(*columns, console=console) as progress:
         task = progress.add_task("flights", total=plan.flight_count, completed=plan.flight_count - left)
-        for _ in make_flights(plan, workers=arguments.workers, stopped=stop.is_set):
+        for _ in _flights(plan, arguments, stop.is_set):
             progress.advance(task)
     missing = len(plan.missing())
     if missing:
         console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
         return 130
-    # The number of workers changes no byte, and so is no part of the command.
-    write_card(plan, command=shlex.join(["neurosim", *_without_workers(sys.argv[1:])]))
+    # Who flies changes no byte, and so is no part of the command.
+    write_card(plan, command=shlex.join(["neurosim", *_without(("--workers", "--ray"), sys.argv[1:])]))
     write_checksums(plan)
     if shards is not None:
         from neurosim_core.data import Dataset, write_shards
@@ -87,13 +98,28 @@ def _make(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _without_workers(words: list[str]) -> list[str]:
+def _flights(plan: DatasetPlan, arguments: argparse.Namespace, stopped: Callable[[], bool]) -> Iterator[int]:
+    if arguments.ray is None:
+        from neurosim_core.data.make import make_flights
+
+        return make_flights(plan, workers=arguments.workers, stopped=stopped)
+    from neurosim_core.data.ray_source import make_flights_on_ray
+
+    workers = max(1, arguments.workers)
+    return make_flights_on_ray(plan, address=arguments.ray, workers=workers, stopped=stopped)
+
+
+def _without(options: tuple[str, ...], words: list[str]) -> list[str]:
+    """Return a command line without some options and their values."""
     kept, skip = [], False
     for word in words:
-        if skip or word == "--workers":
-            skip = word == "--workers"
-        elif not word.startswith("--workers="):
+        if (
+            not skip
+            and not word.startswith(tuple(f"{option}=" for option in options))
+            and word not in options
+        ):
             kept.append(word)
+        skip = not skip and word in options
     return kept
 
 

@@ -26,6 +26,7 @@ import yaml
 
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.data.sources import numbered
 from neurosim_core.flight import header_of
 from neurosim_core.packets import Collision, Events, Image, Odometry, Packet
 from neurosim_core.record import RecordingWriter
@@ -113,12 +114,7 @@ class DatasetPlan:
 
     def settings(self, number: int) -> SimulationConfig:
         """Return the settings of a flight."""
-        changes: dict[str, Any] = {"seed": (self.config.seed + number) % 2**63}
-        for name, step in (("path", number), ("scene", number // self.flights_per_scene)):
-            part = getattr(self.config, name)
-            if hasattr(part, "seed"):
-                changes[name] = part.model_copy(update={"seed": part.seed + step})
-        return self.config.model_copy(update=changes)
+        return numbered(self.config, number, flights_per_scene=self.flights_per_scene)
 
     def missing(self) -> list[int]:
         """Return the numbers of the flights that are not there yet."""
@@ -147,7 +143,7 @@ def prepare(plan: DatasetPlan) -> None:
     (plan.folder / "flights").mkdir(parents=True, exist_ok=True)
     for left in (plan.folder / "flights").glob(".*.part"):
         left.unlink()
-    _replace(described, plan.description.encode())
+    write_whole(described, plan.description.encode())
 
 
 def make_flights(
@@ -170,12 +166,10 @@ def make_flights(
         for number in missing:
             if stopped():
                 return
-            yield _fly(plan, number)
+            yield fly(plan, number)
         return
     count = min(workers, max(1, len(missing)))
-    # Consecutive flights share a scene: a worker takes a stretch of them at a time.
-    size = max(1, min(plan.flights_per_scene, -(-len(missing) // count)))
-    stretches = [(plan, missing[begin : begin + size]) for begin in range(0, len(missing), size)]
+    stretches = [(plan, numbers) for numbers in stretches_of(plan, workers)]
     with multiprocessing.get_context("spawn").Pool(count, _begin_worker, (os.getpid(),)) as pool:
         known = {process.pid for process in pool._pool}  # type: ignore[attr-defined]
         result = pool.map_async(_fly_stretch, stretches, chunksize=1)
@@ -190,6 +184,13 @@ def make_flights(
                 return
             if known != {process.pid for process in pool._pool}:  # type: ignore[attr-defined]
                 raise RuntimeError("a worker died; the same command goes on")
+
+
+def stretches_of(plan: DatasetPlan, workers: int) -> list[list[int]]:
+    """Return the missing flights in parts; those of one scene stay together, as a worker loads it once."""
+    missing = plan.missing()
+    size = max(1, min(plan.flights_per_scene, -(-len(missing) // workers)))
+    return [missing[begin : begin + size] for begin in range(0, len(missing), size)]
 
 
 _parent = 0
@@ -211,11 +212,11 @@ def _begin_worker(parent: int) -> None:
 def _fly_stretch(task: tuple[DatasetPlan, list[int]]) -> None:
     plan, numbers = task
     for number in numbers:
-        _fly(plan, number)
+        fly(plan, number)
 
 
-def _fly(plan: DatasetPlan, number: int) -> int:
-    """Make one flight."""
+def fly(plan: DatasetPlan, number: int) -> int:
+    """Make one flight in this process; return its number."""
     config, path = plan.settings(number), plan.path(number)
     model = _model(config)
     part, stats = path.with_name(f".{path.name}.part"), FlightStats()
@@ -229,7 +230,7 @@ def _fly(plan: DatasetPlan, number: int) -> int:
                 stats.add(packet)
         except DynamicsError as error:
             stats.failure = str(error)
-    _replace(path.with_suffix(".json"), (json.dumps(vars(stats)) + "\n").encode())
+    write_whole(path.with_suffix(".json"), (json.dumps(vars(stats)) + "\n").encode())
     part.replace(path)
     return number
 
@@ -251,7 +252,7 @@ def write_checksums(plan: DatasetPlan) -> None:
         if path.name != "SHA256SUMS":
             with open(path, "rb") as file:
                 lines.append(f"{_sha256(file)}  {path.relative_to(plan.folder)}\n")
-    _replace(plan.folder / "SHA256SUMS", "".join(lines).encode())
+    write_whole(plan.folder / "SHA256SUMS", "".join(lines).encode())
 
 
 def _sha256(file: Any) -> str:
@@ -261,7 +262,8 @@ def _sha256(file: Any) -> str:
     return digest.hexdigest()
 
 
-def _replace(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file that is there as a whole or not at all."""
     part = path.with_name(f".{path.name}.part")
     part.write_bytes(data)
     part.replace(path)

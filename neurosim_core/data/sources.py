@@ -42,6 +42,19 @@ class SampleSource(Protocol):
         """Windows of the last call that were left out, as their ground truth is missing."""
 
 
+def numbered(config: SimulationConfig, number: int, *, flights_per_scene: int = 1) -> SimulationConfig:
+    """Return the settings of a flight: seeds of noise and path are `number` further.
+
+    That of the scene is further by one whenever `flights_per_scene` flights have been in a scene.
+    """
+    changes: dict[str, Any] = {"seed": (config.seed + number) % 2**63}
+    for name, step in (("path", number), ("scene", number // flights_per_scene)):
+        part = getattr(config, name)
+        if hasattr(part, "seed"):
+            changes[name] = part.model_copy(update={"seed": part.seed + step})
+    return config.model_copy(update=changes)
+
+
 def fields_of(config: SimulationConfig) -> dict[str, str | None]:
     """Return the field that each sensor of a configuration gives."""
     return {name: _KINDS.get(sensor.kind) for name, sensor in config.sensors.items()}

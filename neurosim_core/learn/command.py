@@ -41,10 +41,14 @@ def add_parsers(commands: _Commands) -> None:
         default="unseen",
         help="eval: where to fly: seen, unseen (default), or the file of a scene",
     )
+    learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
     dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
+    dense.add_argument(
+        "--ray", metavar="ADDRESS", help="those of --live fly on a Ray cluster: local, auto, host:port"
+    )
     dense.add_argument("--test", type=Path, metavar="DIR", help="a data set to test on")
     dense.add_argument("--minutes", type=float, default=3.0, metavar="M", help="how long (default: 3)")
     dense.add_argument("--size", type=int, default=48, metavar="PX", help="of flights (default: 48)")
@@ -127,7 +131,12 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
         backbone=arguments.backbone,
     )  # fmt: skip
     folder = arguments.out or Path("runs") / task
-    source = {"data": arguments.data, "live": arguments.live, "worlds": arguments.worlds or 0}
+    source = {
+        "data": arguments.data,
+        "live": arguments.live,
+        "ray": arguments.ray,
+        "worlds": arguments.worlds or 0,
+    }
     for name, error in train_dense(folder, config, **source, test=arguments.test).items():
         print(f"{name}: {error}")
     print(f"wrote {folder}/{task}.pt and {task}.json")
@@ -140,7 +149,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from neurosim_core.learn.train import evaluate_run
 
     for name, evaluation in evaluate_run(
-        arguments.run, scenes=arguments.scenes, device=arguments.device, worlds=arguments.worlds
+        arguments.run,
+        scenes=arguments.scenes,
+        device=arguments.device,
+        worlds=arguments.worlds,
+        speed_m_s=arguments.speed,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:

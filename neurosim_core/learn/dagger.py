@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.descent import Descent
+from neurosim_core.learn.descent import Descent, Replayed
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
 from neurosim_core.learn.task import MIRROR_ACTION
@@ -53,7 +53,7 @@ class Dagger:
 
     Args:
         env: The student sees its group `student`, of which `events` are pictures; the teacher `teacher`.
-            Observations named `velocity` are estimated besides.
+            `Task.hint` is estimated besides.
         teacher: Who is imitated.
         config: How.
         generator: Of all random numbers, on the device of the environment.
@@ -65,8 +65,10 @@ class Dagger:
         self._now, _ = env.reset()
         vector = env.group(self._now, "student")
         _, channels, height, width = self._now["events"].shape
-        hints = self._now["velocity"].shape[1]
+        hints = self._now[env.task.hint].shape[1]
         self.policy = EventPolicy(channels, height, width, vector.shape[1], hint_count=hints).to(env.device)
+        if env.device.type == "cuda":
+            self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
@@ -112,7 +114,7 @@ class Dagger:
         """Let half of the worlds be seen in a mirror, if the task says how."""
         env, signs = self.env, self.env.task.mirror
         vectors = [name for name in env.obs_groups["student"] if name != "events"]
-        known = all(name in signs for name in (*vectors, "velocity"))
+        known = all(name in signs for name in (*vectors, env.task.hint))
         self._mirrored = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self._mirrored[: env.num_envs // 2] = known
 
@@ -122,7 +124,7 @@ class Dagger:
 
         self._vector_sign = rows([sign for name in vectors for sign in signs[name]] if known else [1.0])
         self._action_sign = rows(MIRROR_ACTION)
-        self._hint_sign = rows(signs["velocity"] if known else [1.0])
+        self._hint_sign = rows(signs[env.task.hint] if known else [1.0])
 
     def _make_replay(self, vector_size: int, hint_count: int) -> None:
         """Make room for stretches of flight: [iteration, world, step, ...]; surfaces in half precision."""
@@ -137,6 +139,10 @@ class Dagger:
         self._kept["surface"] = torch.zeros(
             (*stretches, *steps, *self._now["events"].shape[1:]), dtype=torch.float16, device=env.device
         )
+        self._seen = {n: torch.zeros_like(v[0, :, 0]) for n, v in self._kept.items() if n != "memory"}
+        self._told = torch.zeros_like(env.group(self._now, "teacher"))
+        self._action = torch.zeros((env.num_envs, 4), device=env.device)
+        self._act = Replayed(self._decide, on_cuda=env.device.type == "cuda")
         self._rows = torch.zeros(config.batch, dtype=torch.int64, device=env.device)
         self._losses = torch.zeros(2, device=env.device)
         self._flown = 0
@@ -152,24 +158,17 @@ class Dagger:
         push = 2.0 * config.disturbance * (draw / lead)[:, None]
         decay = math.exp(-1.0 / (env.task.rate_hz * config.disturbance_s))
         for step in range(config.horizon):
-            now = self._now
-            surface = now["events"]
-            surface = torch.where(self._mirrored[:, None, None, None], surface.flip(-1), surface)
-            vector = env.group(now, "student") * self._vector_sign
-            label = self.teacher(env.group(now, "teacher")).clamp(-1.0, 1.0) * self._action_sign
-            for name, value in (
-                ("surface", surface),
-                ("begun", self._begun),
-                ("vector", vector),
-                ("label", label),
-                ("hint", now["velocity"] * self._hint_sign),
-            ):
+            seen = self._seen
+            seen["begun"].copy_(self._begun)
+            seen["vector"].copy_(env.group(self._now, "student"))
+            seen["hint"].copy_(self._now[env.task.hint])
+            self._told.copy_(env.group(self._now, "teacher"))
+            self._act()
+            for name, value in seen.items():
                 kept[name][:, step] = value
-            memory = self._memory * (1.0 - self._begun)[:, None]
-            action, self._memory = self.policy(surface, vector, memory)
-            noise = torch.randn(action.shape, generator=self._generator, device=env.device)
+            noise = torch.randn(self._action.shape, generator=self._generator, device=env.device)
             self._pushed.mul_(decay).add_(noise, alpha=math.sqrt(1.0 - decay**2))
-            action = torch.where(led, label + push * self._pushed, action) * self._action_sign
+            action = torch.where(led, seen["label"] + push * self._pushed, self._action) * self._action_sign
             self._now, _, terminated, truncated, info = env.step(action)
             self._begun = (terminated | truncated).float()
             counted = self._begun * ~led[:, 0]
@@ -177,6 +176,18 @@ class Dagger:
         self._flown += 1
         episodes, successes, crashes = ended.tolist()
         return {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
+
+    def _decide(self) -> None:
+        """Let teacher and student act on what is in `_seen` and `_told`, half of them in a mirror."""
+        seen, surface = self._seen, self._now["events"]
+        seen["surface"].copy_(torch.where(self._mirrored[:, None, None, None], surface.flip(-1), surface))
+        seen["vector"].mul_(self._vector_sign)
+        seen["hint"].mul_(self._hint_sign)
+        seen["label"].copy_(self.teacher(self._told).clamp(-1.0, 1.0) * self._action_sign)
+        memory = self._memory * (1.0 - seen["begun"])[:, None]
+        action, memory = self.policy(seen["surface"], seen["vector"], memory)
+        self._action.copy_(action)
+        self._memory.copy_(memory)
 
     def _learn(self, rate: float) -> dict[str, float]:
         """Learn from stretches of flight that are drawn from those kept."""
@@ -196,7 +207,7 @@ class Dagger:
         """Return the loss of the stretches that `_rows` names; adds to `_losses`."""
         part = {name: value.flatten(0, 1).index_select(0, self._rows) for name, value in self._kept.items()}
         memory = part.pop("memory")
-        part = {name: value.transpose(0, 1).float() for name, value in part.items()}
+        part = {name: value.transpose(0, 1) for name, value in part.items()}
         action, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
         errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()
         self._losses += torch.stack(errors).detach()

@@ -66,6 +66,7 @@ def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> No
     from cortex.messages import Simulation
     from neurosim_core import __version__
     from neurosim_core.config import load_config, to_yaml
+    from neurosim_core.data.sources import numbered
     from neurosim_core.live.messages import message_type, to_message
     from neurosim_core.live.topics import SIMULATION, stream_topic
     from neurosim_core.sim.rollout import run
@@ -88,10 +89,7 @@ def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> No
         )
         node.publisher(namespace + SIMULATION, Simulation, latch=True).publish(announcement)
         for number in itertools.count(seed):
-            flight = {**settings, "seed": number}
-            for part in ("scene", "path"):
-                flight[part] = {**settings[part], "seed": number}
-            for packet in run(load_config(flight)):
+            for packet in run(numbered(config, number)):
                 for publisher in publishers.values():
                     publisher.wait_for_subscribers(1, timeout_s=600.0)
                 publishers[packet.sensor].publish(to_message(packet))

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurosim_core.data import LiveSource, Stream
+from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
 from neurosim_core.learn.dense import DenseNet, Head
 from neurosim_core.learn.dense_live import flight_settings, live_flights
@@ -214,6 +214,7 @@ def train_dense(
     *,
     data: Path | None = None,
     live: int = 0,
+    ray: str | None = None,
     worlds: int = 0,
     test: Path | None = None,
 ) -> dict[str, Any]:
@@ -224,6 +225,7 @@ def train_dense(
         config: What, and how.
         data: Learn from a data set or recordings with events and what is to be predicted.
         live: Or from so many processes that fly meanwhile, and stream over Cortex.
+        ray: Address of a cluster of Ray where those of `live` fly instead; see `data.ray_source.cluster`.
         worlds: Or from so many worlds, on the device of the network.
         test: A data set to test on; None: flights in scenes of their own.
 
@@ -242,7 +244,7 @@ def train_dense(
     if live:
         torch.set_num_threads(1)  # threads that wait for each other beside processes that fly are slower
     pool = WindowPool(length=config.sequence + head.ahead, room=config.room, mirrored=head.mirrored)
-    with _source(pool, config, data, live, worlds) as more:
+    with _source(pool, config, data, live, worlds, ray) as more:
         steps = _fit(net.to(config.device), pool, config, more)
     constant = head.constant(pool.targets()).cpu()[None]
     tested = [*held_out_windows(config, test)]
@@ -285,7 +287,7 @@ def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
 
 @contextlib.contextmanager
 def _source(
-    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int
+    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
 ) -> Iterator[Callable[[int], None]]:
     """Fill a pool for the first step; yield what to call before each step, with its number."""
     head, options = config.head, _options(config)
@@ -316,8 +318,14 @@ def _source(
         fill(Stream(data, batch=64 * length, sequence=length, **options))
         yield lambda _: None
         return
-    with live_flights(live, flight_settings(config.size_px, 0, field=head.field), seed=config.seed) as names:
-        stream = Stream(LiveSource(names, timeout_s=_SILENT_S), batch=1, **options)
+    settings = flight_settings(config.size_px, 0, field=head.field)
+    with contextlib.ExitStack() as stack:
+        if ray is None:
+            names = stack.enter_context(live_flights(live, settings, seed=config.seed))
+            source: Any = LiveSource(names, timeout_s=_SILENT_S)
+        else:
+            source = RaySource(settings, simulators=live, address=ray, first=config.seed)
+        stream = Stream(source, batch=1, **options)
         filler = threading.Thread(target=fill, args=(stream,), daemon=True)
         filler.start()
         try:

@@ -1,4 +1,4 @@
-"""Gradient steps with Adam, each replayed as one CUDA graph: small networks wait for launches otherwise."""
+"""Steps that are replayed as one CUDA graph: small networks wait for launches otherwise."""
 
 from __future__ import annotations
 
@@ -12,13 +12,45 @@ _EAGER_STEPS = 3
 """Steps before one is captured: PyTorch sets things up in them."""
 
 
+class Replayed:
+    """A function without arguments, which a CUDA device replays as one graph.
+
+    Args:
+        function: Works on tensors that are the same in each call and whose values change; it must not wait
+            for the device.
+        on_cuda: Whether the tensors are on a CUDA device; elsewhere the function is called as it is.
+    """
+
+    def __init__(self, function: Callable[[], None], *, on_cuda: bool) -> None:
+        self._function, self._on_cuda = function, on_cuda
+        self._count = 0
+        self._graph: Any = None
+
+    def __call__(self) -> None:
+        """Call the function."""
+        self._count += 1
+        if not self._on_cuda:
+            self._function()
+        elif self._count <= _EAGER_STEPS:
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                self._function()
+            torch.cuda.current_stream().wait_stream(stream)
+        else:
+            if self._graph is None:
+                self._graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(self._graph):
+                    self._function()
+            self._graph.replay()
+
+
 class Descent:
-    """Minimises a loss.
+    """Minimises a loss by Adam.
 
     Args:
         module: Its parameters are changed.
-        loss: Returns the loss, of tensors that are the same in each step and whose values change; it must
-            not wait for the device.
+        loss: Returns the loss; as the function of `Replayed`.
         gradient_max: Gradients with a larger norm are scaled down to it.
         **settings: Of Adam.
 
@@ -41,8 +73,7 @@ class Descent:
         self.optimizer = torch.optim.Adam(
             module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
         )
-        self._count = 0
-        self._graph: Any = None
+        self._replayed = Replayed(self._descend, on_cuda=self._on_cuda)
 
     def step(self, rate: float) -> None:
         """Take a gradient step.
@@ -55,21 +86,7 @@ class Descent:
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        self._count += 1
-        if not self._on_cuda:
-            self._descend()
-        elif self._count <= _EAGER_STEPS:
-            stream = torch.cuda.Stream()
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
-                self._descend()
-            torch.cuda.current_stream().wait_stream(stream)
-        else:
-            if self._graph is None:
-                self._graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self._graph):
-                    self._descend()
-            self._graph.replay()
+        self._replayed()
 
     def _descend(self) -> None:
         loss = self._loss()

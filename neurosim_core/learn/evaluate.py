@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,12 +25,31 @@ class Evaluation:
     """Means over the episodes: `success`, `crash`, and what else the task measures."""
     speeds: dict[str, float]
     """Quantiles of the metric `speed_m_s` at the end of episodes without a crash [m/s]."""
+    intervals: dict[str, tuple[float, float]]
+    """95 % intervals of `success` and `crash`."""
 
     def __str__(self) -> str:
-        parts = [f"{100.0 * self.metrics[name]:.0f} % {name}" for name in ("success", "crash")]
+        parts = []
+        for name, bounds in self.intervals.items():
+            low, high = (f"{100.0 * bound:.0f}" for bound in bounds)
+            parts.append(f"{100.0 * self.metrics[name]:.0f} % {name} ({low} to {high})")
         if self.speeds:
-            parts.append(f"median speed at the end {self.speeds['median']:.2f} m/s")
-        return ", ".join(parts) + f" ({self.episodes} episodes)"
+            parts.append(f"median speed {self.speeds['median']:.2f} m/s")
+        parts += [f"{self.metrics[name]:.2f} {name}" for name in self.metrics if name not in _SAID]
+        return ", ".join(parts) + f" in {self.episodes} episodes"
+
+
+_SAID = ("success", "crash", "speed_m_s")
+
+
+def wilson(share: float, count: int, *, z: float = 1.959964) -> tuple[float, float]:
+    """Return the interval in which the probability behind a share of `count` trials lies, by default of 95 %.
+
+    Reference: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
+    """
+    middle, weight = share + 0.5 * z * z / count, 1.0 + z * z / count
+    half = z * math.sqrt(share * (1.0 - share) / count + 0.25 * (z / count) ** 2)
+    return max((middle - half) / weight, 0.0), min((middle + half) / weight, 1.0)
 
 
 def student_actor(policy: EventPolicy, env: Env, *, blind: bool = False) -> Actor:
@@ -84,8 +104,10 @@ def evaluate(
     speeds = {}
     if "speed_m_s" in found and (whole := found["speed_m_s"][found["crash"] == 0.0]).numel():
         speeds = {"median": float(whole.median()), "0.9": float(whole.quantile(0.9))}
+    metrics = {name: float(value.mean()) for name, value in found.items()}
     return Evaluation(
         episodes=env.num_envs,
-        metrics={name: float(value.mean()) for name, value in found.items()},
+        metrics=metrics,
         speeds=speeds,
+        intervals={name: wilson(metrics[name], env.num_envs) for name in ("success", "crash")},
     )

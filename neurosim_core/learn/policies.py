@@ -123,8 +123,12 @@ class EventPolicy(nn.Module):
         )
 
     def see(self, surfaces: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-        """Return features of a step, [n, 96]."""
-        features: torch.Tensor = self.mix(torch.cat([self.eyes(torch.log1p(surfaces)), vector], dim=-1))
+        """Return features of a step, [n, 96]; on CUDA bfloat16 does for surfaces in half precision."""
+        seen = torch.log1p(surfaces)
+        halved = seen.is_cuda and seen.dtype == torch.float16
+        with torch.autocast("cuda", torch.bfloat16, enabled=halved, cache_enabled=False):
+            seen = self.eyes(seen if halved else seen.float()).float()
+        features: torch.Tensor = self.mix(torch.cat([seen, vector], dim=-1))
         return features
 
     def remember(self, features: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:

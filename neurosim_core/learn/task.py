@@ -140,6 +140,8 @@ class Task:
     """Change of thrust of an action of 1, as a share of the hover thrust."""
     groups: Mapping[str, Sequence[str]] = {}
     """Names of observations that each group sees: actor, critic, teacher, student."""
+    hint: str = "velocity"
+    """Name of the observation that students estimate besides."""
     mirror: Mapping[str, Sequence[float]] = {}
     """Signs of the numbers of observations when left and right are exchanged, for students; {}: not known."""
 

@@ -205,8 +205,8 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     return dataclasses.replace(
         config,
         teacher=PpoConfig(worlds=512, iterations=40),
-        student=DaggerConfig(worlds=1024, iterations=88, replay=4, updates=24, batch=128),
-        block=44,
+        student=DaggerConfig(worlds=1024, iterations=80, replay=4, updates=26, batch=160),
+        block=40,
         evaluation_worlds=512,
     )
 
@@ -249,6 +249,7 @@ def evaluate_run(
     scenes: str = "unseen",
     device: str | None = None,
     worlds: int | None = None,
+    speed_m_s: float | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does: first with events (`events`), then without (`blind`).
 
@@ -257,11 +258,15 @@ def evaluate_run(
         scenes: Those that it was trained in (`seen`), others (`unseen`), or the file of a scene.
         device: None: as in the training.
         worlds: Episodes; None: as configured.
+        speed_m_s: At which all episodes begin [m/s]; None: as the task says.
     """
     config = read_config(folder)
     worlds = worlds or config.evaluation_worlds
+    task = find_task(config.task)
+    if speed_m_s is not None:
+        task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
     env = make_env(
-        config.task,
+        task,
         worlds=worlds,
         device=device or config.device,
         scenes=scenes if scenes in ("seen", "unseen") else [scenes],  # type: ignore[arg-type]

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 from bridge_rig import imu, rig_of
+from processes import SOON_S
 from runtime_directory import own_directory
 
 from cortex import messages as msg
-from cortex_ros2_bridge.backend.bag import BagBackend
-from cortex_ros2_bridge.config import load
+from cortex_ros2_bridge.config import ConfigError, load
 from cortex_ros2_bridge.lifecycle import Lifecycle
 from cortex_ros2_bridge.msgs import message_class
 
@@ -45,6 +45,10 @@ def managed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         assert events.closed
 
 
+def actuators_of(rig: Any) -> Any:
+    return rig.tally("/drone/command/motor_speeds <- /drone/actuators")
+
+
 def test_messages_pass_only_while_it_is_active(managed: Any) -> None:
     """Unconfigured: nothing is open; inactive: topics are there, nothing is subscribed to."""
     rig = managed.rig
@@ -61,14 +65,15 @@ def test_messages_pass_only_while_it_is_active(managed: Any) -> None:
     rig.updates_during()
     assert measured.subscriber_count == 0
     actuators.put(rotors)
-    refused = rig.tally("/drone/command/motor_speeds <- /drone/actuators")
+    refused = actuators_of(rig)
     assert (refused.received, refused.sent, refused.refused) == (1, 0, 1)
     assert managed.change(ACTIVATE)
     rig.update_until(lambda: measured.subscriber_count == 1 and commands.publisher_count == 1)
     measured.publish(imu(5))
     rig.update_until(lambda: len(sent.sent) == 1)
     actuators.put(rotors)
-    rig.update_until(lambda: commands.recv(0.1))
+    rig.update_until(lambda: actuators_of(rig).sent == 1)
+    assert commands.recv(SOON_S).speed.tolist() == [100.0] * 4
     assert managed.change(DEACTIVATE)
     rig.update_until(lambda: measured.subscriber_count == 0)
     assert (len(sent.sent), sent.closed) == (1, False)
@@ -139,10 +144,7 @@ def test_a_bridge_that_starts_by_itself_is_active(monkeypatch: pytest.MonkeyPatc
         lifecycle.close()
 
 
-def test_a_bag_cannot_be_managed(tmp_path: Any) -> None:
-    bag = BagBackend(tmp_path / "run")
-    waiting = SimpleNamespace(state=UNCONFIGURED)
-    with pytest.raises(ValueError, match="the backend bag has not"):
-        Lifecycle(waiting, bag, "/cortex_bridge")
-    bag.close()
+def test_a_bag_cannot_be_managed() -> None:
     assert not load(None, {"autostart": False}).autostart
+    with pytest.raises(ConfigError, match=r"nobody can activate a bag \(run\.mcap\)"):
+        load({"backend": "run.mcap"}, {"autostart": False})

@@ -14,7 +14,8 @@ from neurosim_core.registry import register
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
+from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor, wilson  # noqa: E402
+from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 from neurosim_core.learn.train import (  # noqa: E402
@@ -161,8 +162,17 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     assert set(first.metrics) == {"success", "crash", "speed_m_s"}
     assert first.metrics["success"] == 0.0  # an episode is shorter than the time to hold
     assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
-    assert "% success" in str(first)
+    assert "0 % success (0 to 39)" in str(first)  # 1 - 1.96^2 / (6 + 1.96^2) of all might have failed
     del training
+
+
+@pytest.mark.parametrize(("successes", "count"), [(0, 10), (1, 10), (7, 9), (490, 512), (20, 20)])
+def test_an_interval_of_a_share_is_that_of_the_score_test(successes, count):
+    """Its ends are the probabilities that a share lies 1.96 standard deviations from."""
+    from scipy.stats import binomtest
+
+    expected = binomtest(successes, count).proportion_ci(0.95, method="wilson")
+    assert wilson(successes / count, count) == pytest.approx(tuple(expected), abs=1e-7)  # z has seven digits
 
 
 def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
@@ -171,6 +181,8 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     found = dict(evaluate_run(tmp_path, scenes=str(file), worlds=3))
     assert set(found) == {"events", "blind"}
     assert found["events"].episodes == 3
+    slow = next(evaluate_run(tmp_path, scenes=str(file), worlds=3, speed_m_s=0.1))[1]
+    assert slow.metrics["speed_m_s"] < 0.5 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
 
@@ -223,8 +235,6 @@ def test_a_flight_in_a_mirror_is_a_flight(hall):
 
 def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
     """`unroll` gives the actions of single steps, also where an episode begins within."""
-    from neurosim_core.learn.policies import EventPolicy
-
     torch.manual_seed(1)
     policy = EventPolicy(4, 9, 9, 10)
     surfaces, vectors = torch.rand(6, 3, 4, 9, 9), torch.randn(6, 3, 10)
