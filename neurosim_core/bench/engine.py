@@ -30,17 +30,14 @@ from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Ambient, Light, Material, Scene, Texture
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_noise_model import TERMS as PIXEL_TERMS
 from neurosim_core.sensors.event_presets import PRESETS
 from neurosim_core.sensors.events import EventCamera
-from neurosim_core.sensors.imu import TERMS as IMU_TERMS
-from neurosim_core.sensors.imu import Imu, ImuSensorConfig
 from neurosim_core.sim.model import Model, find_device, make_model, refit
 from neurosim_core.sim.rollout import run_model, step
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.sim.state import StartState, make_state
 from neurosim_core.trajectory import FigureEightConfig, figure_eight
-from neurosim_core.vehicle import TERMS, DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
+from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 Poses = tuple[NDArray[np.float32], NDArray[np.float32]]
 """p_WC [m], shape [K, 3], and q_WC, xyzw, shape [K, 4]."""

@@ -1,8 +1,7 @@
 """What a scene does not need is left out: kernels, memory, libraries and time of runs, small and large.
 
 Each case flies in a process of its own (`python -m neurosim_core.bench.leave_out`); what it holds and has
-imported is counted there when it has flown. Kernels that leave terms out are compared with ones that have
-them with coefficients of zero.
+imported is counted there when it has flown.
 """
 
 from __future__ import annotations
@@ -10,14 +9,12 @@ from __future__ import annotations
 import gc
 import itertools
 import json
-import math
 import resource
 import subprocess
 import sys
 import time
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from neurosim_core.bench.options import Options, Progress, silent
@@ -37,9 +34,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     for title, config in cases(quick).items():
         progress(title)
         rows.append({"run": title, **run_case(config, seconds=0.2 if quick else 1.0)})
-    progress("reduced against full kernels")
-    differences = [*_vehicle_rows(quick), _imu_row(), _pixel_row()]
-    return _chapter(rows, differences)
+    return _chapter(rows)
 
 
 def cases(quick: bool) -> dict[str, dict[str, Any]]:
@@ -143,76 +138,7 @@ def _fly(config: dict[str, Any], seconds: float) -> Row:
     }
 
 
-# Reduced and full kernels
-
-
-def _vehicle_rows(quick: bool) -> list[Row]:
-    """Compare vehicles without optional terms with ones that have them all, with zeros: states and speed."""
-    from neurosim_core.bench.dynamics_long import best_rate
-    from neurosim_core.bench.engine import TERMS, Multirotor, preset
-
-    rows = []
-    for name in ("hummingbird", "crazyflie", "racer"):
-        config = preset(name)
-        vehicles = [Multirotor(config), Multirotor(config, terms=TERMS)]
-        rng, largest = np.random.default_rng(9), 0.0
-        for _ in range(100):
-            command = config.hover_rotor_speed_rad_s * rng.uniform(0.9, 1.1, (1, config.rotor_count))
-            for vehicle in vehicles:
-                vehicle.step(command, 10_000_000)
-            pairs = zip(vehicles[0].state, vehicles[1].state, strict=True)
-            largest = max(largest, *(float(np.abs(a - b).max()) for a, b in pairs))
-        reduced, full = (best_rate(v, 100, repetitions=3, cpu_s=0.05 if quick else 0.3) for v in vehicles)
-        row: Row = {"kernel": f"vehicle, {name}", "terms": ", ".join(vehicles[0].terms) or "none"}
-        rows.append({**row, "largest difference": largest, "allowed": 1e-12, "times as fast": reduced / full})
-    return rows
-
-
-def _imu_row() -> Row:
-    """Compare an IMU without errors with one that computes them all, with zeros."""
-    from neurosim_core.bench.engine import IMU_TERMS, Imu, ImuSensorConfig, Mount, Multirotor, preset
-
-    airframe = preset("hummingbird")
-    vehicle = Multirotor(airframe)
-    config = ImuSensorConfig(mount=Mount(position_m=(0.1, -0.05, 0.02), rpy_rad=(0.1, 0.2, 0.3)))
-    reduced, full = (Imu(config, vehicle, terms=terms) for terms in (None, IMU_TERMS))
-    rng, largest = np.random.default_rng(9), 0.0
-    for _ in range(400):
-        speeds = airframe.hover_rotor_speed_rad_s * rng.uniform(0.9, 1.1, (1, airframe.rotor_count))
-        vehicle.step(speeds, 2_500_000)
-        pairs = zip(reduced.sample(), full.sample(), strict=True)
-        largest = max(largest, *(float(np.abs(a - b).max()) for a, b in pairs))
-    terms = ", ".join(reduced.terms) or "none"
-    return {"kernel": "IMU", "terms": terms, "largest difference": largest, "allowed": 1e-12}
-
-
-def _pixel_row() -> Row:
-    """Compare ideal pixels with ones that compute every departure from the ideal, with zeros: stamps [us].
-
-    Log radiance wanders at random. The difference is infinite where an event is missing or of another pixel.
-    """
-    from neurosim_core.bench.engine import PIXEL_TERMS, EventCamera, EventCameraConfig
-
-    frames = np.random.default_rng(9).normal(scale=0.3, size=(20, 48, 64)).cumsum(axis=0).astype(np.float32)
-    own_law = ("stochastic", "jitter")  # without zeros that are the ideal law to the bit
-    zeros = tuple(term for term in PIXEL_TERMS if term not in own_law)
-    found = []
-    for terms in (None, zeros):
-        camera = EventCamera(EventCameraConfig(), width=64, height=48, terms=terms)
-        camera.reset(frames[0])
-        found.append(camera.feed(frames[1:], np.arange(1, len(frames)) * 1_700_123).numpy())
-    reduced, full = found
-    same = all(np.array_equal(getattr(reduced, key), getattr(full, key)) for key in ("x", "y", "polarity"))
-    largest = float(np.abs(reduced.t - full.t).max()) if same else math.inf
-    return {
-        "kernel": f"pixels, {len(reduced.t):,} events",
-        "terms": "none",
-        "largest difference": largest,
-        "allowed": 0.0,
-    }
-
-
-def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
+def _chapter(rows: list[Row]) -> Chapter:
     least, most = rows[0], rows[-1]
     imported = [name for name in _SCENE_LIBRARIES if name in least["libraries"].split(", ")]
     cpu, setup = "CPU per simulated s [ms]", "set-up [s of CPU]"
@@ -242,16 +168,9 @@ def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
                 ", ".join(imported) or f"none of {', '.join(_SCENE_LIBRARIES)}",
                 not imported,
             ),
-            Claim(
-                "reduced kernels equal the full ones with coefficients of zero: to 1e-12, and to the stamp",
-                "the equations: a term with coefficient 0 adds 0",
-                "; ".join(f"{row['kernel']} {cell(row['largest difference'])}" for row in differences),
-                all(row["largest difference"] <= row["allowed"] for row in differences),
-            ),
         ],
         tables=[
             Table("leave-out", "Kernels, memory, libraries and time", rows, "On the CPU, each in a process."),
-            Table("leave-out-differences", "Reduced kernels against full ones with zeros", differences),
         ],
         plots=[Plot("leave-out", "What runs take, few parts to many", panels)],
     )

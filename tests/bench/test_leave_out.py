@@ -18,19 +18,12 @@ def test_an_imu_alone_needs_no_pictures_and_no_libraries_for_scenes(rows):
     least, most = rows
     assert least["modules of kernels"] < most["modules of kernels"]
     assert least["their size [MiB]"] < 0.2 * most["their size [MiB]"]
-    assert [claim.met for claim in leave_out._chapter(rows, []).claims] == [True, True, True]
+    assert [claim.met for claim in leave_out._chapter(rows).claims] == [True, True]
 
 
 def test_what_should_not_be_there_is_seen(rows):
     least = {**rows[0], "pictures": 1, "libraries": "scipy, trimesh"}
-    wrong = {"kernel": "vehicle", "largest difference": 1e-9, "allowed": 1e-12}
-    chapter = leave_out._chapter([least, rows[1]], [wrong])
-    assert [claim.met for claim in chapter.claims] == [False, False, False]
-
-
-def test_reduced_kernels_equal_the_full_ones():
-    for row in (*leave_out._vehicle_rows(True), leave_out._imu_row(), leave_out._pixel_row()):
-        assert row["largest difference"] <= row["allowed"]
+    assert [claim.met for claim in leave_out._chapter([least, rows[1]]).claims] == [False, False]
 
 
 def test_a_run_that_fails_says_why():

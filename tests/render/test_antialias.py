@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 from render_scenes import DARK, LOOK_DOWN, UNSHADOWED, box, plane, render, scene_of
+from scipy.spatial.transform import Rotation
 
 from neurosim_core.render.antialias import first_rays, ray_layers
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS, RADIANCE
-from neurosim_core.scene.scene import Ambient, Material
+from neurosim_core.scene.scene import Ambient, Material, Texture
 
 LENS = PinholeConfig(width=33, height=18, fx=32.0, fy=32.0, cx=16.5, cy=9.0)
 """At 1 m a pixel is 1/32 m wide. The last blocks of 4 x 4 pixels are cut."""
@@ -151,6 +152,29 @@ def test_faces_that_are_cut_for_baked_light(traversal):
         )
         seen[samples] = render(part, LENS, poses, outputs=("log_radiance",), config=config)["log_radiance"]
     assert np.abs(np.exp(seen["adaptive"]) - np.exp(seen[64])).max() < 0.75 * (1.0 / 16.0 + 1.0 / 64.0) + 1e-3
+
+
+def test_faces_that_are_seen_edge_on(device):
+    """A wall that is cut into parts, from within its plane: parts without extent are no reason for nan."""
+    turn = Rotation.from_euler("zxy", [0.7, 0.13, 0.21])
+    corners = turn.apply([[-3.0, 0.0, -1.0], [3.0, 0.0, -1.0], [3.0, 0.0, 1.5], [-3.0, 0.0, 1.5]])
+    wall, floor = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False), plane(8.0)
+    uv = np.array([[0, 0], [6, 0], [6, 3], [0, 0], [6, 3], [0, 3], *[[0, 0]] * (3 * len(floor.faces))])
+    rng = np.random.default_rng(0)
+    noise = Texture(name="noise", srgb=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8))
+    scene = scene_of(wall, floor, materials=(Material(name="noise", texture=noise),), uv=uv)
+    poses = []
+    for along, up, off in rng.uniform([-6.0, -1.0, -1e-6], [6.0, 1.5, 1e-6], (64, 3)):
+        position = turn.apply([along, off, up])
+        forward = turn.apply([0.0, 0.0, 0.2]) - position
+        right = np.cross([0.0, 0.0, -1.0], forward)
+        axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+        turned = Rotation.from_matrix(axes / np.linalg.norm(axes, axis=0))
+        poses.append((tuple(position), tuple(turned.as_quat())))
+    lighting = LightingConfig(edge_max_m=0.1, ambient_ray_count=1, shadow_ray_count=1)
+    config = ADAPTIVE.model_copy(update={"lighting": lighting})
+    log = render(scene, LENS, poses, outputs=("log_radiance",), config=config, device=device)["log_radiance"]
+    assert np.isfinite(log).all()
 
 
 def test_threads_and_launches_change_nothing():

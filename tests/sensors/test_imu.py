@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.sensors.imu import CORRELATION_TIMES_S, Imu, ImuConfig
+from neurosim_core.sensors.imu import CORRELATION_TIMES_S, TERMS, Imu, ImuConfig
 from neurosim_core.vehicle import Multirotor, preset
 
 MS = 1_000_000
@@ -227,6 +227,17 @@ def test_reset_starts_the_noise_again(device):
         runs.append(np.concatenate([imu.specific_force.numpy(), imu.angular_rate.numpy()], axis=2))
     assert np.array_equal(*runs)
     assert len(np.unique(runs[0])) == runs[0].size
+
+
+def test_terms_with_zero_coefficients_change_nothing(device):
+    vehicle = isolated(device)
+    vehicle.reset(body_rate=(1.0, 2.0, 5.0))
+    config = ImuConfig(mount={"position_m": (0.3, -0.1, 0.2), "rpy_rad": (0.1, 0.2, 0.3)})
+    reduced, full = (Imu(config, vehicle, terms=terms) for terms in (None, TERMS))
+    for _ in range(20):
+        vehicle.step(np.full(4, 500.0), 3 * MS)
+        for one, other in zip(reduced.sample(), full.sample(), strict=True):
+            assert one == pytest.approx(other, abs=1e-12)  # a sum of float64 in another order
 
 
 def test_saturation(device):

@@ -181,6 +181,8 @@ int main(int argc, char** argv) {
     options.registry = "off";
     options.peers = {peers};
   }
+  if (const char* keys = std::getenv("CORTEX_TEST_KEYS")) options.keys = keys;
+  if (const char* listen = std::getenv("CORTEX_TEST_LISTEN")) options.listen = listen;
   cortex::Node node{"cpp", options};
   std::thread input([] {
     std::string line;

@@ -3,7 +3,8 @@ constexpr float OVERLAP = 1e-5f; // of a triangle's size: no point falls between
 // Functions of a direction whose values are the weights of a triangle's corners over the distance to its plane along it.
 auto functions_of = [&](const wp::vec3& a, const wp::vec3& b, const wp::vec3& c, auto& function) {
     const wp::vec3 normals[3] = {wp::cross(b, c), wp::cross(c, a), wp::cross(a, b)};
-    const float volume = wp::dot(a, normals[0]), scale = 1.0f / volume;
+    const float volume = wp::dot(a, normals[0]);
+    const float scale = wp::abs(volume) > 1e-30f ? 1.0f / volume : 0.0f; // all 0 for a triangle that is seen edge-on
     for (int side = 0; side < 3; ++side)
         for (int axis = 0; axis < 3; ++axis) function[side][axis] = normals[side][axis] * scale;
     return volume;

@@ -17,6 +17,7 @@
 #include "cortex/codec.hpp"
 #include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
+#include "cortex/security.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
 
@@ -76,8 +77,9 @@ class Directory {
   using Nodes = std::map<std::uint64_t, records::NodeRecord>;
 
   Directory(zmq::context_t& context, std::function<records::NodeRecord()> record, std::string registry,
-            const std::vector<std::string>& peers, std::shared_ptr<net::Complaints> complaints)
-      : record_(std::move(record)), complaints_(std::move(complaints)) {
+            const std::vector<std::string>& peers, std::shared_ptr<const Keys> keys,
+            std::shared_ptr<net::Complaints> complaints)
+      : record_(std::move(record)), keys_(std::move(keys)), complaints_(std::move(complaints)) {
     own_ = next_record();
     if (!registry.empty()) connect(context, registry, true);
     for (const auto& peer : peers) connect(context, peer, false);
@@ -145,7 +147,13 @@ class Directory {
       }
       const auto found = inbound_.emplace(hello.record.node, Inbound{now_ns, sender}).first;
       if (found->second.sender != sender) {
-        return control_frame(records::Refused{hello.record.node, "it is the node of another process"});
+        return control_frame(records::Refused{hello.record.node, "it is the node of another process or key"});
+      }
+      const auto& places = hello.record.endpoints;
+      if (is_key(sender) && std::any_of(places.begin(), places.end(), [&](const records::Endpoint& place) {
+            return !place.server_key.empty() && place.server_key != sender;
+          })) {
+        return control_frame(records::Refused{hello.record.node, "its addresses have another key than it came with"});
       }
       found->second.seen_ns = now_ns;
       put(nullptr, hello.record);
@@ -225,6 +233,11 @@ class Directory {
     link->socket.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
     // Nothing may queue for a peer that is not there: a `send` that fails tells us so at once.
     link->socket.set(zmq::sockopt::immediate, true);
+    if (keys_ != nullptr && net::is_tcp(address)) {
+      const std::string server_key = keys_->of_host(net::host_of(address));
+      if (!keys_->allows(server_key)) throw std::invalid_argument("the key of " + address + " is not authorised");
+      keys_->apply_client(link->socket, server_key);
+    }
     link->socket.connect(address);
     link->heard_ns = monotonic_ns();
     links_.push_back(std::move(link));
@@ -461,6 +474,7 @@ class Directory {
   }
 
   std::function<records::NodeRecord()> record_;
+  std::shared_ptr<const Keys> keys_;
   std::shared_ptr<net::Complaints> complaints_;
   std::vector<std::unique_ptr<Link>> links_;
   records::NodeRecord own_;

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <cstring>
 #include <deque>
+#include <functional>
 #include <map>
 #include <memory>
 #include <string>
@@ -43,8 +44,8 @@ struct TypeId {
 class Link {
  public:
   Link(zmq::context_t& context, std::string address, std::uint64_t source, TypeId type, const Policy& policy,
-       bool local, std::int64_t clock_offset_ns, std::shared_ptr<SubscriberCounters> counters,
-       std::shared_ptr<net::Complaints> complaints)
+       bool local, std::int64_t clock_offset_ns, const std::function<void(zmq::socket_t&)>& secure,
+       std::shared_ptr<SubscriberCounters> counters, std::shared_ptr<net::Complaints> complaints)
       : address_(std::move(address)),
         source_(source),
         type_(type),
@@ -60,6 +61,7 @@ class Link {
     const bool shared_memory = false && local;
 #endif
     fd_ = socket_.get(zmq::sockopt::fd);
+    secure(socket_);
     socket_.connect(address_);
     for (const char kind : {'M', 'B', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
     if (shared_memory) socket_.set(zmq::sockopt::subscribe, prefix('S'));

@@ -25,6 +25,7 @@
 #include "cortex/publisher_core.hpp"
 #include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
+#include "cortex/security.hpp"
 #include "cortex/subscriber.hpp"
 
 namespace cortex {
@@ -34,7 +35,8 @@ struct Options {
   std::string registry = "auto";   // "auto": the one of this host; "off"; or "tcp://host:port"
   std::vector<std::string> peers;  // control addresses of nodes to talk to without a registry
   std::string listen;              // address of an interface to be reached at over tcp; empty: this host only
-  bool insecure = false;           // allow plain tcp beyond this host
+  std::string keys;                // directory of CURVE keys for tcp (`cortex keys new`); empty: none
+  bool insecure = false;           // without keys, allow plain tcp beyond this host
   Log log = [](const std::string& text) { std::clog << "cortex: " + text + "\n"; };
 };
 
@@ -46,6 +48,7 @@ class Node {
     if (name_.empty() || name_.size() > 100) {
       throw std::invalid_argument("a node's name has 1 to 100 characters, got '" + name_ + "'");
     }
+    if (!options_.keys.empty()) keys_ = std::make_shared<const Keys>(options_.keys);
     check_addresses();
     const std::string directory = runtime::directory(runtime::domain_id(options_.domain));
     host_ = runtime::host_id();
@@ -57,7 +60,7 @@ class Node {
                                  : options_.registry == "off" ? ""
                                                               : options_.registry;
     directory_ = std::make_unique<detail::Directory>(
-        context_, [this] { return record(); }, registry, options_.peers, complaints_);
+        context_, [this] { return record(); }, registry, options_.peers, keys_, complaints_);
     connected_ = directory_->connected();
     thread_ = std::thread([this] { run(); });
   }
@@ -129,6 +132,7 @@ class Node {
     }
     directory_.reset();
     router_.close();
+    authenticator_.reset();
     context_.close();
     files_.reset();
   }
@@ -145,23 +149,19 @@ class Node {
   static constexpr std::int64_t busy_ns = 300'000'000;
   static constexpr std::int64_t linger_ns = 500'000'000;
 
-  static bool is_loopback(const std::string& host) {
-    return host.rfind("127.", 0) == 0 || host == "::1" || host == "[::1]" || host == "localhost";
-  }
-
   void check_addresses() const {
-    if (options_.insecure) return;
+    if (options_.insecure || keys_ != nullptr) return;
     std::vector<std::string> hosts;
     if (!options_.listen.empty()) hosts.push_back(options_.listen);
     std::vector<std::string> addresses = options_.peers;
     addresses.push_back(options_.registry);
     for (const auto& address : addresses) {
-      if (net::is_tcp(address)) hosts.push_back(address.substr(6, address.rfind(':') - 6));
+      if (net::is_tcp(address)) hosts.push_back(net::host_of(address));
     }
     for (const auto& host : hosts) {
-      if (!is_loopback(host)) {
-        throw std::invalid_argument("plain tcp to " + host + " is open to the network; this client has no CURVE: set " +
-                                    "insecure = true if the network is trusted");
+      if (!net::is_loopback(host)) {
+        throw std::invalid_argument("plain tcp to " + host + " is open to the network: set keys (`cortex keys new`), " +
+                                    "or insecure = true if the network is trusted");
       }
     }
   }
@@ -185,14 +185,17 @@ class Node {
       throw std::invalid_argument("listen must be the address of an interface, which others are told, got '" +
                                   options_.listen + "'");
     }
+    if (keys_ != nullptr) authenticator_ = std::make_unique<Authenticator>(context_, keys_, complaints_);
     const auto bind = [&](zmq::socket_t& socket) {
-      const bool bare = options_.listen.find(':') != std::string::npos && options_.listen.front() != '[';
+      if (keys_ != nullptr) keys_->apply_server(socket);
+      const bool sixth = options_.listen.find(':') != std::string::npos, bare = sixth && options_.listen.front() != '[';
+      socket.set(zmq::sockopt::ipv6, sixth);  // else others would be told ::ffff:127.0.0.1
       socket.bind("tcp://" + (bare ? "[" + options_.listen + "]" : options_.listen) + ":*");
       return socket.get(zmq::sockopt::last_endpoint);
     };
     const std::string lossy = bind(outlets_->lossy.socket);
     const std::string strict = bind(outlets_->strict.socket);
-    endpoints_.push_back({"tcp", lossy, strict, bind(router_), ""});
+    endpoints_.push_back({"tcp", lossy, strict, bind(router_), keys_ == nullptr ? "" : keys_->public_key()});
   }
 
   void check_open(const std::string& topic) const {
@@ -302,6 +305,7 @@ class Node {
     for (auto* socket : directory_->sockets()) add(socket->get(zmq::sockopt::fd));
     add(lossy_fd_);
     add(strict_fd_);
+    if (authenticator_ != nullptr) add(authenticator_->fd());
     const std::int64_t left_ns = std::clamp<std::int64_t>(directory_->deadline_ns() - monotonic_ns(), 0, most_ns);
     ::poll(fds.data(), fds.size(), static_cast<int>((left_ns + 999'999) / 1'000'000));
     if ((fds[0].revents & POLLIN) != 0) waker_.clear();
@@ -314,6 +318,7 @@ class Node {
       changed = true;
       directory_->announce();
     }
+    if (authenticator_ != nullptr) authenticator_->serve();
     serve();
     directory_->tick();
     connected_ = directory_->connected();
@@ -348,10 +353,11 @@ class Node {
           if (endpoint == nullptr) continue;
           sources.push_back({publisher.source, publisher.fingerprint, publisher.schema,
                              subscription->policy().is_reliable ? endpoint->strict : endpoint->lossy,
-                             endpoint->transport == "ipc", same_host ? 0 : node->clock_offset_ns - clock_offset_ns_});
+                             endpoint->transport == "ipc", same_host ? 0 : node->clock_offset_ns - clock_offset_ns_,
+                             endpoint->server_key});
         }
       }
-      subscription->match(context_, sources);
+      subscription->match(context_, sources, keys_.get());
     }
   }
 
@@ -359,16 +365,24 @@ class Node {
     for (const auto& endpoint : node.endpoints) {
       if (endpoint.transport == "ipc" && same_host) return &endpoint;
     }
-    bool keyed = false;
+    std::string why = "it does not listen beyond its host";
     for (const auto& endpoint : node.endpoints) {
       if (endpoint.transport != "tcp") continue;
-      if (endpoint.server_key.empty()) return &endpoint;
-      keyed = true;
+      if (may_reach(endpoint)) return &endpoint;
+      why = endpoint.server_key.empty() ? "it speaks plain tcp"
+            : keys_ == nullptr          ? "it wants CURVE, and this node has no keys"
+                                        : "its key " + endpoint.server_key + " is not authorised";
     }
-    complaints_->once("reach " + std::to_string(node.node),
-                      "node '" + node.name + "' cannot be reached: " +
-                          (keyed ? "it wants CURVE, which this client has not" : "it does not listen beyond its host"));
+    complaints_->once("reach " + std::to_string(node.node), "node '" + node.name + "' cannot be reached: " + why);
     return nullptr;
+  }
+
+  // With keys nothing beyond this host is spoken to in plain.
+  bool may_reach(const records::Endpoint& endpoint) const {
+    if (!endpoint.server_key.empty()) return keys_ != nullptr && keys_->allows(endpoint.server_key);
+    const auto local = [](const std::string& address) { return net::is_loopback(net::host_of(address)); };
+    return (options_.insecure && keys_ == nullptr) ||
+           (local(endpoint.lossy) && local(endpoint.strict) && local(endpoint.control));
   }
 
   void serve() {
@@ -420,7 +434,9 @@ class Node {
   std::int64_t clock_offset_ns_ = 0;
   std::shared_ptr<net::Complaints> complaints_ = std::make_shared<net::Complaints>(options_.log);
   std::unique_ptr<runtime::NodeFiles> files_;
+  std::shared_ptr<const Keys> keys_;
   zmq::context_t context_;
+  std::unique_ptr<Authenticator> authenticator_;
   std::shared_ptr<detail::Outlets> outlets_;
   zmq::socket_t router_;
   int lossy_fd_ = -1;

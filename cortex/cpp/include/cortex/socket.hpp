@@ -29,9 +29,18 @@ namespace net {
 constexpr int queue_max = 1000;
 
 inline bool is_tcp(const std::string& address) { return address.rfind("tcp://", 0) == 0; }
-inline bool is_ipc(const std::string& address) { return address.rfind("ipc://", 0) == 0; }
+// The host of a tcp address, without the brackets of IPv6.
+inline std::string host_of(const std::string& address) {
+  std::string host = address.substr(6, address.rfind(':') - 6);
+  host.erase(std::remove_if(host.begin(), host.end(), [](char c) { return c == '[' || c == ']'; }), host.end());
+  return host;
+}
 
-// Where the unix socket of an ipc address lies.
+inline bool is_loopback(const std::string& host) {
+  return host.rfind("127.", 0) == 0 || host == "::1" || host == "localhost";
+}
+
+inline bool is_ipc(const std::string& address) { return address.rfind("ipc://", 0) == 0; }
 
 // A socket that never blocks its owner at close, and over tcp notices a peer that is gone. On ipc the kernel reports
 // a dead peer at once, and a stopped one may still hold leases of shared memory.
@@ -60,10 +69,13 @@ inline Span<const std::uint8_t> bytes(const zmq::message_t& message) {
   return {static_cast<const std::uint8_t*>(message.data()), message.size()};
 }
 
-// Who sent a message: user, group and process of this host, or the address of another.
+// Who sent a message: its CURVE key; else user, group and process of this host, or the address of another.
 inline std::string sender_of(const zmq::message_t& message) {
-  const char* found = zmq_msg_gets(message.handle(), "Peer-Address");
-  return found == nullptr ? "" : found;
+  for (const char* name : {"User-Id", "Peer-Address"}) {
+    const char* found = zmq_msg_gets(message.handle(), name);
+    if (found != nullptr && *found != 0) return found;
+  }
+  return "";
 }
 
 // Takes in the parts of a message after the one that was read; returns how many there were.

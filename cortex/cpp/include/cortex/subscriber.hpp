@@ -80,6 +80,7 @@ struct Source {
   std::string address;
   bool local = false;
   std::int64_t clock_offset_ns = 0;
+  std::string server_key;  // for CURVE; empty: plain
 };
 
 class SubscriptionCore {
@@ -101,7 +102,7 @@ class SubscriptionCore {
   const Policy& policy() const noexcept { return policy_; }
 
   // Connects to what is there and takes leave of what is gone; for the node's thread.
-  void match(zmq::context_t& context, const std::vector<Source>& sources) {
+  void match(zmq::context_t& context, const std::vector<Source>& sources, const Keys* keys) {
     const std::lock_guard<std::mutex> lock(mutex_);
     if (closed_) return;
     for (auto& link : links_) {
@@ -118,8 +119,11 @@ class SubscriptionCore {
         complain(source);
         continue;
       }
+      const auto secure = [&](zmq::socket_t& socket) {
+        if (!source.server_key.empty()) keys->apply_client(socket, source.server_key);
+      };
       links_.push_back(std::make_unique<Link>(context, source.address, source.source, type_, policy_, source.local,
-                                              source.clock_offset_ns, counters_, complaints_));
+                                              source.clock_offset_ns, secure, counters_, complaints_));
     }
     waker_.set();
   }

@@ -1,0 +1,162 @@
+"""CURVE between the C++ client and Python, over tcp as from another host."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cpp_client import Peer
+from cpp_messages import Rich, Scan
+from cpp_programs import needs_compiler, programs
+from processes import SOON_S, wait_for
+
+from cortex.node import Node
+from cortex.policy import reliable
+from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
+
+__all__ = ["programs"]
+
+pytestmark = needs_compiler
+
+Start = Callable[..., Any]
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> dict[str, Path]:
+    """Key directories: `python` and `cpp` trust each other, `stranger` trusts both and is trusted by none."""
+    names = ("python", "cpp", "stranger")
+    public = {name: new_keys(tmp_path / name).public for name in names}
+    for name in names:
+        trusted = [public[other] for other in ("python", "cpp")]
+        (tmp_path / name / AUTHORIZED_FILE).write_text("# friends\n" + "\n".join(trusted) + "\n")
+    return {name: tmp_path / name for name in names}
+
+
+def authorize(place: Path, key: str) -> None:
+    """Add the key that answers at 127.0.0.1."""
+    file = place / AUTHORIZED_FILE
+    file.write_text(f"{file.read_text()}{key} 127.0.0.1\n")
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[Path]:
+    """A runtime directory of another host, whose path leaves room for sockets."""
+    with tempfile.TemporaryDirectory(prefix="ctx-", dir="/tmp") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def python_node(places: dict[str, Path], make_node: Callable[..., Node]) -> Node:
+    keys = load_keys(places["python"])
+    return make_node(registry="off", listen="127.0.0.1", keys=keys)
+
+
+@pytest.fixture
+def start_cpp(
+    programs: Path,
+    python_node: Node,
+    places: dict[str, Path],
+    elsewhere: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Start:
+    """Start a peer of the Python node, with the keys of a directory; a stranger is not waited for."""
+
+    def start(name: str, *arguments: object) -> Any:
+        [tcp] = [e for e in python_node.nodes()[0].endpoints if e.transport == "tcp"]
+        address = tcp.control
+        authorize(places[name], load_keys(places["python"]).public)
+        with monkeypatch.context() as environment:
+            environment.setenv("CORTEX_TEST_PEER", address)
+            environment.setenv("CORTEX_TEST_KEYS", str(places[name]))
+            environment.setenv("CORTEX_TEST_LISTEN", "127.0.0.1")
+            environment.setenv("CORTEX_RUNTIME_DIR", str(elsewhere))
+            command = [programs / "peer", *map(str, arguments)]
+            if name == "stranger":
+                return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
+            return Peer(command)
+
+    return start
+
+
+def test_cpp_reads_what_python_writes(start_cpp: Start, python_node: Node) -> None:
+    scans = python_node.publisher("/scan", Scan)
+    peer = start_cpp("cpp", "count", "/scan", "reliable", 0, 0)
+    assert scans.wait_for_subscribers(1, SOON_S)
+    for number in [*range(100), -1]:
+        scans.publish(Scan(number, np.full(8, number, np.float32)))
+    result = json.loads(peer.line())
+    assert (result["received"], result["wrong"], result["lost"]) == (100, 0, 0)
+    peer.end()
+
+
+def test_python_reads_what_cpp_writes(start_cpp: Start, python_node: Node) -> None:
+    scans = python_node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
+    peer = start_cpp("cpp", "publish", "/scan", 100, 8)
+    assert [scans.recv(SOON_S).stamp_ns for _ in range(100)] == list(range(100))
+    [found] = [node for node in python_node.nodes() if node.name == "cpp"]
+    [tcp] = [e for e in found.endpoints if e.transport == "tcp"]
+    assert tcp.server_key != ""
+    peer.end()
+
+
+def test_a_stranger_is_told_nothing(
+    start_cpp: Start, python_node: Node, caplog: pytest.LogCaptureFixture, places: dict[str, Path]
+) -> None:
+    key = load_keys(places["stranger"]).public
+    process = start_cpp("stranger", "count", "/scan", "reliable", 0, 0)
+    try:
+        assert wait_for(lambda: f"refused key {key}" in caplog.text)
+    finally:
+        process.kill()
+        process.communicate()
+    assert [node.name for node in python_node.nodes()] == [python_node.name]
+
+
+def test_a_stranger_cannot_read_cpp(
+    start_cpp: Start, python_node: Node, places: dict[str, Path], make_node: Callable[..., Node]
+) -> None:
+    """A key that the list no longer has: the publisher's process says whom it has refused."""
+    peer = start_cpp("cpp", "echo")
+    assert wait_for(lambda: len(python_node.nodes()) == 2)
+    [tcp] = [
+        e
+        for node in python_node.nodes()
+        if node.name == "cpp"
+        for e in node.endpoints
+        if e.transport == "tcp"
+    ]
+    authorize(places["stranger"], tcp.server_key)
+    stranger = make_node(
+        registry="off",
+        peers=[tcp.control],
+        listen="127.0.0.1",
+        keys=load_keys(places["stranger"]),
+    )
+    scans = stranger.subscriber("/from_cpp", Rich)
+    with pytest.raises(TimeoutError):
+        scans.recv(1.0)
+    assert f"refused key {load_keys(places['stranger']).public}" in peer.end()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda place: (place / "key.secret").chmod(0o644), "key.secret is open to others"),
+        (lambda place: (place / "key.secret").unlink(), "cannot read"),
+        (lambda place: (place / "key.public").write_text("no key"), "40 characters of Z85"),
+        (lambda place: (place / "key.public").write_text("0" * 40), "does not belong"),
+        (lambda place: (place / AUTHORIZED_FILE).write_text("rubbish"), "must hold keys and comments"),
+    ],
+)
+def test_bad_keys_are_refused(
+    start_cpp: Start, places: dict[str, Path], damage: Callable[[Path], object], said: str
+) -> None:
+    damage(places["cpp"])
+    with pytest.raises(AssertionError, match=said):
+        start_cpp("cpp", "count", "/scan", "reliable", 0, 0)
