@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
@@ -356,31 +357,27 @@ class Feed:
                 output.tally.refuse("a malformed message, or one of another type")
 
 
+@dataclass(eq=False)
 class Whereabouts:
-    """What the bridge knows of a vehicle: its newest state, and what time that is.
+    """What the bridge knows of a vehicle: its newest state, and what time that is."""
 
-    Attributes:
-        odometry: The newest state; None if none has come.
-        ranges: What it can be asked for; None if the simulator has not said.
-        max_thrust_n: Thrust with all rotors at their highest speed [N]; None if the simulator has not said.
-        sources: Topics of state, of time and of the simulation; None where there is none.
-        resources: What is to be closed when the sources change.
-    """
-
-    def __init__(self, vehicle: str) -> None:
-        self.odometry: Odometry | None = None
-        self.max_thrust_n: float | None = None
-        self.ranges: CommandRanges | None = None
-        self.sources: tuple[str | None, ...] = None, None, None
-        self._vehicle = vehicle
-        self.resources = contextlib.ExitStack()
-        self._clock_ns: int | None = None
+    vehicle: str
+    odometry: Odometry | None = None
+    max_thrust_n: float | None = None
+    """Thrust with all rotors at their highest speed [N]; None if the simulator has not said."""
+    ranges: CommandRanges | None = None
+    """What it can be asked for; None if the simulator has not said."""
+    sources: tuple[str | None, ...] = (None, None, None)
+    """Topics of state, of time and of the simulation; None where there is none."""
+    resources: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    """What is to be closed when the sources change."""
+    clock_ns: int | None = None
 
     def forget(self, sources: tuple[str | None, ...]) -> None:
         """Forget all that came from other sources."""
         self.resources.close()
         self.sources = sources
-        self.odometry = self._clock_ns = self.max_thrust_n = self.ranges = None
+        self.odometry = self.clock_ns = self.max_thrust_n = self.ranges = None
 
     def take_odometry(self, message: Odometry) -> None:
         """Take in a state."""
@@ -388,17 +385,17 @@ class Whereabouts:
 
     def take_clock(self, message: Clock) -> None:
         """Take in the time of the run."""
-        self._clock_ns = message.stamp_ns
+        self.clock_ns = message.stamp_ns
 
     def take_simulation(self, message: Simulation) -> None:
         """Take in what a vehicle can do."""
         known = dict(zip(message.vehicles, message.thrust_max_n, strict=False))
-        self.max_thrust_n = known.get(self._vehicle)
+        self.max_thrust_n = known.get(self.vehicle)
         ranges = dict(zip(message.vehicles, message.command_ranges, strict=False))
-        self.ranges = ranges.get(self._vehicle)
+        self.ranges = ranges.get(self.vehicle)
 
     @property
     def now_ns(self) -> int | None:
         """Time of the newest state, else that of the run [ns]; None if neither has come."""
         odometry = self.odometry
-        return self._clock_ns if odometry is None else odometry.stamp_ns
+        return self.clock_ns if odometry is None else odometry.stamp_ns

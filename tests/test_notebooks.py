@@ -1,23 +1,13 @@
-"""The notebooks run from top to bottom."""
+"""The notebooks run from top to bottom, as the code of their cells."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import json
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
-RUN = """
-import sys, nbformat, nbclient
-notebook = nbformat.read(sys.argv[1], as_version=4)
-assert not any(cell.get("outputs") for cell in notebook.cells), "commit notebooks without outputs"
-nbclient.NotebookClient(notebook, timeout=300).execute()
-print(notebook.cells[-1].outputs[0]["text"])
-"""
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "examples" / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_three():
@@ -25,16 +15,13 @@ def test_there_are_three():
 
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
-def test_a_notebook_runs(file, tmp_path):
-    pytest.importorskip("nbclient")
-    pytest.importorskip("ipykernel")
-    done = subprocess.run(
-        [sys.executable, "-c", RUN, str(file)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "events" in done.stdout.splitlines()[0]
+def test_a_notebook_runs(file, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = [cell for cell in json.loads(file.read_text("utf-8"))["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] for cell in cells), "commit notebooks without outputs"
+    names: dict[str, object] = {"__name__": "__main__"}
+    for cell in cells:
+        exec(compile("".join(cell["source"]), file.name, "exec"), names)
+    assert "events" in capsys.readouterr().out

@@ -83,11 +83,12 @@ def standard(
     qos: Qos = Qos(),  # noqa: B008  (frozen)
     *options: str,
     default: bool = True,
+    direction: Direction = "out",
 ) -> Callable[[F], F]:
     """Register a conversion of the bridge's own, which makes a record or CDR; see `Rule`."""
 
     def register(function: F) -> F:
-        _add_rule(kind, ros_type, "out", name, qos, _encoded(function), default, options)
+        _add_rule(kind, ros_type, direction, name, qos, _encoded(function), default, options)
         return function
 
     return register
@@ -95,13 +96,7 @@ def standard(
 
 def recorded(kind: type[Any], ros_type: str, name: str, *options: str) -> Callable[[F], F]:
     """Register a conversion of commands for bags, as `standard`; `name` is below {base}."""
-
-    def register(function: F) -> F:
-        qos = NEWEST
-        _add_rule(kind, ros_type, "record", f"{{base}}/{name}", qos, _encoded(function), True, options)
-        return function
-
-    return register
+    return standard(kind, ros_type, f"{{base}}/{name}", NEWEST, *options, direction="record")
 
 
 def command(

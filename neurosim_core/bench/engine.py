@@ -48,9 +48,11 @@ def device_title(device: str) -> str:
     return str(wp.get_device(find_device(device)).name)
 
 
-def scene_settings(scene: Path | None) -> dict[str, Any]:
-    """Return the settings of a mesh file as the scene; none for the generated apartment."""
-    return {} if scene is None else {"scene": {"kind": "mesh", "file": str(scene.resolve())}}
+def scene_settings(scene: Path | None, *, quick: bool = False) -> dict[str, Any]:
+    """Return the settings of a mesh file as the scene; none for the apartment, one room if `quick`."""
+    if scene is not None:
+        return {"scene": {"kind": "mesh", "file": str(scene.resolve())}}
+    return {"scene": {"kind": "apartment", "rooms": 1}} if quick else {}
 
 
 def load_scene(file: Path | None, *, rooms: int | None = None) -> Scene:
@@ -238,6 +240,7 @@ def event_settings(
     samples: int | None = None,
     max_displacement_px: float | None = None,
     more: Mapping[str, Any] | None = None,
+    quick: bool = False,
 ) -> dict[str, Any]:
     """Return the settings of a flight with one event camera; packets end with the launches."""
     return {
@@ -255,6 +258,6 @@ def event_settings(
                 "max_displacement_px": max_displacement_px,
             }
         },
-        **scene_settings(scene),
+        **scene_settings(scene, quick=quick),
         **(more or {}),
     }

@@ -16,7 +16,9 @@ import time
 import webbrowser
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import yaml
 from rich.console import Console
 
 from cortex import Node, Subscriber, TypeMismatch, latest
@@ -145,6 +147,7 @@ def watch(
     announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
     number = itertools.count(1)
     source, send_s, over_s, present = 0, 0.0, math.inf, False
+    bodies: Any = None
     session: LiveSession | None = None
     say("waiting for a simulator (neurosim serve)")
     with contextlib.ExitStack() as stack:
@@ -153,8 +156,9 @@ def watch(
             if not outlet.check():
                 return 0
             found = _receive(announcements, say)
-            if found is not None and found[1] != source:
+            if found is not None and (found[1] != source or _bodies_of(found[0]) != bodies):
                 simulation, source = found
+                bodies = _bodies_of(simulation)
                 stack.close()
                 session, present = None, True
                 try:
@@ -178,6 +182,12 @@ def watch(
             if now_s - over_s >= OVER_S:
                 return 0
     return 130
+
+
+def _bodies_of(simulation: Simulation) -> Any:
+    """Return the settings of bodies, which may change during a run: then a new recording shows them."""
+    settings = yaml.safe_load(simulation.config)
+    return settings.get("bodies") if isinstance(settings, dict) else None
 
 
 def _receive(

@@ -128,7 +128,7 @@ class SceneShapes:
 
 
 def scene_shapes(scene: Scene, bodies: Sequence[Body] = ()) -> SceneShapes:
-    """Return the shapes of a scene and of the bodies in it: one mesh per material.
+    """Return the shapes of a scene and of the bodies that are present in it: one mesh per material.
 
     Faces that lie wholly in the highest 15 % go below `world/scene/ceiling`, so that they can be hidden.
     Textures are reduced to 256 pixels.
@@ -141,6 +141,7 @@ def scene_shapes(scene: Scene, bodies: Sequence[Body] = ()) -> SceneShapes:
             faces = scene.faces[chosen & (scene.face_material == index)]
             if len(faces):
                 meshes.append((f"world/scene/{part}/{index}", _mesh(scene, faces, material)))
+    bodies = [body for body in bodies if body.config.present]
     for body in bodies:
         for index, material in enumerate(body.solid.materials):
             faces = body.solid.faces[body.solid.face_material == index]

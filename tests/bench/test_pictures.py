@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from small_room import room_scene
 
-from neurosim_core.bench import events, render, throughput, worlds
+from neurosim_core.bench import events, events_space, render, throughput, worlds
 from neurosim_core.bench.engine import (
     LightingConfig,
     PinholeConfig,
@@ -54,7 +54,7 @@ def test_claims_on_aliasing_see_what_is_beyond_limit_and_floor():
     beyond = {**row, "missed, 20 ms [%]": 6.0}
     noisy = {**floor, "missed, 20 ms [%]": 3.5}
     for rows, met in (((floor, row), True), ((floor, beyond), False), ((noisy, beyond), True)):
-        assert [claim.met for claim in events._space_claims(rows)] == [met]
+        assert [claim.met for claim in events_space.space_claims(rows)] == [met]
 
 
 def test_samples_out_of_range_are_refused():

@@ -200,6 +200,26 @@ def test_a_link_that_is_set_in_flight_is_shown(tmp_path, box, start, monkeypatch
     assert scalars(read(file), "/plots/drone/links/imu") == [(5 * MS, [8.0])]
 
 
+def test_a_body_that_is_brought_in_is_shown(tmp_path, box, start):
+    """In a recording of its own: what a recording shows of a body holds for all of it."""
+    watcher = start(tmp_path / "live.rrd")
+    ball = {"shape": {"kind": "sphere", "radius_m": 0.2}, "present": False}
+    with FakeSimulator(box, overrides={"bodies": {"ball": ball}}) as simulator:
+        simulator.announce()
+        simulator.state(1)
+        grows_to(tmp_path / "live.rrd", lambda rows: "/world/scene/room/0" in rows)
+        simulator.change({"bodies.ball.present": True})
+        wait_for(lambda: (tmp_path / "live-2.rrd").exists())
+        grows_to(
+            tmp_path / "live-2.rrd",
+            lambda rows: "/world/bodies/ball" in rows,
+            meanwhile=lambda: simulator.state(2),
+        )
+    watcher.end()
+    assert "/world/bodies/ball/0" not in read(tmp_path / "live.rrd")
+    assert "/world/bodies/ball/0" in read(tmp_path / "live-2.rrd")
+
+
 def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
     """Of images that come up to 500 times a second, 20 are shown, of windows of events 50."""
     file = tmp_path / "live.rrd"

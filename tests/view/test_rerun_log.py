@@ -349,7 +349,10 @@ def test_bodies_move_with_the_stamps_of_the_first_vehicle(tmp_path):
         position_m=(1.0, 2.0, 3.0), velocity_m_s=(0.5, 0.0, 0.0), spin_rad_s=(0.0, 0.0, 2.0)
     )
     ball = BodyConfig(shape=SphereShape(radius_m=0.5), surface=CheckerSurface(), motion=motion)
-    shapes = scene_shapes(make_scene(trimesh.creation.box((4, 4, 4))), make_bodies({"ball": ball}))
+    waiting = ball.model_copy(update={"present": False})
+    bodies = make_bodies({"ball": ball, "waiting": waiting})
+    shapes = scene_shapes(make_scene(trimesh.creation.box((4, 4, 4))), bodies)
+    assert list(shapes.bodies) == ["ball"]
     rows = record(tmp_path / "f.rrd", [make_odometry(k) for k in range(50)], scene=shapes)
     mesh = [values for t, values in rows["/world/bodies/ball/0"] if t is None]
     assert len(mesh) == 1
