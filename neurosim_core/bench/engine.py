@@ -240,6 +240,7 @@ def event_settings(
     samples: int | None = None,
     max_displacement_px: float | None = None,
     more: Mapping[str, Any] | None = None,
+    quick: bool = False,
 ) -> dict[str, Any]:
     """Return the settings of a flight with one event camera; packets end with the launches."""
     return {
@@ -257,6 +258,6 @@ def event_settings(
                 "max_displacement_px": max_displacement_px,
             }
         },
-        **scene_settings(scene),
+        **scene_settings(scene, quick=quick),
         **(more or {}),
     }

@@ -63,6 +63,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             "height": pixels[1],
             "device": device,
             "scene": options.scene,
+            "quick": quick,
         }
         return event_settings(rate_hz=RATE_HZ, instants=launch, duration_s=duration_s, **view, **more)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,23 +32,23 @@ _ROUNDS = 3
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Turn on the spot in many worlds with one event camera each, and in single simulations beside them."""
-    device, scene = find_device(options.device), options.scene
+    device = find_device(options.device)
     columns, rows_px = options.width or options.height, options.height or options.width
     sizes = [(columns, rows_px)] if columns and rows_px else [(64, 64), (128, 128)]
     counts = options.worlds or ((1, 16, 128, 1024, 4096) if wp.get_device(device).is_cuda else (1, 16, 128))
     if options.quick:
         sizes, counts = sizes[:1], options.worlds or (1, 4)
     budget_s = (options.seconds or (0.3 if options.quick else 3.0)) / _ROUNDS
-    base, rows = make_model(load_config(_settings(scene, device, (32, 32)))), []
+    base, rows = make_model(load_config(_settings(options, device, (32, 32)))), []
     for size, count in itertools.product(sizes, counts):
         pixels = f"{size[0]}x{size[1]}"
         progress(f"{count} worlds of {pixels} px")
-        model = refit(base, load_config(_settings(scene, device, size)))
+        model = refit(base, load_config(_settings(options, device, size)))
         rows.append({"pixels": pixels, "worlds": count, **_case(model, count, budget_s)})
     return _chapter(rows, base, device)
 
 
-def _settings(scene: Path | None, device: str, size: tuple[int, int]) -> dict[str, Any]:
+def _settings(options: Options, device: str, size: tuple[int, int]) -> dict[str, Any]:
     return {
         "device": device,
         "control": {"rate_hz": CONTROL_HZ},
@@ -63,7 +62,7 @@ def _settings(scene: Path | None, device: str, size: tuple[int, int]) -> dict[st
                 "packet_rate_hz": CONTROL_HZ,
             }
         },
-        **scene_settings(scene),
+        **scene_settings(options.scene, quick=options.quick),
     }
 
 

@@ -107,11 +107,11 @@ def _transfer(arguments: argparse.Namespace) -> int:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     from neurosim_core.convert.geometry import read_size
+    from neurosim_core.io.event_file import check_new
     from neurosim_core.io.transfer import transfer
 
     out, text = arguments.out, arguments.size
-    if out.exists() and not arguments.overwrite:
-        raise FileExistsError(f"{out} is already there: add --overwrite, or name another file")
+    check_new(out, overwrite=arguments.overwrite)
     console = Console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:

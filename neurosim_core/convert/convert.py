@@ -33,6 +33,7 @@ from neurosim_core.clock import NS_PER_S, NS_PER_US
 from neurosim_core.convert.frames import Description, Frame, Source, open_source, read_stamps
 from neurosim_core.convert.geometry import Crop, Resizer, largest_crop, read_crop, read_size
 from neurosim_core.convert.light import TRANSFERS, code_step, find_floor
+from neurosim_core.io.event_file import check_new
 from neurosim_core.packets import Events
 from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescription
 from neurosim_core.render.config import RenderConfig
@@ -229,8 +230,7 @@ def convert_video(
     out = Path(out)
     if out.is_dir():
         raise IsADirectoryError(f"the events go to a file, got the folder {out}")
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} is already there: add --overwrite, or name another file")
+    check_new(out, overwrite=overwrite)
     begin = time.perf_counter()
     source = _open(Path(path), config)
     plan = _make_plan(source, config, stack_length)

@@ -131,7 +131,7 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
         description="Event rate, intervals, polarity and spatial spectrum of files of any format, as a table "
         "and on one page of plots.",
     )
-    parser.add_argument("files", nargs="+", type=Path, help="files of events")
+    parser.add_argument("files", nargs="+", type=Path, help="files of events, or folders of them")
     parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
     parser.add_argument("--size", metavar="WxH", help="resolution, of files that do not say it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
@@ -144,6 +144,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.convert.geometry import read_size
     from neurosim_core.data.compare import draw_comparison, measure_events
+    from neurosim_core.data.stream import find_recordings
 
     size = None if arguments.size is None else read_size(arguments.size)
     console = Console(soft_wrap=not sys.stdout.isatty())
@@ -153,7 +154,7 @@ def _compare(arguments: argparse.Namespace) -> int:
         table.add_column(name, justify="left" if name == "file" else "right")
     stats = []
     with console.status("reading") as status:
-        for path in arguments.files:
+        for path in find_recordings(arguments.files):
             status.update(f"reading {path}")
             one = measure_events(path, size=size, sensor=arguments.sensor)
             stats.append(one)

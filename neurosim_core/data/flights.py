@@ -148,7 +148,12 @@ class RecordedFlight:
         """Return the ends of all windows that have their ground truth, and how many have not."""
         stamps = self._camera["stamp_ns"]
         last_ns = int(stamps[-1]) if len(stamps) else -1
-        ends_ns = np.arange(self._config.first_end_ns(begin_ns), last_ns + 1, self._config.stride_ns)
+        if self._config.ends is None:
+            ends_ns = np.arange(self._config.first_end_ns(begin_ns), last_ns + 1, self._config.stride_ns)
+        else:
+            ends_ns = self._columns[self._config.ends]["stamp_ns"]
+            inside = (ends_ns >= begin_ns + self._config.window_ns) & (ends_ns <= last_ns)
+            ends_ns = ends_ns[inside]
         whole = np.ones(len(ends_ns), bool)
         for field in AT_STAMP:
             if field in self._columns:

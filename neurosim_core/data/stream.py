@@ -34,6 +34,8 @@ class Dataset:
             list of these.
         window_s: Length of a window [s].
         stride_s: From one window to the next [s]; None: they follow on each other.
+        ends: Field at whose packets windows end, such as depth of MVSEC, whose times are no multiples of
+            anything; None: at multiples of the stride.
         fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
         sensors: Name of the sensor for a field, such as {"depth": "depth_left"}; by default the first.
 
@@ -51,12 +53,14 @@ class Dataset:
         *,
         window_s: float = 0.05,
         stride_s: float | None = None,
+        ends: str | None = None,
         fields: Sequence[str] | None = None,
         sensors: Mapping[str, str] | None = None,
     ) -> None:
         config = WindowConfig(
             window_s=window_s,
             stride_s=stride_s,
+            ends=ends,
             fields=None if fields is None else tuple(fields),
             sensors=sensors or {},
         )
@@ -126,6 +130,7 @@ class Stream:
             `LiveSource(...)`, running simulators.
         window_s: Length of a window [s].
         stride_s: From one window to the next [s]; None: they follow on each other.
+        ends: Field at whose packets windows end, of recordings; see `Dataset`.
         batch: Windows of a batch, a multiple of `sequence`; the last one of an epoch may have fewer.
         fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
         sensors: Name of the sensor for a field; by default the first.
@@ -147,6 +152,7 @@ class Stream:
         *,
         window_s: float = 0.05,
         stride_s: float | None = None,
+        ends: str | None = None,
         batch: int = 32,
         fields: Sequence[str] | None = None,
         sensors: Mapping[str, str] | None = None,
@@ -168,6 +174,7 @@ class Stream:
         options: dict[str, Any] = {
             "window_s": window_s,
             "stride_s": stride_s,
+            "ends": ends,
             "fields": fields,
             "sensors": sensors,
         }
@@ -178,8 +185,8 @@ class Stream:
         else:
             options["fields"] = None if fields is None else tuple(fields)
             self._config = WindowConfig(**{**options, "sensors": sensors or {}})
-            if shuffle or ranks > 1 or sequence > 1:
-                raise ValueError("shuffle, ranks and sequence go with recordings, not with simulators")
+            if shuffle or ranks > 1 or sequence > 1 or ends is not None:
+                raise ValueError("shuffle, ranks, sequence and ends go with recordings, not with simulators")
         self._position = Position(0, 0)
         self._resume = False
 

@@ -39,6 +39,8 @@ class WindowConfig:
     """Length of a window, in whole microseconds [s]."""
     stride_s: float | None = None
     """From one window to the next [s]; None: they follow on each other."""
+    ends: str | None = None
+    """Field at whose packets windows end, whatever their times; None: at multiples of the stride."""
     fields: tuple[str, ...] | None = None
     """What to take of `FIELDS`; None: all that a source has."""
     sensors: Mapping[str, str] = field(default_factory=dict)
@@ -48,6 +50,10 @@ class WindowConfig:
         for name, value in (("window_s", self.window_s), ("stride_s", self.stride_s)):
             if value is not None and not (value >= 1e-6 and abs(value * 1e6 - round(value * 1e6)) < 1e-6):
                 raise ValueError(f"{name} must be whole microseconds, at least 1, got {value}")
+        if self.ends is not None and self.ends not in AT_STAMP:
+            raise ValueError(f"ends must be one of {', '.join(AT_STAMP)}, got {self.ends!r}")
+        if self.ends is not None and not self.takes(self.ends):
+            raise ValueError(f"ends is {self.ends!r}, which is not in fields")
         unknown = {*(self.fields or ()), *self.sensors} - {*FIELDS}
         if unknown:
             raise ValueError(f"unknown field {sorted(unknown)[0]!r}, known: {', '.join(FIELDS)}")
@@ -223,7 +229,8 @@ def choose_sensors(found: Mapping[str, str | None], config: WindowConfig, *, sou
     for sensor, name in found.items():
         if name is not None and config.sensors.get(name, sensor) == sensor:
             chosen.setdefault(name, sensor)
-    for name in {"events", *(config.fields or ()), *config.sensors} - {*chosen}:
+    wanted_fields = {"events", *(config.fields or ()), *config.sensors, *filter(None, [config.ends])}
+    for name in wanted_fields - {*chosen}:
         wanted = config.sensors.get(name)
         what = f"sensor {wanted!r} for {name}" if wanted else f"sensor for {name}"
         raise ValueError(f"{source} has no {what}; its sensors are {', '.join(found) or 'none'}")

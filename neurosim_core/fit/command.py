@@ -65,6 +65,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from neurosim_core.fit.sensor import Stimulus, fit_sensor
+    from neurosim_core.io.event_file import check_new
 
     if arguments.steps is not None and arguments.contrast is None:
         raise ValueError("say how high the steps are: --contrast 4 if light goes from 1 to 4")
@@ -74,8 +75,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--lux and --rise must be >= 0, got {arguments.lux} and {arguments.rise}")
     picture, rates = (arguments.out.with_suffix(suffix) for suffix in (".png", ".npz"))
     for path in (arguments.out, picture, *([rates] if arguments.also else [])):
-        if path.exists() and not arguments.overwrite:
-            raise FileExistsError(f"{path} is already there: add --overwrite, or name another file with -o")
+        check_new(path, overwrite=arguments.overwrite)
     console = Console()
     with console.status("read the recordings") as status:
         still, reader = _read(arguments.still, arguments)

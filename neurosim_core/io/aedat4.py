@@ -10,28 +10,17 @@ from typing import Any
 import numpy as np
 
 from neurosim_core.install import install_hint
-from neurosim_core.io.event_file import BlockChecker, EventFileError, split_blocks
+from neurosim_core.io.event_file import EventFileError, split_blocks
 from neurosim_core.packets import EventArrays
 
 _PACKET_EVENTS = 8192
 _SIZE_MAX = 1 << 15
 
 
-class Aedat4Reader:
+class Aedat4Source:
     """Reads the first stream of events of an AEDAT4 file."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says.
-
-        Raises:
-            EventFileError: It is not an AEDAT4 file with events.
-            ImportError: faery is not installed.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._faery = _import_faery()
         self._path = path
         self.notes: list[str] = []
@@ -42,13 +31,10 @@ class Aedat4Reader:
         if not tracks:
             raise EventFileError(f"{path} holds no events")
         self._track = tracks[0].id
-        dimensions: tuple[int, int] = size or tracks[0].dimensions
-        self.width, self.height = dimensions
+        self.size: tuple[int, int] | None = tracks[0].dimensions
 
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         decoder = self._decoder()
         while True:
             try:
@@ -58,15 +44,9 @@ class Aedat4Reader:
             except BaseException as error:
                 raise _damage(self._path, error) from None
             if track.id == self._track and len(events):
-                t, p = (
-                    events["t"].astype(np.int64),
-                    events["on"] if "on" in events.dtype.names else events["p"],
-                )
-                yield checker.check(
-                    EventArrays(
-                        t, events["x"].astype(np.uint16), events["y"].astype(np.uint16), p.astype(np.uint8)
-                    )
-                )
+                polarity = "on" if "on" in events.dtype.names else "p"
+                kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, polarity: np.uint8}
+                yield EventArrays(*(events[name].astype(kind) for name, kind in kinds.items()))
 
     def close(self) -> None:
         """Nothing is open between blocks."""
@@ -78,23 +58,15 @@ class Aedat4Reader:
             raise _damage(self._path, error) from None
 
 
-class Aedat4Writer:
+class Aedat4Sink:
     """Writes an AEDAT4 file, compressed with LZ4."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            EventFileError: The sensor has more than 32768 columns or rows.
-            ImportError: faery is not installed.
-            OSError: It cannot be written.
-        """
         faery = _import_faery()
         if max(width, height) > _SIZE_MAX:
             raise EventFileError(f"AEDAT4 files hold at most 32768 x 32768 pixels, not {width} x {height}")
         self._dtype = faery.EVENTS_DTYPE
         self._path = path
-        self._checker = BlockChecker(path, width=width, height=height)
         node, attribute = faery.aedat.DescriptionNode, faery.aedat.DescriptionAttribute
         size = {"sizeX": attribute("int", width), "sizeY": attribute("int", height)}
         place = "/mainloop/Recorder/outInfo/"
@@ -106,8 +78,8 @@ class Aedat4Writer:
         self._encoder.__enter__()
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        for block in split_blocks(self._checker.check(events), _PACKET_EVENTS):
+        """See `EventSink.write`."""
+        for block in split_blocks(events, _PACKET_EVENTS):
             if int(block.t[0]) < 0:
                 raise EventFileError(f"{self._path}: AEDAT4 files hold no time before 0, got {block.t[0]} us")
             records = np.empty(len(block.t), self._dtype)

@@ -6,26 +6,14 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError
-from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet, join_events
+from neurosim_core.io.event_file import EventFileError, gather_blocks
+from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet
 
 
-class LogReader:
+class LogSource:
     """Reads the sensors of one vehicle from a log."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
-        """Open a log.
-
-        Args:
-            path: The file.
-            size: Not needed: messages of events say it.
-            sensor: Event camera whose events are read, "NAME" or "VEHICLE/NAME"; empty: the first.
-
-        Raises:
-            EventFileError: It is no log, or has no such camera.
-            ImportError: mcap is not installed.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path, *, sensor: str = "") -> None:
         from cortex.log import LogError, open_log
 
         self._path = path
@@ -48,7 +36,7 @@ class LogReader:
         self._topic = chosen[0]
         self._vehicle = self._topic.rpartition("/")[0]
         first = next((packet for packet in self.packets() if isinstance(packet, Events)), None)
-        self.width, self.height = size or ((first.width, first.height) if first else (1, 1))
+        self.size: tuple[int, int] | None = (first.width, first.height) if first else (1, 1)
 
     def packets(self) -> Iterator[Packet]:
         """Yield the packets of the camera's vehicle, in the order in which they arrived.
@@ -67,19 +55,11 @@ class LogReader:
         except (LogError, MalformedMessage, TypeMismatch) as error:
             raise EventFileError(f"{self._path}: {error}") from None
 
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        pending: list[EventArrays] = []
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         name = self._topic.rpartition("/")[2]
-        for packet in self.packets():
-            if isinstance(packet, Events) and packet.sensor == name:
-                pending.append(packet.numpy())
-                if sum(len(part.t) for part in pending) >= BLOCK_EVENTS:
-                    yield checker.check(join_events(pending))
-                    pending = []
-        if pending:
-            yield checker.check(join_events(pending))
+        events = (p.numpy() for p in self.packets() if isinstance(p, Events) and p.sensor == name)
+        yield from gather_blocks(events)
 
     def close(self) -> None:
         """Close the file."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.io.event_file import BlockChecker, EventFileError, find_size, split_blocks
+from neurosim_core.io.event_file import EventFileError, split_blocks
 from neurosim_core.packets import EventArrays
 
 _BLOCK_LINES = 200_000
@@ -28,33 +28,15 @@ _NAMES = {
 _HEADER_LINES_MAX = 100
 
 
-class CsvReader:
+class CsvSource:
     """Reads events from text."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-
-        Raises:
-            EventFileError: It is not such a text.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
         self._columns: tuple[str, ...] = ("t", "x", "y", "p")
         self._skip, self._delimiter, self._in_seconds = 0, ",", False
-        found = self._read_header()
-        self.width, self.height = size or found or find_size(self._parse())
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._parse():
-            yield checker.check(events)
+        self.size = self._read_header()
 
     def close(self) -> None:
         """Nothing is open between blocks."""
@@ -80,7 +62,8 @@ class CsvReader:
                 self._skip += 1
         return size
 
-    def _parse(self) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         place = [self._columns.index(name) for name in ("t", "x", "y", "p")]
         kind = np.float64 if self._in_seconds else np.int64
         number = self._skip
@@ -124,22 +107,16 @@ class CsvReader:
         return EventArrays(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
 
 
-class CsvWriter:
+class CsvSink:
     """Writes events as text; the size of the sensor is not in it."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            OSError: It cannot be written.
-        """
-        self._checker = BlockChecker(path, width=width, height=height)
         self._file = open(path, "w", encoding="ascii", newline="\n")  # noqa: SIM115 (closed by close())
         self._file.write("t,x,y,p\n")
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        for block in split_blocks(self._checker.check(events), _BLOCK_LINES):
+        """See `EventSink.write`."""
+        for block in split_blocks(events, _BLOCK_LINES):
             columns = (column.tolist() for column in block)
             self._file.write("".join(map("%d,%d,%d,%d\n".__mod__, zip(*columns, strict=True))))
 

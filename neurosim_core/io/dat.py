@@ -16,9 +16,7 @@ import numpy as np
 
 from neurosim_core.io.event_file import (
     BLOCK_EVENTS,
-    BlockChecker,
     EventFileError,
-    find_size,
     read_header,
     split_blocks,
 )
@@ -30,20 +28,10 @@ _KINDS = (0x00, 0x0C)
 """Event2d and EventCD: the same layout."""
 
 
-class DatReader:
+class DatSource:
     """Reads a DAT file."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-
-        Raises:
-            EventFileError: It is not a DAT file of change detection events.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
@@ -54,25 +42,18 @@ class DatReader:
             if len(kind) < 2 or kind[0] not in _KINDS or kind[1] != _RECORD.itemsize or not header:
                 raise EventFileError(f"{path} is not a DAT file of change detection events")
             known = [header.get(key, "") for key in ("width", "height")]
-            if size is None and all(re.fullmatch(r"\d+", value) for value in known):
-                size = int(known[0]), int(known[1])
-            self.width, self.height = size or find_size(self._decode())
+            is_told = all(re.fullmatch(r"\d+", value) for value in known)
+            self.size = (int(known[0]), int(known[1])) if is_told else None
         except BaseException:
             self._file.close()
             raise
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._decode():
-            yield checker.check(events)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _decode(self) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         position = self._begin
         while True:
             self._file.seek(position)
@@ -93,27 +74,20 @@ class DatReader:
             )
 
 
-class DatWriter:
+class DatSink:
     """Writes a DAT file."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            EventFileError: The sensor has more than 16384 columns or rows.
-            OSError: It cannot be written.
-        """
         if max(width, height) > _SIZE_MAX:
             raise EventFileError(f"DAT files hold at most 16384 x 16384 pixels, not {width} x {height}")
         self._path = path
-        self._checker = BlockChecker(path, width=width, height=height)
         self._file = open(path, "wb")  # noqa: SIM115 (closed by close())
         header = f"% Data file containing CD events.\n% Version 2\n% Height {height}\n% Width {width}\n"
         self._file.write(header.encode() + bytes([0x0C, _RECORD.itemsize]))
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        for block in split_blocks(self._checker.check(events)):
+        """See `EventSink.write`."""
+        for block in split_blocks(events):
             if int(block.t[0]) < 0 or int(block.t[-1]) >= 1 << 32:
                 raise EventFileError(
                     f"{self._path}: DAT files hold times from 0 to 71 minutes, got {block.t[0]} to "

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
-from neurosim_core.packets import NO_EVENTS, EventArrays, Events
+from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, join_events
 
 BLOCK_EVENTS = 1_000_000
 """Events that are read, and held in memory, at a time."""
@@ -23,32 +23,40 @@ class EventFileError(ValueError):
     """A file is damaged or not of its format, or its format cannot hold some events."""
 
 
-class EventReader(Protocol):
-    """Reads the events of one camera, in blocks."""
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a file.
 
-    width: int
-    """Of the sensor [px]."""
-    height: int
-    """Of the sensor [px]."""
+    Raises:
+        FileExistsError: It is there, and may not be replaced.
+    """
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} is already there: add --overwrite, or name another file")
+
+
+class EventSource(Protocol):
+    """What a format has to read the events of one camera; made of the path of a file."""
+
+    size: tuple[int, int] | None
+    """Width and height of the sensor [px], where the file says them."""
     notes: list[str]
-    """What a user should know about the file; complete once all blocks have been read."""
+    """What a user should know about the file; more may come while it is read."""
 
-    def blocks(self) -> Iterator[EventArrays]:
-        """Yield all events from the first on, sorted by time, about a million at a time.
+    def read(self) -> Iterator[EventArrays]:
+        """Yield all events from the first on, as they are in the file, about a million at a time.
 
         Raises:
-            EventFileError: The file is damaged; what was yielded before is intact.
+            EventFileError: The file is damaged.
         """
 
     def close(self) -> None:
         """Close the file."""
 
 
-class EventWriter(Protocol):
-    """Writes the events of one camera."""
+class EventSink(Protocol):
+    """What a format has to write them; made of the path, and width and height of the sensor [px]."""
 
     def write(self, events: EventArrays) -> None:
-        """Append events, sorted by time.
+        """Append events, which are sorted, on the sensor, and one at least.
 
         Raises:
             EventFileError: The format cannot hold them.
@@ -57,6 +65,80 @@ class EventWriter(Protocol):
 
     def close(self) -> None:
         """Complete the file. Closing twice is allowed."""
+
+
+class EventReader:
+    """Reads the events of one camera, in blocks that are checked.
+
+    Args:
+        path: The file.
+        source: It, opened; closed here.
+        size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
+
+    Attributes:
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+        notes: What a user should know about the file; complete once all blocks have been read.
+        packets: Yields what is there besides events, in the order of time; None: nothing ever is.
+    """
+
+    def __init__(self, path: Path, source: EventSource, size: tuple[int, int] | None = None) -> None:
+        self._path, self._source, self.notes = path, source, source.notes
+        self._first_notes = [*source.notes]
+        self.packets: Callable[[], Iterator[Packet]] | None = getattr(source, "packets", None)
+        try:
+            self.width, self.height = size or source.size or _find_size(source.read())
+        except BaseException:
+            source.close()
+            raise
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """Yield all events from the first on, sorted by time, about a million at a time.
+
+        Raises:
+            EventFileError: The file is damaged; what was yielded before is intact.
+        """
+        self.notes[:] = self._first_notes
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        for events in self._source.read():
+            yield checker.check(events)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._source.close()
+
+
+class EventWriter:
+    """Writes the events of one camera, which are checked.
+
+    Args:
+        path: The file.
+        sink: It, opened; closed here.
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+
+    Attributes:
+        write_packet: Takes a packet of another sensor; None: the format has no place for any.
+    """
+
+    def __init__(self, path: Path, sink: EventSink, *, width: int, height: int) -> None:
+        self._sink, self._checker = sink, BlockChecker(path, width=width, height=height)
+        self.write_packet: Callable[[Packet], None] | None = getattr(sink, "write_packet", None)
+
+    def write(self, events: EventArrays) -> None:
+        """Append events, sorted by time.
+
+        Raises:
+            EventFileError: The format cannot hold them.
+            OSError: The disk is full.
+        """
+        checked = self._checker.check(events)
+        if len(checked.t):
+            self._sink.write(checked)
+
+    def close(self) -> None:
+        """Complete the file. Closing twice is allowed."""
+        self._sink.close()
 
 
 class BlockChecker:
@@ -165,7 +247,7 @@ def read_header(file: BinaryIO) -> dict[str, str]:
         header[key.lower()] = value.strip()
 
 
-def find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
+def _find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
     """Return width and height of the smallest sensor that has all pixels that fire."""
     width = height = 1
     for events in blocks:
@@ -173,6 +255,18 @@ def find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
             width = max(width, int(events.x.max()) + 1)
             height = max(height, int(events.y.max()) + 1)
     return width, height
+
+
+def gather_blocks(parts: Iterable[Any]) -> Iterator[EventArrays]:
+    """Yield events, or what has their columns, together until they are a million."""
+    pending: list[Any] = []
+    for part in parts:
+        pending.append(part)
+        if sum(len(each.t) for each in pending) >= BLOCK_EVENTS:
+            yield join_events(pending)
+            pending = []
+    if pending:
+        yield join_events(pending)
 
 
 def split_blocks(events: EventArrays, count: int = BLOCK_EVENTS) -> Iterator[EventArrays]:

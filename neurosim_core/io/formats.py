@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,25 +15,25 @@ class Format(NamedTuple):
 
     module: str
     """Module of `neurosim_core.io` with its classes, imported on first use."""
-    reader: str
-    writer: str
+    source: str
+    sink: str
     suffixes: tuple[str, ...]
     options: dict[str, Any]
-    """More arguments of its writer."""
+    """More arguments of its sink."""
 
 
 FORMATS = {
-    "evt3": Format("raw", "RawReader", "RawWriter", (".raw",), {}),
-    "evt2": Format("raw", "RawReader", "RawWriter", (".evt2.raw",), {"encoding": "evt2"}),
-    "dat": Format("dat", "DatReader", "DatWriter", (".dat",), {}),
-    "csv": Format("csv", "CsvReader", "CsvWriter", (".csv", ".txt"), {}),
-    "npz": Format("npz", "NpzReader", "NpzWriter", (".npz",), {}),
-    "aedat4": Format("aedat4", "Aedat4Reader", "Aedat4Writer", (".aedat4",), {}),
-    "mvsec": Format("mvsec", "MvsecReader", "MvsecWriter", ("mvsec.h5", "mvsec.hdf5"), {}),
-    "recording": Format("hdf5_events", "Hdf5EventReader", "RecordingEventWriter", (".h5", ".hdf5"), {}),
-    "mcap": Format("ros2_bag", "open_mcap", "BagWriter", (".mcap",), {}),
-    "rosbag": Format("ros2_bag", "BagReader", "BagWriter", ("bag",), {}),
-    "rosbag_sqlite3": Format("ros2_bag", "BagReader", "BagWriter", (".sqlite3",), {"storage": "sqlite3"}),
+    "evt3": Format("raw", "RawSource", "RawSink", (".raw",), {}),
+    "evt2": Format("raw", "RawSource", "RawSink", (".evt2.raw",), {"encoding": "evt2"}),
+    "dat": Format("dat", "DatSource", "DatSink", (".dat",), {}),
+    "csv": Format("csv", "CsvSource", "CsvSink", (".csv", ".txt"), {}),
+    "npz": Format("npz", "NpzSource", "NpzSink", (".npz",), {}),
+    "aedat4": Format("aedat4", "Aedat4Source", "Aedat4Sink", (".aedat4",), {}),
+    "mvsec": Format("mvsec", "MvsecSource", "MvsecSink", ("mvsec.h5", "mvsec.hdf5"), {}),
+    "recording": Format("hdf5_events", "Hdf5Source", "RecordingSink", (".h5", ".hdf5"), {}),
+    "mcap": Format("ros2_bag", "open_mcap", "BagSink", (".mcap",), {}),
+    "rosbag": Format("ros2_bag", "BagSource", "BagSink", ("bag",), {}),
+    "rosbag_sqlite3": Format("ros2_bag", "BagSource", "BagSink", (".sqlite3",), {"storage": "sqlite3"}),
 }
 """By name. Where two suffixes fit, the longer one counts."""
 
@@ -101,8 +99,7 @@ def open_events(
             name = "mvsec" if "davis" in file else "recording"
     known = FORMATS[name]
     more = {"sensor": sensor} if name == "recording" or known.module == "ros2_bag" else {}
-    reader: EventReader = _load(known, known.reader)(path, size=size, **more)
-    return reader
+    return EventReader(path, _load(known, known.source)(path, **more), size)
 
 
 def create_events(path: str | Path, *, width: int, height: int, format: str | None = None) -> EventWriter:
@@ -122,8 +119,8 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     path = Path(path)
     name = format_of(path, format)
     known = FORMATS[name]
-    make: Callable[..., EventWriter] = partial(_load(known, known.writer), **known.options)
-    return make(path, width=width, height=height)
+    sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
+    return EventWriter(path, sink, width=width, height=height)
 
 
 def _load(known: Format, name: str) -> Any:

@@ -18,10 +18,8 @@ from neurosim_core import __version__
 from neurosim_core.io.event_file import (
     BLOCK_EVENTS,
     PACKET_US,
-    BlockChecker,
     EventFileError,
     PacketCutter,
-    find_size,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
@@ -48,22 +46,10 @@ def open_hdf5(path: Path) -> Any:
         raise EventFileError(f"{path} is not a readable HDF5 file: {error}") from None
 
 
-class Hdf5EventReader:
+class Hdf5Source:
     """Reads the events of a recording, or of a file of DSEC."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
-        """Open a file.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-            sensor: Event camera of a recording; empty: the first.
-
-        Raises:
-            EventFileError: It has no such events.
-            ImportError: h5py is not installed.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path, *, sensor: str = "") -> None:
         self._path = path
         self.notes: list[str] = []
         self._file = open_hdf5(path)
@@ -71,18 +57,11 @@ class Hdf5EventReader:
             with damage_of(path):
                 self._open(sensor)
                 attributes = self._group.attrs
-                if size is None and "width" in attributes and "height" in attributes:
-                    size = int(attributes["width"]), int(attributes["height"])
-                self.width, self.height = size or find_size(self._read())
+                is_told = "width" in attributes and "height" in attributes
+                self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
         except BaseException:
             self._file.close()
             raise
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._read():
-            yield checker.check(events)
 
     def packets(self) -> Iterator[Packet]:
         """Yield what a recording has besides events, in the order of time; of files of DSEC nothing."""
@@ -124,7 +103,8 @@ class Hdf5EventReader:
         offset = self._group.get("t_offset")
         self._offset_us = 0 if offset is None else int(offset[()])
 
-    def _read(self) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         for begin in range(0, self._count, BLOCK_EVENTS):
             end = min(begin + BLOCK_EVENTS, self._count)
             with damage_of(self._path):
@@ -139,18 +119,11 @@ class Hdf5EventReader:
             )
 
 
-class RecordingEventWriter:
+class RecordingSink:
     """Writes events as a recording, in packets of 10 ms at least; files of DSEC are laid out like it."""
 
     def __init__(self, path: Path, *, width: int, height: int, sensor: str = "events") -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            ImportError: h5py is not installed.
-            OSError: It cannot be written.
-        """
         self._path = path
-        self._checker = BlockChecker(path, width=width, height=height)
         described = SensorDescription(
             name=sensor,
             kind="event_camera",
@@ -166,16 +139,13 @@ class RecordingEventWriter:
         self._packets = PacketCutter(self._writer.write, width=width, height=height, sensor=sensor)
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        block = self._checker.check(events)
-        if not len(block.t):
-            return
-        if int(block.t[0]) < 0 or int(block.t[-1]) > _SPAN_MAX_US:
+        """See `EventSink.write`."""
+        if int(events.t[0]) < 0 or int(events.t[-1]) > _SPAN_MAX_US:
             raise EventFileError(
-                f"{self._path}: times of recordings are from 0 to 30 days, got {block.t[0]} to {block.t[-1]} "
-                "us: --from-zero counts them from the first event"
+                f"{self._path}: times of recordings are from 0 to 30 days, got {events.t[0]} to "
+                f"{events.t[-1]} us: --from-zero counts them from the first event"
             )
-        self._packets.add(block)
+        self._packets.add(events)
 
     def write_packet(self, packet: Packet) -> None:
         """Append a packet of another sensor."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.hdf5 import import_h5py
@@ -27,21 +27,10 @@ _ROWS = {"depth": "depth_image_raw", "pose": "pose", "image": "image_raw", "imu"
 """Name of each sensor and of its array; `ARRAY_ts` has its times."""
 
 
-class MvsecReader:
+class MvsecSource:
     """Reads a file of MVSEC."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: A `_data` or `_gt` file, or one that has both.
-            size: Width and height of the sensor [px]; None: as its pictures, else the smallest that fits.
-
-        Raises:
-            EventFileError: It is not of MVSEC.
-            ImportError: h5py is not installed.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
         self._file = open_hdf5(path)
@@ -50,22 +39,13 @@ class MvsecReader:
                 if _GROUP not in self._file:
                     raise EventFileError(f"{path} has no {_GROUP}: it is not a file of MVSEC")
                 self._group = self._file[_GROUP]
-                if size is None:
-                    names = [_ROWS[name] for name in ("image", "depth") if _ROWS[name] in self._group]
-                    if names:
-                        height, width = self._group[names[0]].shape[1:3]
-                        size = int(width), int(height)
-                self.width, self.height = size or find_size(self._read())
+                shapes = [
+                    self._group[n].shape for n in map(_ROWS.get, ("image", "depth")) if n in self._group
+                ]
+                self.size = (int(shapes[0][2]), int(shapes[0][1])) if shapes else None
         except BaseException:
             self._file.close()
             raise
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._read():
-            yield checker.check(events)
 
     def packets(self) -> Iterator[Packet]:
         """Yield what is there besides events, in the order of time.
@@ -80,7 +60,8 @@ class MvsecReader:
         """Close the file."""
         self._file.close()
 
-    def _read(self) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         events = self._group.get("events")
         for begin in range(0, 0 if events is None else len(events), BLOCK_EVENTS):
             with damage_of(self._path):
@@ -125,18 +106,11 @@ class MvsecReader:
                 yield Image(data=values, encoding="mono8", **head)
 
 
-class MvsecWriter:
+class MvsecSink:
     """Writes a file of MVSEC: of each kind of packets those of the first sensor that sends them."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            ImportError: h5py is not installed.
-            OSError: It cannot be written.
-        """
         self._path = path
-        self._checker = BlockChecker(path, width=width, height=height)
         try:
             self._file: Any = import_h5py().File(path, "w")
         except OSError as error:
@@ -146,8 +120,8 @@ class MvsecWriter:
         self._append("events", np.zeros((0, 4)))
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        block = self._checker.check(events)
+        """See `EventSink.write`."""
+        block = events
         rows = np.empty((len(block.t), 4))
         rows[:, 0], rows[:, 1], rows[:, 2] = block.x, block.y, block.t * 1e-6
         rows[:, 3] = block.polarity.astype(np.float64) * 2.0 - 1.0

@@ -16,27 +16,17 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError
 from neurosim_core.packets import EventArrays
 
 _DTYPES = {"t": "<i8", "x": "<u2", "y": "<u2", "p": "|u1"}
 _COPY_BYTES = 1 << 20
 
 
-class NpzReader:
+class NpzSource:
     """Reads an NPZ file; `polarity` and `ts` or `timestamps` are other names for p and t."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file, and compare all its checksums.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-
-        Raises:
-            EventFileError: It is damaged, or has no such arrays.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
         with open(path, "rb"):
@@ -56,16 +46,9 @@ class NpzReader:
             if found is None:
                 raise EventFileError(f"{path} has no array {name!r}, only {sorted(names)}")
             self._members[name] = names[found]
-        if size is None and {"width", "height"} <= names.keys():
-            size = self._number(names["width"]), self._number(names["height"])
-        self.width, self.height = size or find_size(self._read())
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._read():
-            yield checker.check(events)
+        self.size: tuple[int, int] | None = None
+        if {"width", "height"} <= names.keys():
+            self.size = self._number(names["width"]), self._number(names["height"])
 
     def close(self) -> None:
         """Close the file."""
@@ -75,7 +58,8 @@ class NpzReader:
         with self._zip.open(member) as file:
             return int(np.lib.format.read_array(file, allow_pickle=False))
 
-    def _read(self) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         files = {name: self._zip.open(member) for name, member in self._members.items()}
         try:
             heads = {name: _read_head(file, self._path) for name, file in files.items()}
@@ -96,17 +80,11 @@ class NpzReader:
                 file.close()
 
 
-class NpzWriter:
+class NpzSink:
     """Writes an NPZ file; the columns lie in temporary files beside it until it is closed."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        """Create a file, replacing one that exists.
-
-        Raises:
-            OSError: It cannot be written.
-        """
         self._path, self._size = path, (width, height)
-        self._checker = BlockChecker(path, width=width, height=height)
         self._columns = {
             name: tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115 (closed by close())
             for name in _DTYPES
@@ -115,8 +93,8 @@ class NpzWriter:
         self._zip: zipfile.ZipFile | None = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        block = self._checker.check(events)
+        """See `EventSink.write`."""
+        block = events
         for (name, dtype), column in zip(_DTYPES.items(), block, strict=True):
             self._columns[name].write(np.ascontiguousarray(column, dtype).data)
         self._count += len(block.t)

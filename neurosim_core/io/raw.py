@@ -15,9 +15,7 @@ import numpy as np
 
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from neurosim_core.io.event_file import (
-    BlockChecker,
     EventFileError,
-    find_size,
     read_header,
     split_blocks,
 )
@@ -30,20 +28,10 @@ _HOUR_US = 3_600_000_000
 _GAP_MAX_US = 48 * _HOUR_US
 
 
-class RawReader:
+class RawSource:
     """Reads a RAW file."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
-        """Open a file.
-
-        Args:
-            path: The file.
-            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-
-        Raises:
-            EventFileError: It is not a RAW file of EVT2 or EVT3.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
@@ -52,23 +40,17 @@ class RawReader:
             self._begin = self._file.tell()
             self._encoding = _encoding(header, path)
             self._t0_us = int(header["t0"]) if re.fullmatch(r"\d+", header.get("t0", "")) else 0
-            self.width, self.height = size or _size(header) or find_size(self._decode(_SIZE_MAX, _SIZE_MAX))
+            self.size = _size(header)
         except BaseException:
             self._file.close()
             raise
-
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        self.notes.clear()
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        for events in self._decode(self.width, self.height):
-            yield checker.check(events)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _decode(self, width: int, height: int) -> Iterator[EventArrays]:
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
         word = 2 if self._encoding == "evt3" else 4
         evt2, evt3 = Evt2Decoder(), Evt3Decoder()
         position = self._begin
@@ -94,33 +76,20 @@ class RawReader:
                 yield events
 
 
-class RawWriter:
+class RawSink:
     """Writes a RAW file."""
 
     def __init__(self, path: Path, *, width: int, height: int, encoding: str = "evt3") -> None:
-        """Create a file, replacing one that exists.
-
-        Args:
-            path: The file.
-            width: Of the sensor [px].
-            height: Of the sensor [px].
-            encoding: evt3 or evt2.
-
-        Raises:
-            EventFileError: The sensor has more than 2048 columns or rows.
-            OSError: It cannot be written.
-        """
         if max(width, height) > _SIZE_MAX:
             raise EventFileError(f"RAW files hold at most 2048 x 2048 pixels, not {width} x {height}")
         self._path, self._size, self._encoding = path, (width, height), encoding
-        self._checker = BlockChecker(path, width=width, height=height)
         self._file = open(path, "wb")  # noqa: SIM115 (closed by close())
         self._encoder: Any = None
         self._t0_us = self._last_us = 0
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        for block in split_blocks(self._checker.check(events)):
+        """See `EventSink.write`."""
+        for block in split_blocks(events):
             if self._encoder is None:
                 self._begin(int(block.t[0]))
             if np.diff(block.t, prepend=self._last_us).max() > _GAP_MAX_US:

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from neurosim_core.install import install_hint
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, EventReader, PacketCutter
-from neurosim_core.packets import EventArrays, Odometry, Packet, join_events
+from neurosim_core.io.event_file import EventFileError, EventSource, PacketCutter, gather_blocks
+from neurosim_core.packets import EventArrays, Odometry, Packet
 
 _BRIDGE = "cortex_ros2_bridge.bag_file"
 _VEHICLE = "drone"
 _EVENTS = "events"
 
 
-def open_mcap(path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> EventReader:
+def open_mcap(path: Path, *, sensor: str = "") -> EventSource:
     """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2.
 
     Raises:
@@ -29,29 +29,17 @@ def open_mcap(path: Path, *, size: tuple[int, int] | None = None, sensor: str = 
         ImportError: A library is not installed.
         OSError: It cannot be read.
     """
-    from neurosim_core.io.cortex_log import LogReader
+    from neurosim_core.io.cortex_log import LogSource
 
     with open(path, "rb") as file:
         is_bag = file.read(25)[21:] == b"ros2"
-    return BagReader(path, size=size, sensor=sensor) if is_bag else LogReader(path, size=size, sensor=sensor)
+    return BagSource(path, sensor=sensor) if is_bag else LogSource(path, sensor=sensor)
 
 
-class BagReader:
+class BagSource:
     """Reads a bag: events of one camera, and pictures, inertial measurements and odometry."""
 
-    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
-        """Open a bag.
-
-        Args:
-            path: A directory, or a file of type MCAP.
-            size: Not needed: messages of events say it.
-            sensor: Topic of the event camera, or its last part; empty: the first.
-
-        Raises:
-            EventFileError: It is no bag, or has no such camera.
-            ImportError: rosbags is not installed.
-            OSError: It cannot be read.
-        """
+    def __init__(self, path: Path, *, sensor: str = "") -> None:
         bags = _bridge()
         self._path, self._error = path, bags.BagError
         self.notes: list[str] = []
@@ -62,22 +50,14 @@ class BagReader:
         try:
             self._choose(sensor, bags.EVENT_TYPES)
             found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
-            self.width, self.height = size or next(found, (1, 1))
+            self.size: tuple[int, int] | None = next(found, (1, 1))
         except BaseException:
             self._bag.close()
             raise
 
-    def blocks(self) -> Iterator[EventArrays]:
-        """See `EventReader.blocks`."""
-        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
-        pending: list[Any] = []
-        for _, message in self._messages(self._topic):
-            pending.append(message)
-            if sum(len(part.t) for part in pending) >= BLOCK_EVENTS:
-                yield checker.check(join_events(pending))
-                pending = []
-        if pending:
-            yield checker.check(join_events(pending))
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
+        yield from gather_blocks(message for _, message in self._messages(self._topic))
 
     def packets(self) -> Iterator[Packet]:
         """Yield what is there besides events, in the order in which it was recorded.
@@ -118,25 +98,12 @@ class BagReader:
             raise EventFileError(str(error)) from None
 
 
-class BagWriter:
+class BagSink:
     """Writes a bag: what the bridge would send of a vehicle "drone" with these sensors."""
 
     def __init__(self, path: Path, *, width: int, height: int, storage: str = "mcap") -> None:
-        """Begin a bag.
-
-        Args:
-            path: `NAME.mcap` for a single file, else the directory to make.
-            width: Of the sensor [px].
-            height: Of the sensor [px].
-            storage: "mcap" or "sqlite3", for a directory.
-
-        Raises:
-            ImportError: rosbags is not installed.
-            OSError: It cannot be made.
-        """
         bags = _bridge()
         self._errors = bags.ConvertError, bags.BackendError
-        self._checker = BlockChecker(path, width=width, height=height)
         try:
             self._bag = bags.BagWriter(path, storage=storage)
         except bags.BackendError as error:
@@ -145,8 +112,8 @@ class BagWriter:
         self._closed = False
 
     def write(self, events: EventArrays) -> None:
-        """See `EventWriter.write`."""
-        self._packets.add(self._checker.check(events))
+        """See `EventSink.write`."""
+        self._packets.add(events)
 
     def write_packet(self, packet: Packet) -> None:
         """Append a packet of any sensor, or leave out what ROS has no message for."""

@@ -70,7 +70,7 @@ def transfer(
     reader = open_events(source, format=format, size=size, sensor=sensor)
     done = Transfer(width=reader.width, height=reader.height)
     shift_us: int | None = None if from_zero else 0
-    packets = getattr(reader, "packets", None)
+    packets = reader.packets
     try:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
@@ -89,7 +89,7 @@ def transfer(
                 done.event_count += len(events.t)
                 if on_block is not None:
                     on_block(done.event_count)
-            keep = getattr(writer, "write_packet", None)
+            keep = writer.write_packet
             if keep is not None:
                 for packet in () if packets is None else packets():
                     if not isinstance(packet, Events):

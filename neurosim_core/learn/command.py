@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, hover-paper, depth, flow, pretrain, or `eval`")
-    learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
+    learn.add_argument("what", metavar="TASK", help="hover, avoid, depth, flow, pretrain, or `eval`")
+    learn.add_argument(
+        "run", nargs="?", type=Path, metavar="RUN", help="for `eval`: folder of a run, or depth.pt, ..."
+    )
     learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
     learn.add_argument(
         "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
@@ -146,6 +148,12 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
 def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.run is None:
         raise ValueError("say which run: neurosim learn eval runs/hover")
+    if arguments.run.suffix == ".pt":
+        from neurosim_core.learn.dense_train import evaluate, held_out_windows, load_dense
+
+        net, dense = load_dense(arguments.run)
+        print(evaluate(net, held_out_windows(dense, arguments.test), dense.head))
+        return 0
     from neurosim_core.learn.train import evaluate_run
 
     for name, evaluation in evaluate_run(

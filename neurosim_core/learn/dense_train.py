@@ -165,13 +165,14 @@ class WindowPool:
 def held_out_windows(config: DenseConfig, data: Path | None) -> Iterator[Windows]:
     """Yield the windows of test flights in order: of a data set, or of flights in scenes of their own."""
     sources: list[Any] = [data]
+    ends = None if data is None or config.head.field == "events" else config.head.field
     if data is None:
         seeds = range(_TEST_SEED, _TEST_SEED + config.test_flights)
         field = config.head.field
         more: dict[str, Any] = {"field": field, "duration_s": 3.0, "device": config.device}
         sources = [flight_settings(config.size_px, seed, **more) for seed in seeds]
     for number, source in enumerate(sources):
-        for batch in Stream(source, batch=64, **_options(config)):
+        for batch in Stream(source, batch=64, ends=ends, **_options(config)):
             found = windows_of(batch, config.head, config.bins)
             yield found._replace(source=[f"{number} {name}" for name in found.source])
 

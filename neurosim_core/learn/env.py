@@ -15,8 +15,9 @@ from neurosim_core.learn.episodes import (
     COLUMNS,
     PARAMETERS,
     Episodes,
-    free_points,
     look_at_vehicles,
+    make_routes,
+    probe,
 )
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
@@ -148,14 +149,19 @@ class Env:
         self.num_envs, self.action_count = worlds, 4
         wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(wp_device))
-        self._points = free_points(
+        routes = make_routes(
             [model.free_space for model in self.sim.models],
+            [task.routes(model.config.scene) for model in self.sim.models],
             clearance_m=task.start.clearance_m,
             device=wp_device,
         )
         self._episodes = Episodes(
-            task.start, self._points, self.sim.scene_of_world, world_count=worlds, device=wp_device
+            task.start, routes, self.sim.scene_of_world, world_count=worlds, device=wp_device
         )
+        self._distances = torch.zeros((worlds, len(task.probes)), device=self.device)
+        if task.probes:
+            self._probes: Any = wp.array(list(task.probes), dtype=wp.vec3, device=wp_device)
+            self._distances_array = wp.from_torch(self._distances)
         self._rows: Any = wp.zeros((worlds, COLUMN_COUNT), dtype=wp.float32, device=wp_device)
         self._surface: EventSurface | None = None
         if sees:
@@ -356,6 +362,14 @@ class Env:
             gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
             gravity_noise=self.randomisation.gravity_noise,
         )
+        if self.task.probes:
+            probe(
+                self._distances_array,
+                self._probes,
+                self._rows,
+                fields=self.sim.fields,
+                scene_of_world=self.sim.scene_of_world,
+            )
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)
@@ -365,6 +379,7 @@ class Env:
         worlds = self.num_envs
         return View(
             **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
+            probes=self._distances,
             surface=None if self._surface is None else wp.to_torch(self._surface.array),
             action=torch.zeros((worlds, 4), device=self.device),
             last_action=torch.zeros((worlds, 4), device=self.device),

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from neurosim_core.random import normal4, random_bits, stream_id, uniform4
 from neurosim_core.scene.freespace import DistanceField, FreeSpace, sample_distance
@@ -42,7 +43,6 @@ PARAMETERS = {"mass_factor": 0, "inertia_factor": 1, "drag_factor": 2, "wind_m_s
 """Columns of what differs between the airframes of worlds; of the wind x and y in W."""
 
 _POINT_COUNT = 4096
-_GOAL_TRIES = 16
 _EPISODE = wp.constant(wp.uint32(stream_id("learn/episode")))
 _NOISE = wp.constant(wp.uint32(stream_id("learn/noise")))
 
@@ -54,24 +54,21 @@ class StartConfig:
     clearance_m: float = 0.6
     """Least distance to the scene at the start and at the goal [m]."""
     speed_m_s: tuple[float, float] = (0.0, 0.0)
-    """Range of speeds, in any direction [m/s]."""
-    vertical_share: float = 0.5
-    """Vertical speed as a share of what a uniform direction gives."""
+    """Range of speeds, in any direction, but with half of the vertical part [m/s]."""
     tilt_max_rad: float = 0.0
     """Largest tilt [rad]."""
     rate_max_rad_s: float = 0.0
     """Largest body rate about each axis [rad/s]."""
-    goal_distance_m: tuple[float, float] = (0.0, 0.0)
-    """Range of distances of the goal; (0, 0): the goal is where the vehicle begins [m]."""
+    aimed: bool = False
+    """Whether heading and velocity point at the goal, levelly."""
 
 
 @wp.struct
 class _Start:
     speed: wp.vec2
-    vertical_share: wp.float32
     tilt_max: wp.float32
     rate_max: wp.float32
-    goal_distance: wp.vec2
+    aimed: wp.bool
 
 
 @wp.func
@@ -83,6 +80,7 @@ def _signed(u: wp.vec4) -> wp.vec4:
 def _begin(
     # Model:
     points: wp.array2d[wp.vec3],
+    goals: wp.array2d[wp.vec3],
     scene_of_world: wp.array[wp.int32],
     start: _Start,
     # In:
@@ -107,8 +105,13 @@ def _begin(
     a = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 0))
     b = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 1))
     c = _signed(uniform4(random_bits(seed, _EPISODE, wp.int64(1), 2)))
-    point = points[scene, wp.min(int(a[0] * float(points.shape[1])), points.shape[1] - 1)]
-    yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 2.0 * wp.PI * a[1])
+    index = wp.min(int(a[0] * float(points.shape[1])), points.shape[1] - 1)
+    point = points[scene, index]
+    goal = goals[scene, index]
+    heading = 2.0 * wp.PI * a[1]
+    if start.aimed:
+        heading = wp.atan2(goal[1] - point[1], goal[0] - point[0])
+    yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading)
     lean = 2.0 * wp.PI * a[2]
     tilt = wp.quat_from_axis_angle(wp.vec3(wp.cos(lean), wp.sin(lean), 0.0), start.tilt_max * a[3])
     q = yaw * tilt
@@ -116,25 +119,15 @@ def _begin(
     around = 2.0 * wp.PI * b[1]
     level = wp.sqrt(wp.max(1.0 - z * z, 0.0))
     speed = start.speed[0] + (start.speed[1] - start.speed[0]) * b[2]
-    v = wp.vec3(level * wp.cos(around), level * wp.sin(around), start.vertical_share * z) * speed
+    v = wp.vec3(level * wp.cos(around), level * wp.sin(around), 0.5 * z) * speed
+    if start.aimed:
+        v = wp.vec3(wp.cos(heading), wp.sin(heading), 0.0) * speed
     for axis in range(3):
         position_out[world, axis] = wp.float64(point[axis])
         velocity_out[world, axis] = wp.float64(v[axis])
         body_rate_out[world, axis] = wp.float64(start.rate_max * c[axis])
     for part in range(4):
         orientation_out[world, part] = wp.float64(q[part])
-    goal = point
-    if start.goal_distance[1] > 0.0:
-        found = 0
-        for trial in range(_GOAL_TRIES):
-            u = uniform4(random_bits(seed, _EPISODE, wp.int64(2), trial))
-            other = points[scene, wp.min(int(u[0] * float(points.shape[1])), points.shape[1] - 1)]
-            distance = wp.length(other - point)
-            if found == 0:
-                goal = other
-                found = wp.where(
-                    distance >= start.goal_distance[0] and distance <= start.goal_distance[1], 1, 0
-                )
     goal_out[world] = goal
     for block in range(DRAW_COUNT // 4):
         u = uniform4(random_bits(seed, _EPISODE, wp.int64(3), block))
@@ -264,25 +257,63 @@ def _vary_airframes(
     parameters_out[world, 4] = wind[1]
 
 
-def free_points(spaces: Sequence[FreeSpace], *, clearance_m: float, device: Any) -> Any:
-    """Return points in free space that are connected to each other, device array of vec3 [scene, 4096].
+Routes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Where episodes of a scene begin and where they lead to [m], shape [n, 3] each."""
+
+
+def make_routes(
+    spaces: Sequence[FreeSpace], given: Sequence[Routes | None], *, clearance_m: float, device: Any
+) -> tuple[Any, Any]:
+    """Return points where episodes begin and their goals, device arrays of vec3 [scene, n].
 
     Args:
         spaces: Of each scene.
+        given: Of each scene; None: points in free space that are connected to each other, and lead nowhere.
         clearance_m: Least distance to the scene [m].
         device: Where they are needed.
 
     Raises:
         ValueError: A scene has no such point.
     """
-    rows = []
-    for index, space in enumerate(spaces):
-        voxels = np.argwhere(space.reachable(clearance_m))
-        if not len(voxels):
+    ends = []
+    for index, (space, routes) in enumerate(zip(spaces, given, strict=True)):
+        if routes is None:
+            points = space.centers(np.argwhere(space.reachable(clearance_m)))
+            routes, places = (points, points), np.arange(len(points))
+            chosen = np.random.default_rng(0).integers(max(len(points), 1), size=_POINT_COUNT)
+        else:
+            places = np.flatnonzero(np.minimum(*(space.clearance(each) for each in routes)) >= clearance_m)
+            chosen = np.arange(_POINT_COUNT) % max(len(places), 1)
+        if not len(places):
             raise ValueError(f"scene {index} has no free space with a clearance of {clearance_m:g} m")
-        chosen = np.random.default_rng(0).integers(len(voxels), size=_POINT_COUNT)
-        rows.append(space.centers(voxels[chosen]))
-    return wp.array(np.array(rows, dtype=np.float32), dtype=wp.vec3, device=device)
+        ends.append([each[places[chosen]] for each in routes])
+    rows = np.array(ends, dtype=np.float32)
+    starts: Any = wp.array(rows[:, 0], dtype=wp.vec3, device=device)
+    goals: Any = wp.array(rows[:, 1], dtype=wp.vec3, device=device)
+    return starts, goals
+
+
+@wp.kernel
+def _probe(
+    # Model:
+    fields: wp.array[DistanceField],
+    scene_of_world: wp.array[wp.int32],
+    probes: wp.array[wp.vec3],
+    # In:
+    rows: wp.array2d[wp.float32],
+    # Out:
+    distances_out: wp.array2d[wp.float32],
+) -> None:
+    world, index = wp.tid()
+    q = wp.quat(rows[world, 6], rows[world, 7], rows[world, 8], rows[world, 9])
+    ahead = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    length = wp.max(wp.sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1]), 1.0e-6)
+    x = ahead[0] / length
+    y = ahead[1] / length
+    d = probes[index]
+    offset = wp.vec3(x * d[0] - y * d[1], y * d[0] + x * d[1], d[2])
+    point = wp.vec3(rows[world, 0], rows[world, 1], rows[world, 2]) + offset
+    distances_out[world, index] = sample_distance(fields[scene_of_world[world]], point)[0]
 
 
 class Episodes:
@@ -297,15 +328,14 @@ class Episodes:
     """
 
     def __init__(
-        self, config: StartConfig, points: Any, scene_of_world: Any, *, world_count: int, device: Any
+        self, config: StartConfig, routes: Any, scene_of_world: Any, *, world_count: int, device: Any
     ) -> None:
         self._start = _Start()
         self._start.speed = wp.vec2(*config.speed_m_s)
-        self._start.vertical_share = config.vertical_share
         self._start.tilt_max = config.tilt_max_rad
         self._start.rate_max = config.rate_max_rad_s
-        self._start.goal_distance = wp.vec2(*config.goal_distance_m)
-        self._points, self._scene_of_world, self._device = points, scene_of_world, device
+        self._start.aimed = config.aimed
+        self._routes, self._scene_of_world, self._device = routes, scene_of_world, device
         widths = {"position": 3, "velocity": 3, "orientation": 4, "body_rate": 3}
         self.start = {
             name: wp.zeros((world_count, width), dtype=wp.float64, device=device)
@@ -327,7 +357,7 @@ class Episodes:
         wp.launch(
             _begin,
             dim=len(self.seeds),
-            inputs=[self._points, self._scene_of_world, self._start, mask, self.seeds],
+            inputs=[*self._routes, self._scene_of_world, self._start, mask, self.seeds],
             outputs=[*self.start.values(), self.goal, self.draws],
             device=self._device,
         )
@@ -409,4 +439,23 @@ def look_at_vehicles(
         ],
         outputs=[rows],
         device=rows.device,
+    )
+
+
+def probe(distances: Any, probes: Any, rows: Any, *, fields: Any, scene_of_world: Any) -> None:
+    """Write the distance to the scene of points about each vehicle, to a voxel; launches only.
+
+    Args:
+        distances: Overwritten [m], float32, shape [N, K].
+        probes: The points, ahead of, to the left of and above the vehicle, level [m], array of vec3, [K].
+        rows: Of `look_at_vehicles`.
+        fields: Distance to each scene, array of `DistanceField`.
+        scene_of_world: Index of the scene of each world.
+    """
+    wp.launch(
+        _probe,
+        dim=distances.shape,
+        inputs=[fields, scene_of_world, probes, rows],
+        outputs=[distances],
+        device=distances.device,
     )

@@ -79,7 +79,6 @@ def evaluate(
     actor: Actor,
     *,
     seed: int = 1_000_000,
-    look: Callable[[Env, Observations], None] | None = None,
 ) -> Evaluation:
     """Fly the first episode of each world.
 
@@ -87,15 +86,12 @@ def evaluate(
         env: Where.
         actor: Who flies.
         seed: Of the episodes.
-        look: Called before each step.
     """
     observations, _ = env.reset(seed=seed)
     begun = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     going = begun.clone()
     found: dict[str, torch.Tensor] = {}
     for _ in range(env.episode_steps):
-        if look is not None:
-            look(env, observations)
         observations, _, terminated, truncated, info = env.step(actor(observations, begun))
         begun = terminated | truncated
         for name, value in info["metrics"].items():

@@ -20,6 +20,8 @@ CAMERA = "events"
 """Name of the event camera in `pilot_settings`."""
 _COLOUR = {"kind": "rgb", "rate_hz": 20.0, "lens": {"width": 320, "height": 240, "horizontal_fov_rad": 1.5}}
 """What a flight is filmed with."""
+_VECTOR_SIZE = 10
+"""Numbers that a policy sees besides events: gravity, body rates, the last action."""
 
 
 class Command(NamedTuple):
@@ -76,6 +78,11 @@ class Pilot:
             device="cpu",
         )
         sizes = {each.name: each.shape for each in self._session.get_inputs()}
+        if sizes["vector"] != [1, _VECTOR_SIZE]:
+            raise ValueError(
+                f"{file} was trained for {self.card['task']!r}, and needs more than events, gravity and body "
+                "rates: fly it by `neurosim learn eval`"
+            )
         self._memory: NDArray[np.float32] = np.zeros(sizes["memory"], np.float32)
         self.action: NDArray[np.float32] = np.zeros(4, np.float32)
 

@@ -25,6 +25,8 @@ class PpoConfig:
     learning_rate: float = 1.5e-3
     """At first; it falls to a tenth."""
     discount: float = 0.98
+    reward_scale: float = 1.0
+    """What rewards are multiplied with: large errors of the critic would drown the gradient of the actor."""
     trace: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
@@ -105,7 +107,7 @@ class Ppo:
                 ("action", action),
                 ("log_p", policy.log_probability(mean, action)),
                 ("value", policy.value(told)),
-                ("reward", reward + config.discount * cut * truncated),
+                ("reward", config.reward_scale * reward + config.discount * cut * truncated),
                 ("done", done),
             ):
                 rows[name].append(value)

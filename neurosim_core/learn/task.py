@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.episodes import Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
+from neurosim_core.scene.config import SceneConfig
 from neurosim_core.vehicle import MultirotorConfig
 
 MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
@@ -88,6 +89,8 @@ class View:
     """`gravity_B` as an attitude estimator gives it, [N, 3]."""
     clearance: torch.Tensor
     """Distance from the centre to the scene [m], to a voxel, [N, 1]."""
+    probes: torch.Tensor
+    """Distance to the scene of the points `Task.probes` [m], to a voxel, [N, K]."""
     surface: torch.Tensor | None
     """Event surface, [N, C, H, W]; None: there is no camera."""
     action: torch.Tensor
@@ -138,8 +141,14 @@ class Task:
     """Body rates of an action of 1 [rad/s]."""
     thrust_span: float = 0.6
     """Change of thrust of an action of 1, as a share of the hover thrust."""
+    probes: Sequence[tuple[float, float, float]] = ()
+    """Points whose distance to the scene is seen [m]: ahead, to the left and above, in a level frame."""
     groups: Mapping[str, Sequence[str]] = {}
     """Names of observations that each group sees: actor, critic, teacher, student."""
+    teacher: Mapping[str, Any] = {}
+    """Settings of `PpoConfig` for the teacher, where they differ from those that hover needs."""
+    student: Mapping[str, Any] = {}
+    """And of `DaggerConfig` for the student."""
     hint: str = "velocity"
     """Name of the observation that students estimate besides."""
     mirror: Mapping[str, Sequence[float]] = {}
@@ -149,6 +158,10 @@ class Task:
         """Return settings of the scenes to train in, or of others."""
         first = 100 if unseen else 0
         return [{"kind": "apartment", "rooms": 1, "seed": first + seed} for seed in range(4)]
+
+    def routes(self, scene: SceneConfig) -> Routes | None:
+        """Return where episodes in a scene begin and lead to; None: anywhere, as `start` says."""
+        return None
 
     def command(self, view: View) -> torch.Tensor:
         """Return collective thrust [N] and body rate [rad/s] of the last actions, [N, 4]."""

@@ -199,13 +199,17 @@ def prepare_torch() -> None:
 
 def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
     """Return how a task is trained: with more worlds on a GPU, and for longer."""
+    found = find_task(task)
+    teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
-        return dataclasses.replace(config, pixels=24)
+        small = PpoConfig(**teacher), DaggerConfig(**student)
+        return dataclasses.replace(config, teacher=small[0], student=small[1], pixels=24)
+    many = {"worlds": 1024, "iterations": 80, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512, iterations=40),
-        student=DaggerConfig(worlds=1024, iterations=80, replay=4, updates=26, batch=160),
+        teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
+        student=DaggerConfig(**(many | student)),
         block=40,
         evaluation_worlds=512,
     )

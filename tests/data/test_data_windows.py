@@ -178,3 +178,21 @@ def test_batches_of_worlds():
         assert np.array_equal(batch.pose[0], sample.pose)
         assert np.array_equal(batch.flow[0], sample.flow, equal_nan=True)
         assert np.isfinite(sample.flow).mean() > 0.5
+
+
+def test_windows_may_end_at_ground_truth(tmp_path):
+    """Depth comes every 40 ms, windows of 50 ms overlap: those that begin before the flight are not there."""
+    events = write_flight(tmp_path / "a.h5", duration_s=0.4, depth_hz=25.0)
+    found = data.Dataset(tmp_path / "a.h5", window_s=0.05, ends="depth")
+    assert [sample.stamp_ns for sample in found] == [40_000_000 * k for k in range(2, 11)]
+    for sample in found:
+        end_us = sample.stamp_ns // 1000
+        inside = (events.t > end_us - 50_000) & (events.t <= end_us)
+        assert np.array_equal(sample.events.t, events.t[inside])
+        assert sample.depth is not None
+    with pytest.raises(ValueError, match="ends must be one of depth, flow, rgb, pose, got 'imu'"):
+        data.Dataset(tmp_path / "a.h5", ends="imu")
+    with pytest.raises(ValueError, match="ends is 'depth', which is not in fields"):
+        data.Dataset(tmp_path / "a.h5", ends="depth", fields=["events"])
+    with pytest.raises(ValueError, match="no sensor for flow"):
+        data.Dataset(tmp_path / "a.h5", ends="flow")

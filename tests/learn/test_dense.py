@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 import neurosim_core as ns
+from neurosim_core.cli import main
 from neurosim_core.data.batch import Sample, collate
 from neurosim_core.packets import EventArrays
 from neurosim_core.record import RecordingWriter
@@ -198,7 +199,7 @@ def flights(tmp_path_factory, scene):
 
 
 @pytest.mark.parametrize("task", HEADS)
-def test_training_from_files_learns_and_can_be_loaded(tmp_path, flights, task):
+def test_training_from_files_learns_and_can_be_loaded(tmp_path, flights, task, capsys):
     config = DenseConfig(task=task, steps=60, batch=4, channels=8, rate=2e-2)
     errors = train_dense(tmp_path, config, data=flights, test=flights)
     for blind in ("events zeroed", "mean of each pixel"):
@@ -210,6 +211,8 @@ def test_training_from_files_learns_and_can_be_loaded(tmp_path, flights, task):
     assert (loaded.task, loaded.channels) == (task, 8)
     tested = held_out_windows(loaded, flights)
     assert evaluate(net, tested, loaded.head) == errors["network"]
+    assert main(["learn", "eval", str(tmp_path / f"{task}.pt"), "--test", str(flights)]) == 0
+    assert capsys.readouterr().out == f"{errors['network']}\n"
 
 
 def test_worlds_give_the_windows_of_runs(scene):

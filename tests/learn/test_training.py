@@ -111,6 +111,10 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     ns.load_config(pilot_settings(pilot.card))
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
+    shape = {**policy.shape, "vector_size": 17}
+    export_onnx(EventPolicy(**shape), {**card, "task": "avoid"}, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match="trained for 'avoid', and needs more than events"):
+        Pilot(tmp_path / "other.onnx")
 
 
 def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):

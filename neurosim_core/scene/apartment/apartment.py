@@ -78,11 +78,11 @@ def make_apartment(config: ApartmentConfig) -> Scene:
         pieces.extend(space.pieces)
         points.append(space.roomiest(_FLIGHT_HEIGHT_M))
     name = f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}"
-    return _assemble(name, pieces, palette, inside_m=max(points)[1])
+    return assemble(name, pieces, palette, inside_m=max(points)[1])
 
 
-def _assemble(
-    name: str, pieces: Sequence[Piece], palette: Palette, *, inside_m: tuple[float, float, float]
+def assemble(
+    name: str, pieces: Sequence[Piece], palette: Palette, *, inside_m: tuple[float, float, float] | None
 ) -> Scene:
     """Return a scene in which every piece is an object; objects are named `kind_1`, `kind_2` and so on."""
     counts: dict[str, int] = {}
