@@ -6,7 +6,7 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
 
     world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
     world/bodies/<body>                     where it is, whenever the first vehicle says where that one is
-    world/vehicles/<vehicle>[/<sensor>]     its pose; where a sensor sits; a camera's frustum and picture, points
+    world/vehicles/<vehicle>[/<sensor>]     its pose; where a sensor sits; frustum, picture, points
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
     world/vehicles/<vehicle>/<sensor>/arrows    flow, on a grid of pixels
