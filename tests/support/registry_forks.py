@@ -53,8 +53,9 @@ class RegistryForks:
             assert self._socket.recv(1) == b"."
 
     def close(self) -> None:
-        """Let it end."""
+        """End it, whoever else has a copy of our end; registries have sessions of their own."""
         self._socket.close()
+        self._process.kill()
         self._process.wait()
 
 
