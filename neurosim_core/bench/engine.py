@@ -22,7 +22,7 @@ from neurosim_core.overrides import set_options
 from neurosim_core.packets import EventArrays, Events, Odometry
 from neurosim_core.record import Recording
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.config import LightingConfig, RenderConfig
+from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.renderer import make_renderer, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,6 @@ from neurosim_core.bench.engine import (
     EventArrays,
     EventCamera,
     EventCameraConfig,
-    LightingConfig,
     PinholeConfig,
     Poses,
     RenderConfig,
@@ -119,10 +120,15 @@ def _checkerboard(lens: PinholeConfig) -> Scene:
     )
 
 
+@lru_cache(maxsize=1)
+def _upload(scene: Scene, device: str, filter_settings: tuple[tuple[str, Any], ...]) -> Any:
+    return upload_scene(scene, RenderConfig(exposure=1.0, **dict(filter_settings)), device=device)
+
+
 def _view(scene: Scene, lens: PinholeConfig, device: str, count: int, **settings: Any) -> View:
-    light = LightingConfig(mode="unshadowed")  # nothing to prepare
-    config = RenderConfig(lighting=light, exposure=1.0, **settings)
-    return View(upload_scene(scene, config, device=device), lens, count=count)
+    rays = {key: settings.pop(key) for key in ["samples_per_pixel"] if key in settings}
+    arrays = _upload(scene, device, tuple(sorted(settings.items())))
+    return View(replace(arrays, config=arrays.config.model_copy(update=rays)), lens, count=count)
 
 
 def _render(
@@ -240,7 +246,7 @@ def _chapter(rows: list[Row], pan: list[Row], pictures: list[Picture], device: s
         y_ticks={row["setting"]: place for place, row in enumerate(pan)},
         x_lines={"events of the reference": point["of the reference"]},
     )
-    times = f"Natural logarithm; {size}; light without shadows; CPU time of all threads, or wall-clock "
+    times = f"Natural logarithm; {size}; baked light; CPU time of all threads, or wall-clock "
     "time on CUDA."
     return Chapter(
         name="render",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -133,8 +133,7 @@ def _transfer(arguments: argparse.Namespace) -> int:
         f"{done.end_us * 1e-6:.6f} s ({done.event_count / max(span_s, 1e-6) / 1e6:.2f} M/s){more}",
         highlight=False,
     )
-    for note in done.notes:
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    print_notes(done.notes, console)
     console.print(f"{out}", markup=False, highlight=False, soft_wrap=True)
     return 0
 
@@ -237,11 +236,16 @@ def print_conversion(conversion: Conversion, out: Path, console: Console) -> Non
     for name, text in _facts(conversion):
         facts.add_row(name, text)
     console.print(facts, highlight=False)
-    for note in (*conversion.source.notes, *_warnings(conversion)):
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    print_notes((*conversion.source.notes, *_warnings(conversion)), console)
     if not conversion.complete:
         console.print("interrupted; what was converted is kept", style="yellow")
     console.print(f"{out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def print_notes(notes: Iterable[str], console: Console) -> None:
+    """Print what a user should be aware of, one line each."""
+    for note in notes:
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def _facts(c: Conversion) -> list[tuple[str, str]]:

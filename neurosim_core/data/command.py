@@ -142,6 +142,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from neurosim_core.convert.command import print_notes
     from neurosim_core.convert.geometry import read_size
     from neurosim_core.data.compare import draw_comparison, measure_events
     from neurosim_core.data.stream import find_recordings
@@ -172,7 +173,6 @@ def _compare(arguments: argparse.Namespace) -> int:
         status.update("drawing")
         draw_comparison(stats, arguments.out)
     console.print(table)
-    for note in (note for one in stats for note in one.notes):
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    print_notes((note for one in stats for note in one.notes), console)
     console.print(f"{arguments.out}", markup=False, highlight=False)
     return 0

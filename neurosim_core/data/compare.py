@@ -197,6 +197,19 @@ def _radial(power: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
     return (np.arange(count) + 0.5) / (2.0 * count), mean / max(float(mean.sum()), 1e-30)
 
 
+def new_figure(width_in: float, height_in: float) -> Any:
+    """Return an empty figure of matplotlib, of 100 px an inch.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib.figure
+    except ImportError as error:
+        raise ImportError(f"plots need matplotlib: {install_hint('view')}") from error
+    return matplotlib.figure.Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+
+
 def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
     """Draw a page that compares files, as PNG, PDF or SVG.
 
@@ -204,11 +217,7 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
         ImportError: matplotlib is not installed.
         OSError: It cannot be written.
     """
-    try:
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError(f"plots need matplotlib: {install_hint('view')}") from error
-    figure = matplotlib.figure.Figure(figsize=(14.0, 9.0), dpi=100, layout="constrained")
+    figure = new_figure(14.0, 9.0)
     grid = figure.add_gridspec(3, 6, height_ratios=[1.0, 1.0, 0.9])
     plots = [figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])]
     middles_us = np.sqrt(INTERVAL_EDGES_US[1:] * INTERVAL_EDGES_US[:-1])
@@ -220,9 +229,9 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
         share = one.intervals / max(int(one.intervals.sum()), 1)
         plots[1].step(middles_us * 1e-3, share, color=color, where="mid", lw=1.4)
         plots[2].plot(one.frequency, np.maximum(one.spectrum, 1e-12), color=color, lw=1.4)
-    _label(plots[0], "event rate of a pixel", "time since the first event [s]", "events a second")
-    _label(plots[1], "time between two events of a pixel", "interval [ms]", "share", x="log")
-    _label(plots[2], "spatial spectrum of 20 ms", "frequency [cycles/px]", "share of the power", y="log")
+    label_axes(plots[0], "event rate of a pixel", "time since the first event [s]", "events a second")
+    label_axes(plots[1], "time between two events of a pixel", "interval [ms]", "share", x="log")
+    label_axes(plots[2], "spatial spectrum of 20 ms", "frequency [cycles/px]", "share of the power", y="log")
     plots[0].set_ylim(0.0, 1.25 * plots[0].get_ylim()[1])  # room for the legend
     plots[0].legend(loc="upper right", frameon=False, fontsize=9)
     shown = stats[: len(_COLORS)]
@@ -232,9 +241,10 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
     figure.savefig(out)
 
 
-def _label(
+def label_axes(
     axes: Any, title: str, x_label: str, y_label: str, *, x: str = "linear", y: str = "linear"
 ) -> None:
+    """Name a plot and its axes; `x` and `y` are their scales."""
     axes.set(xlabel=x_label, ylabel=y_label, xscale=x, yscale=y)
     axes.set_title(title, loc="left", color=_INK, fontsize=11, fontweight="bold")
     axes.spines[["top", "right"]].set_visible(False)

@@ -137,6 +137,7 @@ def print_fit(fit: SensorFit, console: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from neurosim_core.convert.command import print_notes
     from neurosim_core.fit.sensor import statistics
 
     table = Table("setting", "value", "standard error", box=None, pad_edge=False)
@@ -149,8 +150,7 @@ def print_fit(fit: SensorFit, console: Console) -> None:
     for name, value in statistics(fit.real).items():
         table.add_row(escape(name), _short(value), _short(simulated[name]) if name in simulated else "")
     console.print(table, highlight=False)
-    for note in fit.notes:
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    print_notes(fit.notes, console)
 
 
 def _short(value: Any) -> str:
@@ -189,13 +189,9 @@ def draw_fit(fit: SensorFit, out: Path) -> None:
     """
     import numpy as np
 
-    from neurosim_core.install import install_hint
+    from neurosim_core.data.compare import label_axes, new_figure
 
-    try:
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError(f"the picture needs matplotlib: {install_hint('view')}") from error
-    figure = matplotlib.figure.Figure(figsize=(14.0, 4.2), dpi=100, layout="constrained")
+    figure = new_figure(14.0, 4.2)
     rates, intervals, steps = figure.subplots(1, 3)
     for one, color, name in zip((fit.real, fit.simulated), _COLORS, ("recording", "simulation"), strict=True):
         still = one.still
@@ -211,19 +207,13 @@ def draw_fit(fit: SensorFit, out: Path) -> None:
         time_s = np.linspace(0.0, one.period_s, one.period_hz.shape[1], endpoint=False)
         for rate, style in zip(one.period_hz, ("-", ":"), strict=True):
             steps.plot(time_s, rate, style, color=color)
-    _label(rates, "rates of pixels in still light", "share of pixels", "events a second", "log")
-    _label(intervals, "time between two events of a pixel", "interval [s]", "share", "log")
-    _label(steps, "rate of a pixel after light rises", "time [s]", "events a second", "linear")
-    rates.set_yscale("log")
+    label_axes(
+        rates, "rates of pixels in still light", "share of pixels", "events a second", x="log", y="log"
+    )
+    label_axes(intervals, "time between two events of a pixel", "interval [s]", "share", x="log")
+    label_axes(steps, "rate of a pixel after light rises", "time [s]", "events a second")
     if not fit.real.period_hz.size:
         steps.text(0.5, 0.5, "no recording of steps", ha="center", transform=steps.transAxes)
     rates.legend(frameon=False, fontsize=9)
     intervals.legend(frameon=False, fontsize=9)
     figure.savefig(out)
-
-
-def _label(axes: Any, title: str, x_label: str, y_label: str, x_scale: str) -> None:
-    axes.set(xlabel=x_label, ylabel=y_label, xscale=x_scale)
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#e9ecef")

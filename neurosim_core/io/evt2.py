@@ -21,8 +21,6 @@ _KNOWN = {0x0, _ON, _TIME_HIGH, _TRIGGER, _OTHERS, _CONTINUED}
 _HIGH_BITS = 28
 _HIGH_MAX = (1 << _HIGH_BITS) - 1
 _LOW_BITS = 6
-SIZE_MAX = 2048
-"""Most columns and rows."""
 
 
 class Evt2Encoder:

@@ -12,7 +12,7 @@
    pixel shows the nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded
    once per pixel, at the middle of the points that show it.
 3. Blocks with more than FACE_COUNT_MAX faces or with moving bodies, and pixels that show for the most part
-   none of the faces, are the mean of RAY_COUNT rays, through every other point.
+   none of the faces, are the mean of RAY_COUNT rays.
 
 Faces are those of the scene before they are cut for baked light, which makes many of one.
 
@@ -33,7 +33,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernels, make_lists
+from neurosim_core.render.antialias_groups import even_thread_count, group_kernels, make_lists
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.coverage import (
@@ -483,5 +483,6 @@ class Antialiasing:
             )
             return
         self._lists.count.zero_()
-        for kernel, dim in zip(self._kernels, (pixel_count, *2 * [self._lists.threads]), strict=True):
+        even = even_thread_count(pixel_count, view.instant_count)
+        for kernel, dim in zip(self._kernels, (even, *2 * [self._lists.threads]), strict=True):
             launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)

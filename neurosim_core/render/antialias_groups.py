@@ -39,6 +39,8 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
+_INSTANTS = wp.constant(4)
+"""Instants of a pixel in a block that shows one surface, of a thread."""
 _COVER_BOUNDS = (64, 16)
 """Threads of a block, and blocks of a multiprocessor."""
 _THREADS_PER_MULTIPROCESSOR = 1280
@@ -78,6 +80,11 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
     lists.count = wp.zeros(3, dtype=int, device=device)
     lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
     return lists
+
+
+def even_thread_count(pixel_count: int, instant_count: int) -> int:
+    """Return the threads of the kernel of even blocks, for so many pixels of all instants of all worlds."""
+    return pixel_count // instant_count * -(-instant_count // _INSTANTS)
 
 
 @wp.func_native(read_native(__file__, "classify_block"))
@@ -128,15 +135,15 @@ def _meet_pair(
     ...
 
 
-@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "store_pair", MOST=FACE_COUNT_MAX))
 def _store_pair(place: int, pair: int, light: wp.vec3):
     """Keep the light of a pair."""
     ...
 
 
-@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
-def _sum_pairs(place: int, first: int, count: int) -> wp.vec3:
-    """Return the light of consecutive pairs."""
+@wp.func_native(read_native(__file__, "sum_pairs", MOST=FACE_COUNT_MAX))
+def _sum_pairs(place: int, first: int, count: int, step: int) -> wp.vec3:
+    """Return the light of those of consecutive pairs that are among the 32 of a step."""
     ...
 
 
@@ -163,10 +170,57 @@ def _xyz(ray: wp.vec4) -> wp.vec3:
     return wp.vec3(ray[0], ray[1], ray[2])
 
 
+@wp.struct
+class PixelPlace:
+    """A pixel of a block in one instant; for the rest see `view_data.TilePlace`."""
+
+    rendered: wp.bool
+    world: int
+    instant: int
+    slot: int
+    left: int
+    """Column of the first pixel of the block."""
+    top: int
+    """Row of the first pixel of the block."""
+    row: int
+    col: int
+    outside: wp.bool
+    """The pixel is not in the picture."""
+    ray: int
+    """Index of its ray in a layer."""
+
+
+def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:
+    """Return the Warp function that locates a pixel of a block.
+
+    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; which of the four blocks of
+    the tile; which of the 16 pixels of the block; view and worlds.
+    """
+    locate_tile = tile_locator(terms, images=images, instants=instants)
+
+    @wp.func
+    def locate_pixel(tile: int, instant: int, quarter: int, lane: int, view: ViewData, worlds: WorldData):
+        place = locate_tile(tile, instant, view, worlds)
+        at = PixelPlace()
+        at.rendered = place.rendered
+        at.world = place.world
+        at.instant = place.instant
+        at.slot = place.slot
+        at.left = place.left + 4 * (quarter % 2)
+        at.top = place.top + 4 * (quarter // 2)
+        at.row = at.top + lane // 4
+        at.col = at.left + lane % 4
+        at.outside = at.col >= view.width or at.row >= view.height
+        at.ray = place.first_ray + at.row * view.width + at.col
+        return at
+
+    return locate_pixel
+
+
 def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     """Return the kernels; see `antialias.antialiasing_kernel`."""
     requested = requested_outputs(outputs)
-    locate_tile = tile_locator(terms, images=requested.images, instants=requested.log)
+    locate_pixel = _pixel_locator(terms, images=requested.images, instants=requested.log)
     radiance_of = pixel_shader(terms)
     radiance_beyond = pixel_shader(terms, beyond=True)
     write_radiance = radiance_writer(outputs, supersampled=False)
@@ -184,51 +238,52 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         out: RenderOutputs,
         lists: BlockLists,
     ) -> None:
-        # The threads of a warp reach the functions that they call together: 64 are a tile in one instant.
-        index = first + wp.tid()
-        block = index // 16
-        place = locate_tile(index // 64 // view.instant_count, index // 64 % view.instant_count, view, worlds)
-        if not place.rendered:
-            return
-        if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[place.world]]
-        left = place.left + 4 * (block % 2)
-        top = place.top + 4 * (block // 2 % 2)
-        kind = _classify_block(scene, out.face, place.instant, top, left, view.height, view.width)
-        if left >= view.width or top >= view.height:
-            return
-        lane = index % 16
-        if lane == 0 and kind == _SEVERAL:
-            lists.uneven[wp.atomic_add(lists.count, 0, 1)] = block
-        if lane == 0 and kind == _BODY:
-            columns = (1 << wp.min(view.width - left, 4)) - 1
-            pixels = int(0)
-            for row in range(wp.min(view.height - top, 4)):
-                pixels = pixels | (columns << (4 * row))
-            lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, pixels)
-        col = left + lane % 4
-        row = top + lane // 4
-        even = kind != _SEVERAL and kind != _BODY
-        if not even or col >= view.width or row >= view.height:
-            return
-        radiance = scene.sky
-        if kind != _SKY:
-            origin = view.p_WC[place.instant]
-            q = view.q_WC[place.instant]
-            ray_C = rays[0, place.first_ray + row * view.width + col]
-            toward = wp.quat_rotate(q, _xyz(ray_C))
-            part = out.face[place.instant, row, col]
-            met = _meet_part(scene, part, origin, toward)
-            hit = Hit()
-            hit.face = part
-            hit.t = met[0]
-            hit.u = met[1]
-            hit.v = met[2]
-            hit.normal = wp.vec3(met[3], met[4], met[5])
-            radiance = radiance_beyond(
-                scene, bodies, place.instant, -1, q, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit
-            )
-        write_radiance(scene, radiance, 1, place.instant, place.slot, row, col, out)
+        # The threads of a warp reach the functions that they call together: 64 are a tile in a few instants.
+        group = (first + wp.tid()) // 64
+        quarter = (first + wp.tid()) % 64 // 16
+        lane = (first + wp.tid()) % 16
+        group_count = (view.instant_count + _INSTANTS - 1) // _INSTANTS
+        tile = group // group_count
+        begin = group % group_count * _INSTANTS
+        for instant in range(begin, wp.min(begin + _INSTANTS, view.instant_count)):
+            at = locate_pixel(tile, instant, quarter, lane, view, worlds)
+            if not at.rendered:
+                continue
+            if wp.static(terms.world_scenes):
+                scene = worlds.scenes[worlds.scene[at.world]]
+            kind = _classify_block(scene, out.face, at.instant, at.top, at.left, view.height, view.width)
+            if at.left >= view.width or at.top >= view.height:
+                continue
+            block = 4 * (tile * view.instant_count + instant) + quarter
+            if lane == 0 and kind == _SEVERAL:
+                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = block
+            if lane == 0 and kind == _BODY:
+                columns = (1 << wp.min(view.width - at.left, 4)) - 1
+                pixels = int(0)
+                for row in range(wp.min(view.height - at.top, 4)):
+                    pixels = pixels | (columns << (4 * row))
+                lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, pixels)
+            even = kind != _SEVERAL and kind != _BODY
+            if at.outside or not even:
+                continue
+            radiance = scene.sky
+            if kind != _SKY:
+                origin = view.p_WC[at.instant]
+                q = view.q_WC[at.instant]
+                ray_C = rays[0, at.ray]
+                toward = wp.quat_rotate(q, _xyz(ray_C))
+                part = out.face[at.instant, at.row, at.col]
+                met = _meet_part(scene, part, origin, toward)
+                hit = Hit()
+                hit.face = part
+                hit.t = met[0]
+                hit.u = met[1]
+                hit.v = met[2]
+                hit.normal = wp.vec3(met[3], met[4], met[5])
+                radiance = radiance_beyond(
+                    scene, bodies, at.instant, -1, q, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit
+                )
+            write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
@@ -245,44 +300,42 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     ) -> None:
         # The threads of a warp reach the functions that they call together.
         lane = (first + wp.tid()) % 32
-        pixel_lane = lane % 16
         entry = _next_entry(lists.count, 2)
         while entry < lists.count[0]:
             block = lists.uneven[entry]
-            place = locate_tile(
-                block // 4 // view.instant_count, block // 4 % view.instant_count, view, worlds
+            at = locate_pixel(
+                block // 4 // view.instant_count,
+                block // 4 % view.instant_count,
+                block % 4,
+                lane % 16,
+                view,
+                worlds,
             )
             if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[place.world]]
-            left = place.left + 4 * (block % 2)
-            top = place.top + 4 * (block // 2 % 2)
-            col = left + pixel_lane % 4
-            row = top + pixel_lane // 4
-            outside = col >= view.width or row >= view.height
-            pixel = place.first_ray + row * view.width + col
-            corner = place.first_ray + top * view.width + left
-            if outside:
-                pixel = corner
-            origin = view.p_WC[place.instant]
-            q = view.q_WC[place.instant]
+                scene = worlds.scenes[worlds.scene[at.world]]
+            corner = at.ray - (lane % 16 // 4) * view.width - lane % 4
+            pixel = wp.where(at.outside, corner, at.ray)
+            origin = view.p_WC[at.instant]
+            q = view.q_WC[at.instant]
             covered = _cover_block(
                 scene,
                 out.face,
-                place.instant,
-                top,
-                left,
+                at.instant,
+                at.top,
+                at.left,
                 view.height,
                 view.width,
-                outside,
+                at.outside,
                 origin,
                 wp.quat_rotate(q, _xyz(rays[0, pixel])),
                 wp.quat_rotate(q, _xyz(rays[1, pixel])),
                 wp.quat_rotate(q, _xyz(rays[2, pixel])),
             )
+            total = wp.vec3(0.0)
             for step in range((covered[0] + 31) // 32):
                 pair = 32 * step + lane
                 if pair < covered[0]:
-                    met = _meet_pair(scene, covered[5], pair, out.face, place.instant, top, left, origin)
+                    met = _meet_pair(scene, covered[5], pair, out.face, at.instant, at.top, at.left, origin)
                     owner = int(met[0])
                     spread_rad = rays[0, corner + owner // 4 * view.width + owner % 4][3]
                     toward = wp.vec3(met[3], met[4], met[5])
@@ -295,7 +348,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     light = radiance_beyond(
                         scene,
                         bodies,
-                        place.instant,
+                        at.instant,
                         -1,
                         q,
                         wp.normalize(toward),
@@ -304,15 +357,15 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                         hit,
                     )
                     _store_pair(covered[5], pair, met[1] * light)
-            total = _sum_pairs(covered[5], covered[1], covered[2])
+                total += _sum_pairs(covered[5], covered[1], covered[2], step)
             whole = float(SAMPLE_COUNT)
             if covered[4] != 0:
                 total += float(covered[3]) * scene.sky
             else:
                 whole -= float(covered[3])
-            written = lane < 16 and not outside
+            written = lane < 16 and not at.outside
             if written and covered[3] >= 0:
-                write_radiance(scene, total / whole, 1, place.instant, place.slot, row, col, out)
+                write_radiance(scene, total / whole, 1, at.instant, at.slot, at.row, at.col, out)
             unresolved = _warp_votes(written and covered[3] < 0)
             if unresolved != 0 and lane == 0:
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
@@ -336,41 +389,43 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         for turn in range(turn_count(begin, lists.count[1], lists.threads // _RAYS)):
             listed = lists.unresolved[begin + turn * (lists.threads // _RAYS)]
             block = listed[0]
-            place = locate_tile(
-                block // 4 // view.instant_count, block // 4 % view.instant_count, view, worlds
+            lane = index // RAY_COUNT
+            at = locate_pixel(
+                block // 4 // view.instant_count,
+                block // 4 % view.instant_count,
+                block % 4,
+                lane,
+                view,
+                worlds,
             )
             if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[place.world]]
-            lane = index // RAY_COUNT
-            row = place.top + 4 * (block // 2 % 2) + lane // 4
-            col = place.left + 4 * (block % 2) + lane % 4
+                scene = worlds.scenes[worlds.scene[at.world]]
             wanted = (listed[1] >> lane) & 1
             light = wp.vec3(0.0)
             if wanted != 0:
                 point = ray_point(index % RAY_COUNT)
-                origin = view.p_WC[place.instant]
-                q = view.q_WC[place.instant]
-                pixel = place.first_ray + row * view.width + col
-                toward_C = _xyz(rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel])
+                origin = view.p_WC[at.instant]
+                q = view.q_WC[at.instant]
+                toward_C = _xyz(rays[0, at.ray] + point[0] * rays[1, at.ray] + point[1] * rays[2, at.ray])
                 direction_C = wp.normalize(toward_C)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
                 if wp.static(terms.bodies):
-                    hit, body = intersect_bodies(bodies, place.instant, direction_C, q, hit)
+                    hit, body = intersect_bodies(bodies, at.instant, direction_C, q, hit)
                 light = radiance_of(
                     scene,
                     bodies,
-                    place.instant,
+                    at.instant,
                     body,
                     q,
                     direction,
                     origin,
-                    RAY_WIDTH * rays[0, pixel][3],
+                    RAY_WIDTH * rays[0, at.ray][3],
                     hit,
                 )
             light = _ray_sum(light)
             if wanted != 0 and index % RAY_COUNT == 0:
-                write_radiance(scene, light / float(RAY_COUNT), 1, place.instant, place.slot, row, col, out)
+                write_radiance(scene, light / float(RAY_COUNT), 1, at.instant, at.slot, at.row, at.col, out)
 
     return GroupKernels(shade_even_blocks, cover_uneven_blocks, cast_unresolved_pixels)

@@ -65,7 +65,7 @@ class RenderConfig(Settings):
     """Radiance added before the logarithm that event cameras see: what a black surface gives."""
     samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = "adaptive"
     """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray
-    finds the surfaces around a pixel, and 16 points of the pixel tell how much of it each covers; 8 rays
+    finds the surfaces around a pixel, and 32 points of the pixel tell how much of it each covers; 8 rays
     where many small surfaces meet and for moving bodies. It takes 2 to 4 times as long as one ray, and more
     in pictures of 64x64 of a detailed scene. An integer: as many rays in all pixels. With 1, edges alias, and
     a quarter to a half of the events at 346x260 are aliasing. Geometry (depth, range, normal, instance) is

@@ -6,13 +6,13 @@ import warp as wp
 
 from neurosim_core.native_code import read_native
 
-SAMPLE_COUNT = 16
+SAMPLE_COUNT = 32
 """Points of a pixel."""
 RAY_COUNT = 8
 """Rays of a pixel that is rendered by rays."""
 RAY_WIDTH = wp.constant(RAY_COUNT**-0.5)
 """Width of the footprint of one of them [px]."""
-FACE_COUNT_MAX = 64
+FACE_COUNT_MAX = 48
 """Most faces of a block of 4 x 4 pixels and the ring around it."""
 SHARPNESS = wp.constant(0.7)
 """Width of the footprint that a texture is averaged over where a surface fills a pixel [px].
@@ -21,16 +21,10 @@ A lookup blurs more than a mean does.
 """
 
 
-@wp.func_native(read_native(__file__, "sample_point", SAMPLES=SAMPLE_COUNT))
-def sample_point(sample: int) -> wp.vec2:
-    """Return a point of a pixel, from its centre [px]."""
-    ...
-
-
-@wp.func
+@wp.func_native(read_native(__file__, "sample_point", SAMPLES=RAY_COUNT))
 def ray_point(ray: int) -> wp.vec2:
     """Return the point of a pixel that a ray goes through, from its centre [px]."""
-    return sample_point(2 * ray + (ray + ray // 2 + ray // 4) % 2)
+    ...
 
 
 @wp.func

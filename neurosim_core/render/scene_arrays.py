@@ -262,6 +262,7 @@ def _upload_wholes(
     data.whole_corner = wp.array(corners, dtype=wp.vec3, device=device)
     data.whole_neighbor = wp.array(neighbor, dtype=int, device=device)
     data.whole_surface = wp.array(surface, dtype=int, device=device)
+    data.face_surface = wp.array(surface[mesh.origin], dtype=int, device=device)
 
 
 def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -36,6 +36,8 @@ class SceneData:
     """The one beyond the edge opposite each corner, -1: none, shape [3 W]."""
     whole_surface: wp.array[int]
     """The plane surface of one material and without seams that it is a part of, shape [W]."""
+    face_surface: wp.array[int]
+    """That of each face after the cuts."""
     face_lod: wp.array[float]
     """log2 of texels per metre on each face."""
     corner_uv: wp.array[wp.vec2]

@@ -3,9 +3,8 @@
 
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time
 it reaches L_ref + threshold_on (or L_ref - threshold_off) an event is emitted at the crossing time, and L_ref
-becomes the level crossed. The tie rule is in `EventCamera`; the pixels are in `event_pixels`, their kernels
-in `event_scan`. What is not ideal in them is in `event_noise_model`, and the arbiter that reads them out in
-`event_readout`.
+becomes the level crossed. The tie rule is in `EventCamera`; pixels are in `event_pixels`, their kernels in
+`event_scan`, what is not ideal in `event_noise_model`, the arbiter that reads them out in `event_readout`.
 
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """

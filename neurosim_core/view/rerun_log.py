@@ -6,8 +6,7 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
 
     world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
     world/bodies/<body>                     where it is, whenever the first vehicle says where that one is
-    world/vehicles/<vehicle>                its pose
-    world/vehicles/<vehicle>/<sensor>       where the sensor sits; frustum and picture of a camera, points
+    world/vehicles/<vehicle>[/<sensor>]     its pose; where a sensor sits; frustum, picture, points
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
     world/vehicles/<vehicle>/<sensor>/arrows    flow, on a grid of pixels
@@ -19,8 +18,7 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
     plots/<vehicle>/command/<mode>          what it was told to do
     plots/<vehicle>/links/<link>            delay of each message [ms]; a gap where one was lost
     plots/<vehicle>/<name>                  what `log_scalar` was given
-    simulator/<name>                        what `log_simulator` was given
-    status                                  what `log_status` was given
+    simulator/<name>, status                what `log_simulator` and `log_status` were given
 """
 
 from __future__ import annotations

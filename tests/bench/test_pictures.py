@@ -11,7 +11,6 @@ from small_room import room_scene
 
 from neurosim_core.bench import events, events_space, render, throughput, worlds
 from neurosim_core.bench.engine import (
-    LightingConfig,
     PinholeConfig,
     RenderConfig,
     ShiftedLens,
@@ -82,9 +81,7 @@ def test_a_shifted_lens_sees_the_same_picture_by_other_rays():
     poses = render._looking(np.array([[0.013, 0.007, 1.5]]), np.array([0.1]), 0.7)
     found = []
     for lens, count in ((LENS, 64), (ShiftedLens(LENS, (0.382, 0.618)), 64), (LENS, 1)):
-        config = RenderConfig(
-            samples_per_pixel=count, lighting=LightingConfig(mode="unshadowed"), exposure=1.0
-        )
+        config = RenderConfig(samples_per_pixel=count, exposure=1.0)
         found.append(
             View(upload_scene(scene, config, device="cpu"), lens, count=1).render(poses).numpy().copy()
         )

@@ -40,36 +40,40 @@ def radiance(scene, offsets_m, *, config=ADAPTIVE, device="cpu", lens=LENS, **op
 
 @pytest.mark.parametrize("traversal", ["auto", "warp"])
 def test_an_edge_that_moves_through_a_pixel(device, traversal):
-    """Radiance is that of the box filter, to half the distance of the sample points: 1/32."""
+    """Radiance is that of the box filter, to half the distance of the sample points: 1/64."""
     config = ADAPTIVE.model_copy(update={"cpu_traversal": traversal})
     offsets = np.linspace(0.0, PITCH_M, 41)
     seen = radiance(strips((0.0, 3.0)), offsets, config=config, device=device)
     column = np.arange(LENS.width)
     left = (column - 16.5)[None] + offsets[:, None] / PITCH_M  # of each pixel, from the edge [px]
     expected = 0.25 + 0.75 * np.clip(left + 1.0, 0.0, 1.0)
-    assert np.abs(seen - expected[:, None]).max() <= 0.75 / 32.0 + 1e-4
+    assert np.abs(seen - expected[:, None]).max() <= 0.75 / 64.0 + 1e-4
     assert np.abs((seen - expected[:, None]).mean()) < 0.002  # no bias
 
 
 def test_bars_thinner_than_a_pixel_are_seen(device):
-    """Bars of 0.3 px are seen in all rows at any place: they cover 3 to 5 of 16 points."""
+    """Bars of 0.3 px are seen in all rows at any place: they cover 9 or 10 of 32 points.
+
+    Where a bar lies in two pixels, the triangle that no first ray hits may be missed.
+    """
     period, width = 7.0 * PITCH_M, 0.3 * PITCH_M
     bars = strips(*((k * period, k * period + width) for k in range(-4, 5)))
     seen = radiance(bars, np.linspace(0.0, PITCH_M, 65), device=device)
     share = (seen[:, 2:-2] - 0.25) / 0.75
     coverage = np.stack([share[..., col - 2 : col + 3].sum(axis=-1) for col in (9, 16, 23)], axis=-1)
-    assert coverage.min() > 3.0 / 16.0 - 1e-3
-    assert coverage.max() < 5.0 / 16.0 + 1e-3
+    assert coverage.min() > 6.0 / 32.0 - 1e-3
+    assert coverage.max() < 10.0 / 32.0 + 1e-3
+    assert np.mean(np.abs(coverage - 0.3) < 0.03) > 0.8  # contrast within 10 %
     assert coverage.mean() == pytest.approx(0.3, abs=0.015)
 
 
 def test_an_edge_crosses_levels_when_the_box_filter_does(device):
-    """Log radiance passes levels 0.2 apart at the time of the closed form, to 1/32 of a pixel's transit."""
+    """Log radiance passes levels 0.2 apart at the time of the closed form, to 1/64 of a pixel's transit."""
     offsets = np.linspace(0.5 * PITCH_M, 1.5 * PITCH_M, 321)
     log = np.log(radiance(strips((0.0, 3.0)), offsets, device=device)[:, 4, 15])
     levels = np.log(0.25) + 0.2 * np.arange(1, 7)
     crossed = np.array([np.argmax(log >= level) for level in levels]) / 320.0
-    np.testing.assert_allclose(crossed, (np.exp(levels) - 0.25) / 0.75, atol=1 / 32 + 1 / 320)
+    np.testing.assert_allclose(crossed, (np.exp(levels) - 0.25) / 0.75, atol=1 / 64 + 1 / 320)
 
 
 def test_a_slow_drift_gives_no_event_of_its_own(device):

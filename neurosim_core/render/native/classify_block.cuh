@@ -12,7 +12,7 @@ for (int turn = 0; turn < 3; ++turn) {
     const bool inside = place < 36 && y < height && x < width;
     const int part = inside ? *wp::address(faces, instant, y, x) : -1;
     const bool solid = part >= 0 && part < face_count;
-    const int surface = solid ? scene.whole_surface.data[scene.whole_of_face.data[part]] : -1;
+    const int surface = solid ? scene.face_surface.data[part] : -1;
     body |= part >= face_count;
     if (turn == 0) reference = __shfl_sync(0xffffffffu, surface, 0, 16);
     several |= inside && surface != reference;

@@ -1,10 +1,11 @@
-// CUDA: the threads of a warp find together what the 16 points of each of 4 x 4 pixels show, as `list_seen_faces.cuh` and
-// `cover_lanes.cuh` do on a CPU. Threads 0 to 15 have points 0 to 7 of a pixel each, threads 16 to 31 the other points.
-// Leaves pairs of a pixel and a surface that it shows in shared memory. Returns their number; the first of the pixel and how
-// many; how many of its points show none, -1: it has to be rendered by rays; whether the sky is behind; where the pairs are.
+// CUDA: the threads of a warp find together what the points of each of 4 x 4 pixels show, as `list_seen_faces.cuh` and
+// `cover_lanes.cuh` do on a CPU. Leaves pairs of a pixel and a surface that it shows in shared memory. Returns their number;
+// the first of the pixel and how many; how many of its points show none, -1: it has to be rendered by rays; whether the sky
+// is behind; where the pairs are.
 wp::vec_t<6, int> result;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
+#include "sample_points.cuh"
 __shared__ Block blocks[2];
 Block& block = blocks[threadIdx.x / 32 % 2];
 constexpr unsigned ALL = 0xffffffffu;
@@ -28,6 +29,8 @@ for (int place = lane; place < 64; place += 32) {
     bool added = face >= 0 && __ffs(same) - 1 == lane;
     for (int entry = 0; entry < count; ++entry) added &= block.seen[entry] != face;
     const unsigned additions = __ballot_sync(ALL, added);
+    listed = count + __popc(additions) <= MOST;
+    if (!listed) break;
     if (added) {
         const int entry = count + __popc(additions & ((1u << lane) - 1));
         block.seen[entry] = face;
@@ -38,6 +41,8 @@ for (int place = lane; place < 64; place += 32) {
 }
 sky = __any_sync(ALL, sky);
 #include "edge_functions.cuh"
+unsigned long long reaching = 0; // entries that reach the pixel
+int edges = 0; // pairs of a pixel and a face whose edges cross it
 for (int begin = 0; listed && begin < count;) {
     const int end = wp::min(begin + 32, count), entry = begin + lane;
     int surface = -1;
@@ -49,12 +54,16 @@ for (int begin = 0; listed && begin < count;) {
             surface = scene.whole_surface.data[face];
         for (int side = 0; side < 3; ++side)
             for (int axis = 0; axis < 3; ++axis) block.function[3 * side + axis][entry] = function[side][axis];
+        for (int axis = 0; axis < 3; ++axis)
+            block.plane[axis][entry] = function[0][axis] + function[1][axis] + function[2][axis];
         block.surface[entry] = surface;
     }
     __syncwarp();
     for (int pair_of_faces = begin; pair_of_faces < end; pair_of_faces += 2) { // each half of the threads: which pixels one reaches
-        const int at = wp::min(pair_of_faces + half, end - 1);
-        bool reached = block.surface[at] >= 0, cut[3];
+        const bool there = pair_of_faces + half < end;
+        const int at = there ? pair_of_faces + half : begin;
+        bool reached = there && block.surface[at] >= 0;
+        unsigned cut = 0;
 #pragma unroll
         for (int side = 0; side < 3; ++side) {
             const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at], block.function[3 * side + 2][at]};
@@ -63,17 +72,25 @@ for (int begin = 0; listed && begin < count;) {
             };
             const float middle = along(center), extent = 0.5f * (wp::abs(along(across)) + wp::abs(along(down)));
             reached &= middle + extent >= 0.0f;
-            cut[side] = middle - extent < 0.0f;
+            cut |= (unsigned)(middle - extent < 0.0f) << side;
         }
-        unsigned reach = (__ballot_sync(ALL, reached) >> (16 * half)) & 0xffffu;
+        if (!reached) cut = 0;
+        const unsigned half_of_lanes = 0xffffu << (16 * half);
+        unsigned reach = __ballot_sync(ALL, reached) & half_of_lanes ? 8u : 0u;
 #pragma unroll
         for (int side = 0; side < 3; ++side)
-            if ((__ballot_sync(ALL, reached && cut[side]) >> (16 * half)) & 0xffffu) reach |= 0x10000u << side;
-        if (pixel == 0) block.reach[at] = (int)reach; // the upper bits: edges that cross pixels
+            if (__ballot_sync(ALL, cut & 1u << side) & half_of_lanes) reach |= 1u << side;
+        const bool edged = cut != 0;
+        const unsigned all_edged = __ballot_sync(ALL, edged);
+        if (edged) block.listed[edges + __popc(all_edged & ((1u << lane) - 1))] = (unsigned short)(pixel | at << 4 | cut << 10);
+        edges += __popc(all_edged);
+        if (reached) reaching |= 1ull << at;
+        if (there) block.shown[at][pixel] = reached ? ALL_POINTS : 0u;
+        if (pixel == 0 && there) block.reach[at] = (unsigned char)reach; // edges that cross pixels; 8: it reaches one
     }
     __syncwarp();
     if (entry < end) {
-        if ((block.reach[entry] & 0xffff) == 0) surface = -1;
+        if (block.reach[entry] == 0) surface = -1;
         block.surface[entry] = surface;
     }
     __syncwarp();
@@ -81,17 +98,20 @@ for (int begin = 0; listed && begin < count;) {
         int first = entry; // entry of the same surface
         for (int other = entry - 1; other >= 0 && surface >= 0; --other)
             if (block.surface[other] == surface) first = other;
-        block.first[entry] = first;
+        block.first[entry] = (unsigned char)first;
     }
     for (int base = 3 * begin; listed && base < 3 * end; base += 32) { // each thread looks beyond an edge
         const int at = wp::min((base + lane) / 3, end - 1), side = (base + lane) % 3;
         int beyond = -1;
-        if (base + lane < 3 * end && (block.reach[at] >> (16 + side)) & 1)
+        if (base + lane < 3 * end && (block.reach[at] >> side) & 1)
             beyond = scene.whole_neighbor.data[3 * (size_t)block.seen[at] + side];
-        const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at], block.function[3 * side + 2][at]};
-        if (beyond >= 0 && !is_beyond(beyond, function)) beyond = -1;
         for (int other = 0; other < count; ++other)
             if (block.seen[other] == beyond) beyond = -1;
+        if (beyond >= 0) {
+            const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at],
+                                       block.function[3 * side + 2][at]};
+            if (!is_beyond(beyond, function)) beyond = -1;
+        }
         for (unsigned waiting; listed && (waiting = __ballot_sync(ALL, beyond >= 0));) {
             const int face = __shfl_sync(ALL, beyond, __ffs(waiting) - 1);
             listed = count < MOST;
@@ -106,82 +126,85 @@ for (int begin = 0; listed && begin < count;) {
     }
     begin = end;
 }
-unsigned nearest[4] = {ALL, ALL, ALL, ALL}; // of each point in a byte: the first entry of what it shows, 255: nothing
+unsigned taken = 0; // points that show a face
+unsigned long long surfaces = 0; // first entries of the surfaces that the pixel shows
 if (listed) {
-    unsigned low = 0, high = 0; // entries that reach the pixel
-    for (int entry = 0; entry < wp::min(count, 32); ++entry) low |= ((unsigned)(block.reach[entry] >> pixel) & 1u) << entry;
-    for (int entry = 32; entry < count; ++entry) high |= ((unsigned)(block.reach[entry] >> pixel) & 1u) << (entry - 32);
-    float best[SAMPLES / 2];
+    reaching |= __shfl_xor_sync(ALL, reaching, 16);
+    for (int base = 0; base < edges; base += 32) { // each thread looks at the points of a pixel and the edges of a face
+        const unsigned code = base + lane < edges ? block.listed[base + lane] : 0u;
+        const int at = code & 15, entry = (code >> 4) & 63;
+        wp::vec3 toward[3];
+        float near[3];
 #pragma unroll
-    for (int sample = 0; sample < SAMPLES / 2; ++sample) best[sample] = 0.0f;
-    while (low | high) {
-        const int entry = low ? __ffs(low) - 1 : 31 + __ffs(high);
-        if (low) low &= low - 1;
-        else high &= high - 1;
-        const unsigned first = block.first[entry];
-        float value[3][3];
+        for (int term = 0; term < 3; ++term) {
 #pragma unroll
-        for (int side = 0; side < 3; ++side) {
-            const float function[3] = {block.function[3 * side][entry], block.function[3 * side + 1][entry],
-                                       block.function[3 * side + 2][entry]};
-            auto along = [&](const wp::vec3& toward) {
-                return fmaf(function[0], toward[0], fmaf(function[1], toward[1], function[2] * toward[2]));
-            };
-            value[side][0] = along(center);
-            value[side][1] = along(across);
-            value[side][2] = along(down);
-            // `sample` counts from 8 `half`: its point is half a pixel to the right, and 1/16 further down
-            value[side][0] = fmaf(half * (1.0f / 16.0f), value[side][2], fmaf(half * 0.5f, value[side][1], value[side][0]));
+            for (int axis = 0; axis < 3; ++axis) toward[term][axis] = block.ray[3 * term + axis][at];
+            near[term] = OVERLAP * fmaf(block.plane[0][entry], toward[term][0],
+                                        fmaf(block.plane[1][entry], toward[term][1], block.plane[2][entry] * toward[term][2]));
         }
+        unsigned outside = 0;
+        for (unsigned cut = code >> 10; cut; cut &= cut - 1) {
+            const int side = 3 * (__ffs(cut) - 1);
+            float value[3];
 #pragma unroll
-        for (int sample = 0; sample < SAMPLES / 2; ++sample) {
-            const int reversed = (sample & 1) << 3 | (sample & 2) << 1 | (sample & 4) >> 1;
-            const float x = ((float)sample + 0.5f) / SAMPLES - 0.5f, y = ((float)reversed + 0.5f) / SAMPLES - 0.5f;
-            float shown[3];
+            for (int term = 0; term < 3; ++term)
+                value[term] = fmaf(block.function[side][entry], toward[term][0],
+                                   fmaf(block.function[side + 1][entry], toward[term][1],
+                                        fmaf(block.function[side + 2][entry], toward[term][2], near[term])));
+            unsigned negative = 0;
 #pragma unroll
-            for (int side = 0; side < 3; ++side) shown[side] = fmaf(y, value[side][2], fmaf(x, value[side][1], value[side][0]));
-            const float near = shown[0] + shown[1] + shown[2];
-            const float least = fminf(fminf(shown[0], shown[1]), shown[2]);
-            const bool nearer = least >= -OVERLAP * near && near > NEARER * best[sample];
-            best[sample] = nearer ? near : best[sample];
-            const unsigned byte = sample % 4, selector = 0x3210u ^ ((byte ^ 4u) << (4 * byte));
-            nearest[sample / 4] = nearer ? __byte_perm(nearest[sample / 4], first, selector) : nearest[sample / 4];
+            for (int sample = SAMPLES - 1; sample >= 0; --sample) {
+                const float at_point = fmaf(points[1][sample], value[2], fmaf(points[0][sample], value[1], value[0]));
+                negative = __funnelshift_l(__float_as_uint(at_point), negative, 1);
+            }
+            outside |= negative;
         }
+        if (code >> 10) block.shown[entry][at] = ALL_POINTS & ~outside;
     }
     __syncwarp();
+    unsigned long long holding = 0; // entries before that hold points
+    for (unsigned long long rest = half ? 0u : reaching; rest; rest &= rest - 1) { // which of several shows where they are
+        const int entry = __ffsll(rest) - 1;
+        unsigned inside = block.shown[entry][pixel], overlap = inside & taken;
+        for (unsigned long long others = holding; overlap && others; others &= others - 1) {
+            const int other = __ffsll(others) - 1;
+            const unsigned contested = block.shown[other][pixel] & overlap;
+            overlap &= ~contested; // no two hold a point
+            if (block.first[other] == block.first[entry]) inside &= ~contested;
+            if (!contested || block.first[other] == block.first[entry]) continue;
+            float nearer[3], plane[3];
 #pragma unroll
-    for (int word = 0; word < 2; ++word) {
-        const unsigned own = nearest[word], other = __shfl_xor_sync(ALL, own, 16);
-        nearest[word] = half ? other : own;
-        nearest[2 + word] = half ? own : other;
+            for (int axis = 0; axis < 3; ++axis) plane[axis] = fmaf(-NEARER, block.plane[axis][other], block.plane[axis][entry]);
+            nearer[0] = fmaf(plane[0], center[0], fmaf(plane[1], center[1], plane[2] * center[2]));
+            nearer[1] = fmaf(plane[0], across[0], fmaf(plane[1], across[1], plane[2] * across[2]));
+            nearer[2] = fmaf(plane[0], down[0], fmaf(plane[1], down[1], plane[2] * down[2]));
+            const float extent = 0.5f * (wp::abs(nearer[1]) + wp::abs(nearer[2]));
+            unsigned won = nearer[0] > extent ? contested : 0u;
+            if (wp::abs(nearer[0]) <= extent)
+                for (unsigned points_left = contested; points_left; points_left &= points_left - 1) {
+                    const int sample = __ffs(points_left) - 1;
+                    const float x = ((float)sample + 0.5f) / SAMPLES - 0.5f;
+                    const float y = ((float)(__brev(sample) / (0x80000000u / (SAMPLES / 2))) + 0.5f) / SAMPLES - 0.5f;
+                    if (fmaf(y, nearer[2], fmaf(x, nearer[1], nearer[0])) > 0.0f) won |= 1u << sample;
+                }
+            block.shown[other][pixel] &= ~won;
+            inside &= ~(contested & ~won);
+        }
+        block.shown[entry][pixel] = inside;
+        if (inside) holding |= 1ull << entry;
+        taken |= inside;
+    }
+    for (unsigned long long rest = holding; rest; rest &= rest - 1) { // faces of one surface are taken together
+        const int entry = __ffsll(rest) - 1, first = block.first[entry];
+        const unsigned shown = block.shown[entry][pixel];
+        if (first < entry) block.shown[first][pixel] |= shown;
+        if (shown) surfaces |= 1ull << first;
     }
 }
-int bare = 0; // points that show none of the faces
-#pragma unroll
-for (int word = 0; word < 4; ++word) bare += __popc(__vcmpeq4(nearest[word], ALL)) / 8;
-const bool resolved = listed && (sky || bare <= SAMPLES / 2);
-auto shown_at = [&](int sample) {
-    return (sample < 8 ? __byte_perm(nearest[0], nearest[1], sample) : __byte_perm(nearest[2], nearest[3], sample - 8)) & 255u;
-};
-auto points_like = [&](int sample) { // bits of the points that show what this one does
-    const unsigned shown = shown_at(sample);
-    unsigned bits = 0;
-#pragma unroll
-    for (int word = 0; word < 4; ++word) {
-        const unsigned equal = __vcmpeq4(nearest[word], 0x01010101u * shown) & 0x08040201u;
-        bits |= ((equal | equal >> 8 | equal >> 16 | equal >> 24) & 15u) << (4 * word);
-    }
-    return bits;
-};
-unsigned covered = 0;
-#pragma unroll
-for (int word = 0; word < 4; ++word) {
-    const unsigned equal = ~__vcmpeq4(nearest[word], ALL) & 0x08040201u;
-    covered |= ((equal | equal >> 8 | equal >> 16 | equal >> 24) & 15u) << (4 * word);
-}
-if (half || outside || !resolved) covered = 0;
-int pairs = 0;
-for (unsigned left_over = covered; left_over; ++pairs) left_over &= ~points_like(__ffs(left_over) - 1);
+const int bare = SAMPLES - __popc(taken);
+const bool resolved = listed && (sky || 2 * bare <= SAMPLES);
+if (half || outside || !resolved) surfaces = 0;
+const int pairs = __popcll(surfaces);
 int before = pairs;
 #pragma unroll
 for (int step = 1; step < 16; step *= 2) {
@@ -190,23 +213,7 @@ for (int step = 1; step < 16; step *= 2) {
 }
 result[0] = __shfl_sync(ALL, before, 15);
 before -= pairs;
-for (int pair = before; covered; ++pair) {
-    const int sample = __ffs(covered) - 1;
-    const unsigned bits = points_like(sample);
-    covered &= ~bits;
-    float x = 0.0f, y = 0.0f;
-#pragma unroll
-    for (int other = 0; other < SAMPLES; ++other) {
-        const int reversed = (other & 1) << 3 | (other & 2) << 1 | (other & 4) >> 1 | (other & 8) >> 3;
-        const float shows = (bits >> other) & 1u ? 1.0f : 0.0f;
-        x += shows * (((float)other + 0.5f) / SAMPLES - 0.5f);
-        y += shows * (((float)reversed + 0.5f) / SAMPLES - 0.5f);
-    }
-    const int number = __popc(bits);
-    block.pair[0][pair] = __int_as_float(pixel | (int)shown_at(sample) << 8 | number << 16);
-    block.pair[1][pair] = x / (float)number;
-    block.pair[2][pair] = y / (float)number;
-}
+for (int pair = before; surfaces; surfaces &= surfaces - 1) block.listed[pair++] = (unsigned short)(pixel | (__ffsll(surfaces) - 1) << 4);
 __syncwarp();
 result[1] = before;
 result[2] = pairs;

@@ -18,15 +18,9 @@ if (even) {
         middle[0][0][lane] = middle[1][0][lane] = 0.0f;
     }
 } else {
-    int layer_of[MOST], touching[MOST], touching_count = 0;
-    alignas(64) float best[SAMPLES][LANES];
-    alignas(64) int nearest[SAMPLES][LANES]; // layer
-    for (int sample = 0; sample < SAMPLES; ++sample)
-        for (int lane = 0; lane < LANES; ++lane) {
-            best[sample][lane] = 0.0f;
-            nearest[sample][lane] = -1;
-        }
-    const int hit_count = seen_count;
+    int layer_of[MOST], touching = 0;
+    float plane[MOST][3]; // of touching faces: the nearness [1/m] along a direction is its product with this
+    alignas(64) unsigned shown[MOST][LANES]; // bits of the points that show it
     for (int entry = 0; entry < seen_count; ++entry) {
         const int face = seen[entry];
         const wp::vec3* corner = scene.whole_corner.data + 3 * (size_t)face;
@@ -38,7 +32,8 @@ if (even) {
                 for (int lane = 0; lane < LANES; ++lane)
                     value[side][term][lane] = function[side][0] * ray[term][0][lane] + function[side][1] * ray[term][1][lane]
                                               + function[side][2] * ray[term][2][lane];
-        int touched = 0, crossed[3] = {};
+        unsigned touched = 0, crossed[3] = {}; // bits of the lanes
+        alignas(64) unsigned* inside = shown[touching];
         for (int lane = 0; lane < LANES; ++lane) {
             int reached = 1, cut[3];
             for (int side = 0; side < 3; ++side) {
@@ -46,14 +41,15 @@ if (even) {
                 reached &= value[side][0][lane] + half >= 0.0f;
                 cut[side] = value[side][0][lane] - half < 0.0f;
             }
-            touched |= reached;
-            for (int side = 0; side < 3; ++side) crossed[side] |= cut[side] & reached;
+            inside[lane] = reached ? ALL_POINTS : 0u;
+            touched |= reached ? 1u << lane : 0u;
+            for (int side = 0; side < 3; ++side) crossed[side] |= cut[side] & reached ? 1u << lane : 0u;
         }
         if (!touched) continue;
         if (entry < MOST)
             for (int side = 0; side < 3; ++side) {
                 const int beyond = crossed[side] ? scene.whole_neighbor.data[3 * (size_t)face + side] : -1;
-                if (beyond >= 0 && is_beyond(beyond, function[side])) list_face(beyond, -1 - beyond);
+                if (beyond >= 0 && !is_listed(beyond) && is_beyond(beyond, function[side])) list_face(beyond, -1 - beyond);
             }
         const int surface = scene.whole_surface.data[face];
         int layer = 0;
@@ -63,42 +59,73 @@ if (even) {
             layer_part[layer] = part_hit[entry];
             ++layer_count;
         }
-        for (int sample = 0; sample < SAMPLES; ++sample)
-            for (int lane = 0; lane < LANES; ++lane) {
-                float at[3];
-                for (int side = 0; side < 3; ++side)
-                    at[side] = value[side][0][lane] + points[0][sample] * value[side][1][lane]
-                               + points[1][sample] * value[side][2][lane];
-                const float near = at[0] + at[1] + at[2];
-                const float least = wp::min(wp::min(at[0], at[1]), at[2]);
-                const bool nearer = least >= -OVERLAP * near && near > NEARER * best[sample][lane];
-                best[sample][lane] = nearer ? near : best[sample][lane];
-                nearest[sample][lane] = nearer ? layer : nearest[sample][lane];
+        for (int side = 0; side < 3; ++side) {
+            if (!crossed[side]) continue;
+            alignas(64) float at[3][LANES];
+            for (int term = 0; term < 3; ++term)
+                for (int lane = 0; lane < LANES; ++lane)
+                    at[term][lane] = value[side][term][lane]
+                                     + OVERLAP * (value[0][term][lane] + value[1][term][lane] + value[2][term][lane]);
+            for (unsigned rest = crossed[side]; rest; rest &= rest - 1) {
+                const int lane = __builtin_ctz(rest);
+                unsigned outside = 0;
+                for (int sample = 0; sample < SAMPLES; ++sample)
+                    outside |= at[0][lane] + points[0][sample] * at[1][lane] + points[1][sample] * at[2][lane] < 0.0f ? 1u << sample : 0u;
+                inside[lane] &= ~outside;
             }
+        }
+        for (int axis = 0; axis < 3; ++axis)
+            plane[touching][axis] = function[0][axis] + function[1][axis] + function[2][axis];
+        for (int other = 0; other < touching; ++other) { // which of two shows where both are
+            if (layer_of[other] == layer) continue;
+            alignas(64) unsigned contested[LANES], undecided[LANES];
+            alignas(64) float nearer[3][LANES];
+            unsigned any = 0;
+            for (int lane = 0; lane < LANES; ++lane) any |= contested[lane] = shown[other][lane] & inside[lane];
+            if (!any) continue;
+            for (int term = 0; term < 3; ++term)
+                for (int lane = 0; lane < LANES; ++lane)
+                    nearer[term][lane] = (plane[touching][0] - NEARER * plane[other][0]) * ray[term][0][lane]
+                                         + (plane[touching][1] - NEARER * plane[other][1]) * ray[term][1][lane]
+                                         + (plane[touching][2] - NEARER * plane[other][2]) * ray[term][2][lane];
+            any = 0;
+            for (int lane = 0; lane < LANES; ++lane) {
+                const float half = 0.5f * (wp::abs(nearer[1][lane]) + wp::abs(nearer[2][lane]));
+                const bool in_front = nearer[0][lane] > half, behind = nearer[0][lane] <= -half;
+                shown[other][lane] &= in_front ? ~contested[lane] : ALL_POINTS;
+                inside[lane] &= behind ? ~contested[lane] : ALL_POINTS;
+                any |= undecided[lane] = in_front || behind ? 0u : contested[lane];
+            }
+            for (int lane = 0; any && lane < LANES; ++lane)
+                for (unsigned rest = undecided[lane]; rest; rest &= rest - 1) {
+                    const int sample = __builtin_ctz(rest);
+                    const bool in_front = nearer[0][lane] + points[0][sample] * nearer[1][lane]
+                                              + points[1][sample] * nearer[2][lane] > 0.0f;
+                    (in_front ? shown[other] : inside)[lane] &= ~(rest & -rest);
+                }
+        }
+        layer_of[touching++] = layer;
         if (!listed) break;
     }
     for (int layer = 0; layer < layer_count; ++layer) {
-        float count[LANES] = {}, x[LANES] = {}, y[LANES] = {};
-        for (int sample = 0; sample < SAMPLES; ++sample)
-            for (int lane = 0; lane < LANES; ++lane) {
-                const float shows = nearest[sample][lane] == layer ? 1.0f : 0.0f;
-                count[lane] += shows;
-                x[lane] += shows * points[0][sample];
-                y[lane] += shows * points[1][sample];
-            }
+        alignas(64) unsigned bits[LANES] = {};
+        for (int face = 0; face < touching; ++face)
+            if (layer_of[face] == layer)
+                for (int lane = 0; lane < LANES; ++lane) bits[lane] |= shown[face][lane];
         for (int lane = 0; lane < LANES; ++lane) {
-            const float share = 1.0f / wp::max(count[lane], 1.0f);
-            number[layer][lane] = count[lane];
-            middle[0][layer][lane] = share * x[lane];
-            middle[1][layer][lane] = share * y[lane];
+            number[layer][lane] = bits[lane] == ALL_POINTS ? SAMPLES : 0.0f;
+            middle[0][layer][lane] = middle[1][layer][lane] = 0.0f;
         }
+        for (int lane = 0; lane < LANES; ++lane)
+            if (bits[lane] != 0 && bits[lane] != ALL_POINTS)
+                number[layer][lane] = mean_of(bits[lane], middle[0][layer][lane], middle[1][layer][lane]);
     }
 }
 #include "nearest_part.cuh"
 // Returns the part of a layer to shade in a direction: the one that the pixel's own ray hit, if it is of this surface;
 // else one that another ray hit; else, of a face that none hit, the one in this direction.
 auto part_of = [&](int layer, int own, const wp::vec3& direction) {
-    if (own >= 0 && scene.whole_surface.data[scene.whole_of_face.data[own]] == layer_surface[layer]) return own;
+    if (own >= 0 && scene.face_surface.data[own] == layer_surface[layer]) return own;
     if (layer_part[layer] >= 0) return layer_part[layer];
     return nearest_part(-1 - layer_part[layer], direction);
 };

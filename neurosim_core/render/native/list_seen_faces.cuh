@@ -5,9 +5,12 @@
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 int seen[MOST], part_hit[MOST], seen_count = 0, previous = -2;
 bool sky = false, listed = true;
-auto list_face = [&](int face, int part) {
+auto is_listed = [&](int face) {
     for (int entry = 0; entry < seen_count; ++entry)
-        if (seen[entry] == face) return;
+        if (seen[entry] == face) return true;
+    return false;
+};
+auto list_face = [&](int face, int part) {
     listed &= seen_count < MOST;
     if (!listed) return;
     seen[seen_count] = face;
@@ -22,6 +25,6 @@ for (int y = upper; y < wp::min(upper + 6, height); ++y) {
         previous = part;
         if (part < 0) sky = true;
         else if (part >= mesh.num_tris) listed = false;
-        else list_face(scene.whole_of_face.data[part], part);
+        else if (const int face = scene.whole_of_face.data[part]; !is_listed(face)) list_face(face, part);
     }
 }

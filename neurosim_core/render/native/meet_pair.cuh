@@ -5,8 +5,10 @@ wp::vec_t<12, float> met;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
-const int bits = __float_as_int(block.pair[0][pair]), pixel = bits & 15, first = (bits >> 8) & 255;
-const float x = block.pair[1][pair], y = block.pair[2][pair];
+#include "sample_points.cuh"
+const int pixel = block.listed[pair] & 15, first = block.listed[pair] >> 4;
+float x, y;
+const float number = mean_of(block.shown[first][pixel], x, y);
 wp::vec3 toward;
 for (int axis = 0; axis < 3; ++axis)
     toward[axis] = fmaf(y, block.ray[6 + axis][pixel], fmaf(x, block.ray[3 + axis][pixel], block.ray[axis][pixel]));
@@ -15,11 +17,11 @@ const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 #include "nearest_part.cuh"
 const int own = *wp::address(faces, instant, top + pixel / 4, left + pixel % 4), hit = block.part[first];
 int part = own;
-if (own < 0 || scene.whole_surface.data[scene.whole_of_face.data[own]] != block.surface[first])
+if (own < 0 || scene.face_surface.data[own] != block.surface[first])
     part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
 #include "meet_plane.cuh"
 met[0] = (float)pixel;
-met[1] = (float)(bits >> 16);
+met[1] = number;
 met[2] = __int_as_float(part);
 met[6] = length * near;
 met[7] = corner[0] * near;

@@ -1,2 +1,2 @@
 #include "sample_points.cuh"
-return wp::vec2(points[0][sample], points[1][sample]);
+return wp::vec2(points[0][ray], points[1][ray]);
