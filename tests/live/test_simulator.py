@@ -6,6 +6,7 @@ import itertools
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -288,12 +289,21 @@ def test_only_what_is_listened_to_is_rendered():
 
 
 def test_who_subscribes_and_then_commands_gets_stamp_0(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("neurosim_core.live.status.SETTLE_S", 3.0)  # time to subscribe on a busy machine
-    monkeypatch.setattr("neurosim_core.live.status.SETTLE_MAX_S", SOON_S)
+    begin_s, subscribed = time.monotonic(), threading.Event()
+    clock = SimpleNamespace(
+        monotonic=lambda: time.monotonic() if subscribed.is_set() else begin_s,
+        monotonic_ns=time.monotonic_ns,
+        time_ns=time.time_ns,
+    )
+    monkeypatch.setattr("neurosim_core.live.status.time", clock)  # it settles when the test has subscribed
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         rig.send(rig.hover(), stamp_ns=0)
+        monitor = rig.simulator._subscribers
+        assert not sum(monitor._counts[1:-1])  # of the topics of the vehicle
         events = rig.node.subscriber("/drone/events", Events)
         imu = rig.node.subscriber("/drone/imu", Imu)
+        wait_for(lambda: sum(monitor._counts[1:-1]) >= 2)
+        subscribed.set()
         rig.send(rig.hover(), stamp_ns=PERIOD_NS)
         rig.send(rig.hover(), stamp_ns=2 * PERIOD_NS)
         assert imu.recv(SOON_S).stamp_ns == 0
