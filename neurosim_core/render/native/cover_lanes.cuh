@@ -67,7 +67,7 @@ if (even) {
                     at[term][lane] = value[side][term][lane]
                                      + OVERLAP * (value[0][term][lane] + value[1][term][lane] + value[2][term][lane]);
             for (unsigned rest = crossed[side]; rest; rest &= rest - 1) {
-                const int lane = __builtin_ctz(rest);
+                const int lane = lowest_of(rest);
                 unsigned outside = 0;
                 for (int sample = 0; sample < SAMPLES; ++sample)
                     outside |= at[0][lane] + points[0][sample] * at[1][lane] + points[1][sample] * at[2][lane] < 0.0f ? 1u << sample : 0u;
@@ -98,7 +98,7 @@ if (even) {
             }
             for (int lane = 0; any && lane < LANES; ++lane)
                 for (unsigned rest = undecided[lane]; rest; rest &= rest - 1) {
-                    const int sample = __builtin_ctz(rest);
+                    const int sample = lowest_of(rest);
                     const bool in_front = nearer[0][lane] + points[0][sample] * nearer[1][lane]
                                               + points[1][sample] * nearer[2][lane] > 0.0f;
                     (in_front ? shown[other] : inside)[lane] &= ~(rest & -rest);

@@ -17,6 +17,7 @@ auto count_bits = [](unsigned bits) {
     return __builtin_popcount(bits);
 #endif
 };
+auto lowest_of = [&](unsigned bits) { return count_bits(~bits & (bits - 1u)); }; // place of the lowest bit that is set
 // Returns the number of the points whose bits are set, and their mean: columns count the points, rows their bits in reverse.
 auto mean_of = [&](unsigned bits, float& x, float& y) {
     int column = 0, row = 0;
