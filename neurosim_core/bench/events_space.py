@@ -41,6 +41,7 @@ from neurosim_core.bench.report import Claim, Panel, Plot, Row, Series
 from neurosim_core.bench.scenes import thin_structures
 
 WINDOWS_MS = (1.0, 5.0, 20.0)
+"""Within which events are matched."""
 SAMPLES = (1, 2, 4, 8, 16, 64)
 REFERENCE_SAMPLES = 64
 SPACE_HZ = 500.0

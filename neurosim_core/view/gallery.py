@@ -130,25 +130,24 @@ def _show_scene(scene: Mapping[str, Any], device: str) -> str:
 
 def _films(device: str) -> list[str]:
     """Return figures of films: the default flight, and a throw that the policy of the package ends."""
-    shown = []
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.webp"
+
+        def shown(title: str, command: str) -> str:
+            return _framed(title, _image(title, film.read_bytes(), "webp"), command)
+
         model = make_model(load_config({"duration_s": _FILM_S, "device": device}))
         with saved_flight(film, model) as write:
             for packet in run_model(model, make_state(model)):
                 write(packet)
         command = f"neurosim run --duration {_FILM_S:g} && neurosim view flight --save film.webp"
-        shown.append(
-            _framed("the default flight", _image("the default flight", film.read_bytes(), "webp"), command)
-        )
+        figures = [shown("the default flight", command)]
         if importlib.util.find_spec("onnxruntime") is not None:
             overrides = {"device": device}
             fly_policy("hover", duration_s=_FILM_S, overrides=overrides, save=film, say=lambda line: None)
             command = f"neurosim fly --policy hover --duration {_FILM_S:g} --save film.webp"
-            shown.append(
-                _framed("hover, learnt from events", _image("hover", film.read_bytes(), "webp"), command)
-            )
-    return shown
+            figures.append(shown("hover, learnt from events", command))
+    return figures
 
 
 def _show_rig(rig: Mapping[str, Any], device: str) -> list[str]:

@@ -150,7 +150,7 @@ class RerunLogger:
         self._bodies: Mapping[str, BodyConfig] = {}
         self._scene = scene
         self._panels: dict[str, dict[Panel, None]] = {name: {} for name in self._vehicles}
-        self._shown: set[tuple[str, str]] = set()
+        self._kind_of: dict[tuple[str, str], str] = {}
         self._layout_is_old = False
         recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for name, sensors in self._vehicles.items():
@@ -177,7 +177,7 @@ class RerunLogger:
                 f"known: {', '.join(DISPLAYS)}"
             )
         vehicle = self._first if vehicle is None else vehicle
-        if (vehicle, packet.sensor) not in self._shown:
+        if (vehicle, packet.sensor) not in self._kind_of:
             self._show_sensor(vehicle, packet, schema)
         DISPLAYS[schema.display](self, vehicle, packet, schema)
 
@@ -297,10 +297,10 @@ class RerunLogger:
 
     def _show_sensor(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
         """Give the packets of a sensor their places in the layout, when the first comes."""
-        self._shown.add((vehicle, packet.sensor))
         kind = schema.display
         if kind in PICTURES and kind != "events":
             kind = picture_of(packet)[0]
+        self._kind_of[vehicle, packet.sensor] = kind
         panels = self._panels.setdefault(vehicle, {})
         if panels.pop(picture_panel(vehicle, packet.sensor), 0) is None:
             self._layout_is_old = True  # it has another rank now
@@ -430,9 +430,9 @@ class RerunLogger:
         if self._image_limit.passes(entity, now_ns):
             self._set_time(packet.stamp_ns)
             self._recording.log(entity, encode_picture(packet, compress=self._compress))
-            kind, data = picture_of(packet)
-            if kind == "flow":
-                self._recording.log(f"{body(vehicle)}/{packet.sensor}/arrows", flow_arrows(data))
+            if self._kind_of[vehicle, packet.sensor] == "flow":
+                arrows = flow_arrows(picture_of(packet)[1])
+                self._recording.log(f"{body(vehicle)}/{packet.sensor}/arrows", arrows)
 
     def _log_events(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         entity = f"{body(vehicle)}/{packet.sensor}/image"
