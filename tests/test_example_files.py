@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -89,3 +90,16 @@ def test_a_renderer_in_another_process_conforms(monkeypatch):
     if ctypes.util.find_library("EGL") is None:
         pytest.skip("OpenGL without a display needs EGL")
     assert load("remote_renderer").main() == (10, [])
+
+
+def test_tutorials_include_the_examples_that_they_speak_of():
+    """A line that a formatter has touched includes nothing, and says so nowhere."""
+    included = 0
+    for page in (EXAMPLES.parent / "docs").rglob("*.md"):
+        for line in page.read_text(encoding="utf-8").splitlines():
+            if line.startswith("--8"):
+                name = re.fullmatch(r'--8<-- "(.+)"', line)
+                assert name is not None, (page, line)
+                assert (EXAMPLES.parent / name[1]).is_file(), (page, line)
+                included += 1
+    assert included >= 6

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from neurosim_core.data.shards import write_shards
     from neurosim_core.data.stream import Dataset, Stream
     from neurosim_core.data.tonic import TonicDataset
-    from neurosim_core.data.torch_loader import Loader
+    from neurosim_core.data.torch_loader import Loader, as_tensors
 
 _HOME = {
     "Batch": "batch",
@@ -24,6 +24,7 @@ _HOME = {
     "Sample": "batch",
     "Stream": "stream",
     "TonicDataset": "tonic",
+    "as_tensors": "torch_loader",
     "collate": "batch",
     "write_shards": "shards",
 }
@@ -38,6 +39,7 @@ __all__ = [
     "Sample",
     "Stream",
     "TonicDataset",
+    "as_tensors",
     "collate",
     "write_shards",
 ]

@@ -29,21 +29,21 @@ class Sample:
     """Of the event camera [px]."""
     height: int
     """Of the event camera [px]."""
-    events: EventArrays | None
+    events: EventArrays | None = None
     """Events with start < t <= stamp, in whole microseconds."""
-    depth: NDArray[np.float32] | None
+    depth: NDArray[np.float32] | None = None
     """Planar z at the stamp [m], inf where nothing was hit, shape [H, W]."""
-    flow: NDArray[np.float32] | None
+    flow: NDArray[np.float32] | None = None
     """The flow picture of the stamp [px], shape [H, W, 2]."""
-    rgb: NDArray[np.uint8] | None
+    rgb: NDArray[np.uint8] | None = None
     """The picture of the stamp, shape [H, W, 3] or [H, W]."""
-    imu: NDArray[np.float64] | None
+    imu: NDArray[np.float64] | None = None
     """Samples of the window: stamp [s], specific force [m/s^2], angular rate [rad/s], shape [n, 7]."""
-    pose: NDArray[np.float64] | None
+    pose: NDArray[np.float64] | None = None
     """p_WB [m] and q_WB (xyzw) at the stamp, shape [7]."""
-    dropped_count: int
+    dropped_count: int = 0
     """Events of the window that the camera lost."""
-    lost_count: int
+    lost_count: int = 0
     """Packets of the event camera that are missing in the window."""
 
 

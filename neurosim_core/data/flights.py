@@ -27,6 +27,7 @@ class RecordedFlight:
         name: For its samples; None: the path.
 
     Attributes:
+        span_ns: From the first to the last event packet.
         skipped_count: Windows that were left out, as their ground truth is missing.
 
     Raises:
@@ -48,9 +49,9 @@ class RecordedFlight:
         camera = groups[self._events_sensor]
         self._camera = self._read_columns(camera)
         self.width, self.height = int(camera.attrs["width"]), int(camera.attrs["height"])
-        self.ends_ns, self.skipped_count = self._find_windows(
-            int(camera["start_ns"][0]) if len(camera["start_ns"]) else 0
-        )
+        begin_ns = int(camera["start_ns"][0]) if len(camera["start_ns"]) else 0
+        self.span_ns = int(self._camera["stamp_ns"][-1]) - begin_ns if len(self._camera["stamp_ns"]) else 0
+        self.ends_ns, self.skipped_count = self._find_windows(begin_ns)
         self.close()
 
     def __len__(self) -> int:

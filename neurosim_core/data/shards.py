@@ -81,6 +81,7 @@ class ShardFlight:
 
     Attributes:
         skipped_count: 0: what has no ground truth is not in it.
+        span_ns: 0: it is not known.
 
     Raises:
         ValueError: It is no shard, is damaged, or does not have what is wanted.
@@ -88,6 +89,7 @@ class ShardFlight:
     """
 
     skipped_count = 0
+    span_ns = 0
 
     def __init__(self, path: Path, config: WindowConfig) -> None:
         self.path, self._config = path, config

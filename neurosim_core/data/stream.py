@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 import weakref
@@ -18,6 +19,7 @@ from neurosim_core.data.flights import RecordedFlight
 from neurosim_core.data.shards import ShardFlight
 from neurosim_core.data.windows import WindowConfig
 
+_log = logging.getLogger(__name__)
 _OPEN_MAX = 64
 """Most files that are open at a time."""
 
@@ -43,7 +45,7 @@ class Dataset:
         flights: The recordings, in the order of their paths.
 
     Raises:
-        ValueError: A file is no recording, or does not have what is wanted.
+        ValueError: A file is no recording, or does not have what is wanted; or all are shorter than a window.
         FileNotFoundError: There is no such file.
     """
 
@@ -74,6 +76,7 @@ class Dataset:
             if folder is not None:
                 weakref.finalize(flight, _remove, folder, os.getpid())
             self.flights.append(flight)
+        self._tell_missing(config)
         self._begins = np.concatenate([[0], np.cumsum([len(flight) for flight in self.flights])])
         self._open: list[RecordedFlight | ShardFlight] = []
 
@@ -81,6 +84,23 @@ class Dataset:
     def skipped_count(self) -> int:
         """Windows that were left out, as their ground truth is missing."""
         return sum(flight.skipped_count for flight in self.flights)
+
+    def _tell_missing(self, config: WindowConfig) -> None:
+        """Refuse windows that fit into no flight; say it where most of them have no ground truth."""
+        count, skipped = sum(map(len, self.flights)), self.skipped_count
+        spans_s = [1e-9 * flight.span_ns for flight in self.flights]
+        if not count and max(spans_s) < config.window_s:
+            hint = f"; if these are milliseconds, write {1e-3 * config.window_s:g}"
+            raise ValueError(
+                f"window_s = {config.window_s:g} fits into no flight, the longest has {max(spans_s):g} s of "
+                f"events{hint if config.window_s >= 1.0 else ''}"
+            )
+        if skipped > count:
+            _log.warning(
+                "%d of %d windows are left out, as their ground truth is not stamped at their end: choose "
+                "window_s or stride_s as multiples of its period, or fewer fields",
+                skipped, skipped + count,
+            )  # fmt: skip
 
     def __len__(self) -> int:
         return int(self._begins[-1])
@@ -126,8 +146,8 @@ class Stream:
     alone, not on workers; `state_dict` and `load_state_dict` continue in the middle of an epoch.
 
     Args:
-        source: As for `Dataset`; or settings that are flown in this process; or a `Simulation`; or
-            `LiveSource(...)`, running simulators.
+        source: As for `Dataset`; or settings, or their file, that are flown in this process; or a
+            `Simulation`; or `LiveSource(...)`, running simulators.
         window_s: Length of a window [s].
         stride_s: From one window to the next [s]; None: they follow on each other.
         ends: Field at whose packets windows end, of recordings; see `Dataset`.
@@ -314,6 +334,10 @@ def _sequential(source: Any) -> Any:
     """Return a source whose flights come once; None for recordings."""
     if hasattr(source, "samples"):
         return source
+    if isinstance(source, str | Path) and Path(source).suffix in (".yaml", ".yml"):
+        from neurosim_core.config import load_config
+
+        source = load_config(source)
     if isinstance(source, str | Path) or (isinstance(source, Sequence) and not isinstance(source, Mapping)):
         return None
     from neurosim_core.data.sources import RunSource, WorldsSource

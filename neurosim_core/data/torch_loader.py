@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 import pickle
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -47,6 +49,12 @@ class Loader:
         **options: Any,
     ) -> None:
         torch = _import_torch()
+        known = [name for name in inspect.signature(Stream).parameters if name not in ("source", "transform")]
+        for name in options:
+            if name not in known:
+                close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+                hint = f"did you mean {close[0]!r}? " if close else ""
+                raise TypeError(f"Loader has no argument {name!r}; {hint}known: workers, {', '.join(known)}")
         self.stream = Stream(source, transform=transform, **options)
         self._device = device
         self._position = Position(0, 0)
@@ -69,6 +77,11 @@ class Loader:
 
     def __len__(self) -> int:
         return len(self.stream)
+
+    @property
+    def skipped_count(self) -> int:
+        """See `Stream.skipped_count`."""
+        return self.stream.skipped_count
 
     def __iter__(self) -> Iterator[Any]:
         begin = self._position

@@ -152,6 +152,8 @@ class WarpRenderer:
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
         self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
+        self.antialiased = adaptive
+        """Whether pixels with several faces are resolved (`antialias`)."""
         self._antialiasing = None
         if adaptive:
             fill_factor = arrays.config.fill_factor

@@ -381,7 +381,10 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
                 f"seed_m must be in free space, got {config.seed_m}, where the nearest surface or bound "
                 f"of the scene is at {room:.3f} m"
             )
-        notes.append(f"The scene names {scene.inside_m} as inside, but {room:.3f} m from there is a surface.")
+        is_outside = bool(((known.point < bounds[0]) | (known.point > bounds[1])).any())
+        spans = f"it spans {bounds[0].round(2).tolist()} to {bounds[1].round(2).tolist()} m"
+        why = spans if is_outside else f"a surface is {abs(room):.3f} m from there"
+        notes.append(f"The scene names {scene.inside_m} as inside, but {why}.")
         seed = _find_seed(unseeded)
     place = np.round(seed.point, 2).tolist()
     return dataclasses.replace(

@@ -412,7 +412,10 @@ def _make_rule(
 
 def render_terms(group: RenderGroupState) -> tuple[str, ...]:
     """Return what a group computes beyond its outputs: for the scene, its settings, lens, pictures."""
-    terms = getattr(group.renderers[0], "terms", None)  # only Warp's has a kernel made to measure
+    renderer = group.renderers[0]
+    terms = getattr(renderer, "terms", None)  # only Warp's has a kernel made to measure
     present = {} if terms is None else terms._asdict()
+    if getattr(renderer, "antialiased", False):
+        present |= {"supersampled": False, "antialiased": True}
     made = (term for process in group.processes[0].values() for term in process.terms)
     return (*(name for name, value in present.items() if value), *made)

@@ -177,7 +177,8 @@ def _terrain(space: FreeSpace, config: CollisionFreeConfig) -> _Terrain:
         raise PlanningError(
             f"nothing can be reached at clearance_m = {config.clearance_m:g}: around the seed "
             f"{_show(space.seed_m)} no voxel of {space.voxel_m:g} m has as much room; the most in the scene "
-            f"is {float(space.grid_clearance.max()):.2f} m"
+            f"is {max(float(space.grid_clearance.max()), 0.0):.2f} m, which is "
+            f"{float(np.ptp(space.bounds_m, axis=0).max()):.3g} m across"
         )
     lack = np.maximum(0.0, 1.0 - (space.grid_clearance - config.clearance_m) / _ROOM_WANTED_M)
     slowness = np.where(reachable, 1.0 + _NEAR_COST * lack**2, 0.0).astype(np.float32)

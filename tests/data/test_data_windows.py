@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 from recorded_flights import HEIGHT, WIDTH, write_flight
 
 import neurosim_core as ns
@@ -196,3 +197,18 @@ def test_windows_may_end_at_ground_truth(tmp_path):
         data.Dataset(tmp_path / "a.h5", ends="depth", fields=["events"])
     with pytest.raises(ValueError, match="no sensor for flow"):
         data.Dataset(tmp_path / "a.h5", ends="flow")
+
+
+def test_windows_that_are_too_long_or_mostly_without_truth_are_said(tmp_path, caplog):
+    write_flight(tmp_path / "a.h5", duration_s=0.4, depth_hz=25.0)
+    said = r"window_s = 50 fits into no flight, the longest has 0\.4 s of events; if these .* write 0\.05"
+    with pytest.raises(ValueError, match=said):
+        data.Dataset(tmp_path / "a.h5", window_s=50)
+    found = data.Dataset(tmp_path / "a.h5", window_s=0.03, fields=["events", "depth"])
+    assert (len(found), found.skipped_count) == (3, 10)
+    assert "10 of 13 windows are left out" in caplog.text
+
+
+def test_settings_may_be_named_by_their_file(tmp_path):
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump(CONFIG))
+    assert [len(batch.source) for batch in data.Stream(tmp_path / "a.yaml", batch=2)] == [2, 2]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from neurosim_core.data.make import DatasetPlan, make_flights, prepare
 from neurosim_core.data.ray_source import RaySource, cluster, make_flights_on_ray
 from neurosim_core.data.sources import numbered
 
-pytest.importorskip("ray", reason="needs the extra distributed: Ray is not installed")
+ray = pytest.importorskip("ray", reason="needs the extra distributed: Ray is not installed")
 
 LENS = {"width": 24, "height": 16, "horizontal_fov_rad": 1.5}
 
@@ -78,3 +80,14 @@ def test_a_data_set_has_the_same_bytes(config, tmp_path):
         for suffix in (".h5", ".json"):
             files = [plan.path(number).with_suffix(suffix) for plan in plans]
             assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of Ray, in Ray
+def test_the_example_trains_on_two_workers(monkeypatch):
+    pytest.importorskip("torch", reason="needs the extra learn")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    example = importlib.import_module("ray_train")
+    ray.cloudpickle.register_pickle_by_value(example)  # as that of a script: workers do not find the module
+    told = example.main()
+    assert told["workers"] == 2
+    assert 0.0 < told["loss"] < 1.0
