@@ -27,6 +27,8 @@ _CALL_S = 10.0
 _RESTART_COUNT_MAX = 10
 """An executor that fails more often than this within `_RESTART_PERIOD_S` is given up."""
 _RESTART_PERIOD_S = 10.0
+_TAKE_COUNT_MAX = 32
+"""So many messages of a topic are taken before others have their turn."""
 _SERVICES = "_services"
 """Added to the node's name for the node of its services; `ros2 node list` hides names with a leading "_"."""
 _Result = TypeVar("_Result")
@@ -264,12 +266,11 @@ class RclpyBackend:
         """Subscribe to a topic; all subscriptions share a thread."""
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
-        deliver = Delivery(callback, topic)
         loop = self._here()
         made = RclpySubscription(
-            loop, topic, lambda node: node.create_subscription(kind, topic, deliver, profile, raw=True)
+            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, raw=True)
         )
-        made.deliver = deliver
+        made.deliver = Delivery(callback, topic)
         return loop.add(made)
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
@@ -384,6 +385,22 @@ class RclpySubscription(_Endpoint):
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
+
+    def take(self, message: bytes) -> None:
+        """Deliver a message, and those that have come meanwhile.
+
+        An executor spends most of its time on waiting: in this way one that falls behind catches up.
+        """
+        self.deliver(message)
+        waiting = self.handle
+        if waiting is None:
+            return
+        with waiting.handle:
+            for _ in range(_TAKE_COUNT_MAX):
+                taken = waiting.handle.take_message(waiting.msg_type, True)
+                if taken is None:
+                    break
+                self.deliver(taken[0])
 
     @property
     def publisher_count(self) -> int:

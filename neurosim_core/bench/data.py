@@ -33,7 +33,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         formats = []
         for name, known in FORMATS.items():
             needs = {"aedat4": "faery", "ros2_bag": "rosbags"}.get(known.module, "h5py")
-            if importlib.util.find_spec(needs) is None:
+            if not known.sink or importlib.util.find_spec(needs) is None:
                 continue
             progress(name)
             formats.append({"format": name, **_there_and_back(_path(Path(folder), name), name, seconds)})

@@ -17,6 +17,7 @@ class Format(NamedTuple):
     """Module of `neurosim_core.io` with its classes, imported on first use."""
     source: str
     sink: str
+    """Empty: it is only read."""
     suffixes: tuple[str, ...]
     options: dict[str, Any]
     """More arguments of its sink."""
@@ -30,19 +31,23 @@ FORMATS = {
     "npz": Format("npz", "NpzSource", "NpzSink", (".npz",), {}),
     "aedat4": Format("aedat4", "Aedat4Source", "Aedat4Sink", (".aedat4",), {}),
     "mvsec": Format("mvsec", "MvsecSource", "MvsecSink", ("mvsec.h5", "mvsec.hdf5"), {}),
+    "dsec": Format("dsec", "DsecSource", "", (), {}),
     "recording": Format("hdf5_events", "Hdf5Source", "RecordingSink", (".h5", ".hdf5"), {}),
     "mcap": Format("ros2_bag", "open_mcap", "BagSink", (".mcap",), {}),
     "rosbag": Format("ros2_bag", "BagSource", "BagSink", ("bag",), {}),
     "rosbag_sqlite3": Format("ros2_bag", "BagSource", "BagSink", (".sqlite3",), {"storage": "sqlite3"}),
 }
 """By name. Where two suffixes fit, the longer one counts."""
+_FOLDERS = {"metadata.yaml": "rosbag", "events/left/events.h5": "dsec"}
+"""Formats that are folders, by a file that is in each."""
 
 
 def format_of(path: Path, name: str | None = None) -> str:
     """Return the name of the format of a file, from its own name.
 
     Args:
-        path: The file; what is in it does not count. A directory with metadata of rosbag2 is a bag.
+        path: The file; what is in it does not count. A directory with metadata of rosbag2 is a bag, one with
+            events/left/events.h5 a sequence of DSEC.
         name: The format, if the user says it.
 
     Raises:
@@ -52,8 +57,9 @@ def format_of(path: Path, name: str | None = None) -> str:
         if name not in FORMATS:
             raise EventFileError(f"unknown format {name!r}, known: {', '.join(FORMATS)}")
         return name
-    if (path / "metadata.yaml").is_file():
-        return "rosbag"
+    for mark, folder in _FOLDERS.items():
+        if (path / mark).is_file():
+            return folder
     fits = {
         suffix: key
         for key, known in FORMATS.items()
@@ -67,9 +73,9 @@ def format_of(path: Path, name: str | None = None) -> str:
 
 
 def is_event_file(path: Path) -> bool:
-    """Whether the name of a file is that of a format of events; of a directory: whether it is a bag."""
+    """Whether a name is that of a file of events; of a directory: whether it is of a format that is one."""
     try:
-        return (path / "metadata.yaml").is_file() if path.is_dir() else bool(format_of(path))
+        return any((path / f).is_file() for f in _FOLDERS) if path.is_dir() else bool(format_of(path))
     except EventFileError:
         return False
 
@@ -119,6 +125,8 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     path = Path(path)
     name = format_of(path, format)
     known = FORMATS[name]
+    if not known.sink:
+        raise EventFileError(f"{path}: {name} is only read; write .h5, whose layout of events is the same")
     sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
     return EventWriter(path, sink, width=width, height=height)
 

@@ -8,7 +8,9 @@ Reference: Gehrig et al. (2021), DSEC, https://dsec.ifi.uzh.ch/data-format.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,8 @@ def open_hdf5(path: Path) -> Any:
         OSError: It cannot be read.
     """
     h5py = import_h5py()
+    with contextlib.suppress(ImportError):  # filters of files of DSEC, for whoever has them
+        import_module("hdf5plugin")
     with open(path, "rb"):
         pass
     try:

@@ -51,6 +51,11 @@ def add_parsers(commands: _Commands) -> None:
     dense.add_argument(
         "--ray", metavar="ADDRESS", help="those of --live fly on a Ray cluster: local, auto, host:port"
     )
+    dense.add_argument(
+        "--fly-device",
+        metavar="DEVICE",
+        help="of the worlds, which fly meanwhile: cuda:1, ... (default: --device)",
+    )
     dense.add_argument("--test", type=Path, metavar="DIR", help="a data set to test on")
     dense.add_argument("--minutes", type=float, default=3.0, metavar="M", help="how long (default: 3)")
     dense.add_argument("--size", type=int, default=48, metavar="PX", help="of flights (default: 48)")
@@ -130,7 +135,7 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
     config = DenseConfig(
         task=task, device=device, seed=arguments.seed, minutes=arguments.minutes, size_px=arguments.size,
-        backbone=arguments.backbone,
+        backbone=arguments.backbone, fly_device=arguments.fly_device,
     )  # fmt: skip
     folder = arguments.out or Path("runs") / task
     source = {

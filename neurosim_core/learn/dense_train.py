@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,7 +68,9 @@ class DenseConfig:
     backbone: str | None = None
     """File of a network whose weights to begin with; see `DenseNet.take_backbone`."""
     device: str = "cpu"
-    """Of the network, and of worlds."""
+    """Of the network."""
+    fly_device: str | None = None
+    """Of worlds; None: that of the network. Worlds on another device fly while the network learns."""
     seed: int = 0
     """Of the order, the weights and the flights."""
 
@@ -109,10 +113,13 @@ class WindowPool:
         length: Windows of a sequence.
         room: Most windows.
         mirrored: Factor of each channel of a target in a mirrored picture.
+        device: Where they are kept; None: where they come from.
     """
 
-    def __init__(self, *, length: int, room: int, mirrored: Sequence[float] = (1.0,)) -> None:
-        self._length, self._most = length, max(1, room // length)
+    def __init__(
+        self, *, length: int, room: int, mirrored: Sequence[float] = (1.0,), device: str | None = None
+    ) -> None:
+        self._length, self._most, self._device = length, max(1, room // length), device
         self._sign = torch.tensor(mirrored)[:, None, None]
         self._sequences: list[tuple[Tensor, Tensor]] = []
         self._begun: dict[str, list[tuple[int, Tensor, Tensor]]] = {}
@@ -126,7 +133,8 @@ class WindowPool:
 
     def add(self, windows: Windows) -> None:
         """Take windows; those of a flight come in the order of time, those of several in any."""
-        voxels, targets = windows.voxel.half(), windows.target.clone()
+        voxels = windows.voxel.to(self._device, torch.half)
+        targets = windows.target.to(self._device, copy=True)
         for row, name in enumerate(windows.source):
             begun = self._begun.setdefault(name, [])
             if begun and begun[-1][0] != windows.start_ns[row]:
@@ -234,19 +242,27 @@ def train_dense(
         Errors of the network, of the network with its events zeroed, and of the mean of each pixel.
 
     Raises:
-        ValueError: Not exactly one source is given, there is too little data, or the backbone does not fit.
+        ValueError: Not exactly one source is given, there is too little data, the backbone does not fit, or
+            `fly_device` is given for what are no worlds.
     """
     if bool(data) + bool(live) + bool(worlds) != 1:
         raise ValueError("say what to learn from: --data DIR, --live N, or --worlds N")
+    if config.fly_device is not None and not worlds:
+        raise ValueError(f"fly_device {config.fly_device!r} needs worlds: say --worlds N")
     torch.manual_seed(config.seed)
     head, net = config.head, config.net()
     if config.backbone is not None:
         net.take_backbone(Path(config.backbone))
     if live:
         torch.set_num_threads(1)  # threads that wait for each other beside processes that fly are slower
-    pool = WindowPool(length=config.sequence + head.ahead, room=config.room, mirrored=head.mirrored)
+    pool = WindowPool(
+        length=config.sequence + head.ahead,
+        room=config.room,
+        mirrored=head.mirrored,
+        device=config.device if worlds else None,
+    )
     with _source(pool, config, data, live, worlds, ray) as more:
-        steps = _fit(net.to(config.device), pool, config, more)
+        fit = _fit(net.to(config.device), pool, config, more)
     constant = head.constant(pool.targets()).cpu()[None]
     tested = [*held_out_windows(config, test)]
     net.eval()
@@ -261,7 +277,9 @@ def train_dense(
     torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
     told = {
         "config": asdict(config),
-        "steps": steps,
+        "steps": fit.steps,
+        "share of the time without data": fit.waited_share,
+        "gpus": fit.gpus,
         "training windows": pool.window_count,
         "test windows": sum(len(windows.source) for windows in tested),
         "errors": {name: error._asdict() for name, error in errors.items()},
@@ -295,28 +313,34 @@ def _source(
     if worlds:
         from neurosim_core.learn.dense_worlds import world_windows
 
-        settings = flight_settings(config.size_px, config.seed, field=head.field, device=config.device)
+        fly_device = config.fly_device or config.device
+        settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
         flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
         while len(pool) < min(config.batch, worlds):
             pool.add(next(flown))
 
+        def due(step: int) -> bool:
+            return pool.window_count * config.reuse < step * config.batch * config.sequence
+
         def fly_on(step: int) -> None:
-            while pool.window_count * config.reuse < step * config.batch * config.sequence:
+            while due(step):
                 pool.add(next(flown))
 
-        yield fly_on
+        if fly_device == config.device:
+            yield fly_on
+            return
+        with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
+
+            def wait(step: int) -> None:
+                while due(step) and goes_on():
+                    time.sleep(1e-3)
+
+            yield wait
         return
-    stop = threading.Event()
-
-    def fill(stream: Stream) -> None:
-        for batch in stream:
-            pool.add(windows_of(batch, head, config.bins))
-            if stop.is_set():
-                return
-
     if data is not None:
         length = config.sequence + head.ahead
-        fill(Stream(data, batch=64 * length, sequence=length, **options))
+        for batch in Stream(data, batch=64 * length, sequence=length, **options):
+            pool.add(windows_of(batch, head, config.bins))
         yield lambda _: None
         return
     settings = flight_settings(config.size_px, 0, field=head.field)
@@ -326,27 +350,68 @@ def _source(
             source: Any = LiveSource(names, timeout_s=_SILENT_S)
         else:
             source = RaySource(settings, simulators=live, address=ray, first=config.seed)
-        stream = Stream(source, batch=1, **options)
-        filler = threading.Thread(target=fill, args=(stream,), daemon=True)
-        filler.start()
+        batches = iter(Stream(source, batch=1, **options))
+        filling = _meanwhile(lambda: pool.add(windows_of(next(batches), head, config.bins)))
+        goes_on = stack.enter_context(filling)
+        while len(pool) < config.batch and goes_on():
+            time.sleep(0.05)
+        yield lambda _: None
+
+
+@contextlib.contextmanager
+def _meanwhile(step: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Do a step again and again in a thread, until it raises StopIteration or the block ends.
+
+    Yield what says whether this goes on; that raises what the step raised.
+    """
+    stop = threading.Event()
+
+    def work() -> None:
+        with contextlib.suppress(StopIteration):
+            while not stop.is_set():
+                step()
+
+    with ThreadPoolExecutor(1) as executor:
+        working = executor.submit(work)
+
+        def goes_on() -> bool:
+            if working.done():
+                working.result()
+                return False
+            return True
+
         try:
-            while len(pool) < config.batch and filler.is_alive():
-                time.sleep(0.05)
-            yield lambda _: None
+            yield goes_on
         finally:
-            stop.set()
-            filler.join(_SILENT_S)  # the next window ends it, as long as somebody flies
+            stop.set()  # the next step ends it
 
 
-def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> int:
-    """Train for the time that there is; return how many steps that were."""
+class _Fit(NamedTuple):
+    """What training took."""
+
+    steps: int
+    waited_share: float
+    """Share of its time in which it flew, or waited for those who fly."""
+    gpus: list[str]
+    """Number, memory in use and power of each GPU at its end."""
+
+
+def _gpus(device: str) -> list[str]:
+    if torch.device(device).type != "cuda":
+        return []
+    query = ["nvidia-smi", "--query-gpu=index,memory.used,power.draw", "--format=csv,noheader"]
+    return subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
+    """Train for the time that there is."""
     if len(pool) == 0:
         raise ValueError(
             f"there are no {config.sequence + config.head.ahead} consecutive windows to learn from"
         )
     head, random = config.head, np.random.default_rng(config.seed)
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=1e-4)
-    begin_s, steps = time.monotonic(), 0
+    begin_s, steps, waited_s = time.monotonic(), 0, 0.0
 
     def share_done() -> float:
         if config.steps is not None:
@@ -356,7 +421,9 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
     while (share := share_done()) < 1.0:
         for group in optimizer.param_groups:
             group["lr"] = config.rate * min(1.0, 10.0 * share + 0.01) * 0.5 * (1.0 + np.cos(np.pi * share))
+        asked_s = time.monotonic()
         more(steps)
+        waited_s += time.monotonic() - asked_s
         voxel, target = (part.to(config.device) for part in pool.draw(config.batch, random))
         memory, predicted = None, []
         for window in voxel[: config.sequence]:
@@ -371,4 +438,8 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         if steps % 100 == 0:
             told = (steps, 100.0 * share, loss.item(), pool.window_count)
             _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
-    return steps
+    fit = _Fit(steps, waited_s / (time.monotonic() - begin_s), _gpus(config.device))
+    _log.info(
+        "%d steps, %.0f %% of the time without data %s", steps, 100.0 * fit.waited_share, fit.gpus or ""
+    )
+    return fit

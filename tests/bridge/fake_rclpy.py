@@ -5,6 +5,7 @@ Nodes of the same domain reach each other. Messages are carried as they are seri
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import inspect
 import sys
@@ -198,6 +199,7 @@ class Subscription:
         self.node, self.msg_type, self.topic, self.callback = node, msg_type, topic, callback
         self.qos_profile = qos
         self.waiting: deque[bytes] = deque(maxlen=qos.depth)
+        self.handle = Taker(self)
 
     destroyed = False
 
@@ -205,6 +207,21 @@ class Subscription:
         with self.node.context.wake:
             self.waiting.append(msg)
             self.node.context.wake.notify_all()
+
+
+class Taker(contextlib.nullcontext[None]):
+    """What a subscription takes its messages from; nothing destroys it within a `with`."""
+
+    def __init__(self, subscription: Subscription) -> None:
+        super().__init__()
+        self.subscription = subscription
+
+    def take_message(self, msg_type: type, raw: bool) -> tuple[bytes, dict[str, int]] | None:
+        """Return the oldest message that waits, and what is known about it."""
+        assert raw, "the fake does not deserialise"
+        assert msg_type is self.subscription.msg_type
+        with self.subscription.node.context.wake:
+            return (self.subscription.waiting.popleft(), {}) if self.subscription.waiting else None
 
 
 class Service:

@@ -19,7 +19,7 @@ from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
 
 WIDTH, HEIGHT = 346, 260
 HOUR_US = 3_600_000_000
-WRITABLE = [*FORMATS]
+WRITABLE = [name for name, known in FORMATS.items() if known.sink]
 
 
 def draw(count: int, *, span_us: int, begin_us: int = 0, seed: int = 0) -> EventArrays:
@@ -294,12 +294,11 @@ def test_wrong_files(tmp_path):
     (tmp_path / "a.xyz").write_bytes(b"")
     with pytest.raises(EventFileError, match=r"known: \.raw, "):
         open_events(tmp_path / "a.xyz")
-    for name, known in FORMATS.items():
+    for name in WRITABLE:
         path = path_of(tmp_path, name)
         path.write_bytes(b"neither one nor the other\n" * 10)
         with pytest.raises((EventFileError, ImportError), match=str(path) + "|faery|mcap"):
             open_events(path)
-        assert known.suffixes
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from neurosim_core.record.header import RecordingHeader
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
-from neurosim_core.learn import dense_train  # noqa: E402
+from neurosim_core.learn import dense_train, dense_worlds  # noqa: E402
 from neurosim_core.learn.dense import DenseNet  # noqa: E402
 from neurosim_core.learn.dense_train import (  # noqa: E402
     HEADS,
@@ -241,6 +242,31 @@ def test_worlds_fly_on_when_their_windows_have_been_seen(tmp_path, flights, scen
     train_dense(tmp_path, config, worlds=2, test=flights)
     told = json.loads((tmp_path / "flow.json").read_text())
     assert told["training windows"] == 32  # the last step begins when 8 were seen: a quarter of them
+
+
+def test_worlds_of_another_device_fly_meanwhile(tmp_path, flights, scene, monkeypatch):
+    """Training waits until no window has been seen too often; what ends the flights ends it."""
+    monkeypatch.setattr(dense_train, "flight_settings", lambda *_, **__: settings(scene))
+    # `cpu:0` is another name to PyTorch, not to us
+    config = DenseConfig(
+        task="flow", steps=3, batch=1, channels=4, reuse=0.25, device="cpu:0", fly_device="cpu"
+    )
+    train_dense(tmp_path, config, worlds=2, test=flights)
+    told = json.loads((tmp_path / "flow.json").read_text())
+    assert told["training windows"] >= 32
+    assert 0.0 < told["share of the time without data"] < 1.0
+
+    windows = dense_worlds.world_windows
+
+    def breaks(*arguments, **options):
+        yield from itertools.islice(windows(*arguments, **options), 5)
+        raise OSError("the other device is gone")
+
+    monkeypatch.setattr(dense_worlds, "world_windows", breaks)
+    with pytest.raises(OSError, match="device is gone"):
+        train_dense(tmp_path, config, worlds=2, test=flights)
+    with pytest.raises(ValueError, match=r"fly_device.*needs worlds"):
+        train_dense(tmp_path, config, data=flights)
 
 
 def test_a_backbone_is_taken_from_torch_and_from_onnx(tmp_path):
