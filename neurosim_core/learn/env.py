@@ -380,6 +380,8 @@ class Env:
         return View(
             **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
             probes=self._distances,
+            scenes=[model.config.scene for model in self.sim.models],
+            scene=wp.to_torch(self.sim.scene_of_world).long(),
             surface=None if self._surface is None else wp.to_torch(self._surface.array),
             action=torch.zeros((worlds, 4), device=self.device),
             last_action=torch.zeros((worlds, 4), device=self.device),

@@ -205,12 +205,12 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     if not find_device(device).startswith("cuda"):
         small = PpoConfig(**teacher), DaggerConfig(**student)
         return dataclasses.replace(config, teacher=small[0], student=small[1], pixels=24)
-    many = {"worlds": 1024, "iterations": 80, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 84, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=40,
+        block=42,
         evaluation_worlds=512,
     )
 

@@ -530,7 +530,9 @@ def test_models_that_were_made_before(plain, textured):
     config = ns.load_config(settings(plain))
     models = [ns.make_model(ns.load_config(settings(path))) for path in (plain, textured)]
     commands = commands_of("rates", 2, 2)
-    seen = record(Simulation(config, worlds=2, models=models), commands)
+    simulation = Simulation(config, worlds=2, models=models)
+    assert [model.config.scene for model in simulation.models] == [model.config.scene for model in models]
+    seen = record(simulation, commands)
     for world, path in enumerate((plain, textured)):
         for step, packets in enumerate(fly_alone(settings(path, seed=7 + world), commands[:, world])):
             assert_same(seen[step][world], packets)
