@@ -67,8 +67,9 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
 
     ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean to
     `rmw_cyclonedds_cpp`: Humble knows the last one only, and keeps to the interface 127.0.0.1; later ones
-    search on this host only. For these the interface 127.0.0.1 is added to the one that Cyclone DDS chooses:
-    nodes on Fast DDS that start later look for others there only, nodes on Cyclone DDS on the chosen one only.
+    search on this host only. For these the interface 127.0.0.1 is added to the one that Cyclone DDS
+    chooses: nodes on Fast DDS that start later look for others there only, nodes on Cyclone DDS on the
+    chosen one only.
 
     Raises:
         ValueError: A variable has a value that ROS does not know.
