@@ -91,6 +91,10 @@ class View:
     """Distance from the centre to the scene [m], to a voxel, [N, 1]."""
     probes: torch.Tensor
     """Distance to the scene of the points `Task.probes` [m], to a voxel, [N, K]."""
+    scenes: Sequence[SceneConfig]
+    """Settings of the scenes."""
+    scene: torch.Tensor
+    """Which of them each world is in, int64, [N]."""
     surface: torch.Tensor | None
     """Event surface, [N, C, H, W]; None: there is no camera."""
     action: torch.Tensor

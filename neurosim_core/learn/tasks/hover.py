@@ -30,7 +30,7 @@ class Hover(Task):
     episode_s = 5.0
     start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))
-    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 2.0))
+    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 3.0))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
     groups: Mapping[str, Sequence[str]] = {
