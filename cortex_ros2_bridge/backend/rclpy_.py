@@ -9,10 +9,18 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
+from cortex_ros2_bridge.backend.base import (
+    BackendError,
+    Buffer,
+    Qos,
+    Serve,
+    TopicInfo,
+    check_message,
+    why_apart,
+)
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
@@ -225,6 +233,7 @@ class RclpyBackend:
         self.distro = chosen_distro() or DEFAULT_DISTRO
         self._lock = threading.Lock()
         self._closed = False
+        self._warned: set[tuple[str, str]] = set()
         self._context = Context()
         self._service_loop: _Loop | None = None
         try:
@@ -258,7 +267,15 @@ class RclpyBackend:
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
         loop = self._here()
-        return loop.add(RclpyPublisher(loop, topic, lambda node: node.create_publisher(kind, topic, profile)))
+        made = RclpyPublisher(
+            loop,
+            topic,
+            lambda node: node.create_publisher(
+                kind, topic, profile, event_callbacks=_no_events("PublisherEventCallbacks")
+            ),
+        )
+        made.qos = qos
+        return loop.add(made)
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
@@ -268,8 +285,18 @@ class RclpyBackend:
         kind, profile = _interface(type_name), _profile(qos)
         loop = self._here()
         made = RclpySubscription(
-            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, raw=True)
+            loop,
+            topic,
+            lambda node: node.create_subscription(
+                kind,
+                topic,
+                made.take,
+                profile,
+                raw=True,
+                event_callbacks=_no_events("SubscriptionEventCallbacks"),
+            ),
         )
+        made.qos = qos
         made.deliver = Delivery(callback, topic)
         return loop.add(made)
 
@@ -288,10 +315,12 @@ class RclpyBackend:
         return loop.add(made)
 
     def topics(self) -> list[TopicInfo]:
-        """Return what others have."""
+        """Return what others have; what does not meet an endpoint of ours is said once."""
         if self._closed or self._loop.failure:
             return []
         node, parts = self._loop.node, self._loop.endpoints()
+        for part in parts:
+            self._compare(part, part.others(node))
         found = []
         for topic, types in node.get_topic_names_and_types():
             own = [sum(isinstance(part, kind) and part.topic == topic for part in parts) for kind in _ENDS]
@@ -299,6 +328,14 @@ class RclpyBackend:
             if others > (0, 0):
                 found += [TopicInfo(topic, type_name, *others) for type_name in types]
         return sorted(found)
+
+    def _compare(self, own: _Endpoint, others: Iterable[Qos]) -> None:
+        """Say once why others of a topic do not meet ours."""
+        for other in others:
+            why = why_apart(*((own.qos, other) if isinstance(own, RclpyPublisher) else (other, own.qos)))
+            if why and (own.topic, why) not in self._warned:
+                self._warned.add((own.topic, why))
+                _log.warning("%s does not reach a node: %s", own.topic, why)
 
     def close(self) -> None:
         """End the node."""
@@ -337,6 +374,7 @@ class _Endpoint:
     """Whether the executor waits for it."""
     destroyer = ""
     """What the node destroys a handle with."""
+    qos = Qos()
 
     def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
         self.topic = topic
@@ -347,6 +385,10 @@ class _Endpoint:
     def destroy(self, node: Any, handle: Any) -> None:
         """Destroy the handle."""
         getattr(node, self.destroyer)(handle)
+
+    def others(self, node: Any) -> list[Qos]:
+        """Return how those on the other end of the topic are made, so far as we compare it."""
+        return []
 
     def close(self) -> None:
         """Withdraw it."""
@@ -359,6 +401,10 @@ class RclpyPublisher(_Endpoint):
 
     is_waited_for = False
     destroyer = "destroy_publisher"
+
+    def others(self, node: Any) -> list[Qos]:
+        """Return how the subscriptions are made."""
+        return [_qos_of(each) for each in node.get_subscriptions_info_by_topic(self.topic)]
 
     @property
     def subscriber_count(self) -> int:
@@ -385,6 +431,10 @@ class RclpySubscription(_Endpoint):
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
+
+    def others(self, node: Any) -> list[Qos]:
+        """Return how the publishers are made."""
+        return [_qos_of(each) for each in node.get_publishers_info_by_topic(self.topic)]
 
     def take(self, message: bytes) -> None:
         """Deliver a message, and those that have come meanwhile.
@@ -445,6 +495,20 @@ def _interface(type_name: str) -> Any:
             f"unknown ROS type {type_name!r}: the package {package} of this ROS installation has none, or is "
             f"not installed (apt install ros-$ROS_DISTRO-{package.replace('_', '-')})"
         ) from None
+
+
+def _no_events(kind: str) -> Any:
+    """Return callbacks for no events: for each, whether it comes or not, every wait takes 5 us longer."""
+    try:
+        module = importlib.import_module("rclpy.event_handler")
+    except ImportError:  # Humble
+        module = importlib.import_module("rclpy.qos_event")
+    return getattr(module, kind)(use_default_callbacks=False)
+
+
+def _qos_of(endpoint: Any) -> Qos:
+    found = endpoint.qos_profile
+    return Qos(reliability=found.reliability.name.lower(), durability=found.durability.name.lower())
 
 
 def _profile(qos: Qos) -> Any:

@@ -38,52 +38,6 @@ Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
 StepResult = tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
 
 
-def make_env(
-    task: str | Task,
-    *,
-    worlds: int = 64,
-    device: str = "auto",
-    observe: Collection[str] | None = None,
-    surface: SurfaceConfig | None = None,
-    scenes: Scenes = "seen",
-    models: Sequence[Model] | None = None,
-    randomise: bool | Randomisation = True,
-    pixels: int | None = None,
-    seed: int = 0,
-) -> Env:
-    """Return a task in many worlds.
-
-    Args:
-        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
-        worlds: N.
-        device: Where everything is: auto, cpu, cuda:0.
-        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
-        surface: How events are shown; None: as the task says.
-        scenes: Where to fly.
-        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
-        randomise: Draw parameters anew in each episode; as the task says, or as told.
-        pixels: Width and height of the event camera [px]; None: as the task says.
-        seed: Of world 0; world i has seed + i.
-
-    Raises:
-        ValueError: There is no such task, or a setting is not for worlds.
-    """
-    chosen = find_task(task) if isinstance(task, str) else task
-    if pixels is not None:
-        chosen.camera = {**chosen.camera, "width": pixels, "height": pixels}
-    return Env(
-        chosen,
-        worlds=worlds,
-        device=device,
-        observe=observe,
-        surface=surface,
-        scenes=scenes,
-        models=models,
-        randomise=randomise,
-        seed=seed,
-    )
-
-
 def find_task(name: str) -> Task:
     """Return a task by its name in the registry.
 
@@ -104,7 +58,19 @@ class Env:
     nor brings anything to the host; on a CPU it skips what no world needs.
 
     Args:
-        task: What to do; the other arguments are those of `make_env`.
+        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
+        worlds: N.
+        device: Where everything is: auto, cpu, cuda:0.
+        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
+        surface: How events are shown; None: as the task says.
+        scenes: Where to fly.
+        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
+        randomise: Draw parameters anew in each episode; as the task says, or as told.
+        pixels: Width and height of the event camera [px]; None: as the task says.
+        seed: Of world 0; world i has seed + i.
+
+    Raises:
+        ValueError: There is no such task, or a setting is not for worlds.
 
     Attributes:
         task: What is done.
@@ -119,7 +85,7 @@ class Env:
 
     def __init__(
         self,
-        task: Task,
+        task: str | Task,
         *,
         worlds: int = 64,
         device: str = "auto",
@@ -128,9 +94,12 @@ class Env:
         scenes: Scenes = "seen",
         models: Sequence[Model] | None = None,
         randomise: bool | Randomisation = True,
+        pixels: int | None = None,
         seed: int = 0,
     ) -> None:
-        self.task = task
+        self.task = task = find_task(task) if isinstance(task, str) else task
+        if pixels is not None:
+            task.camera = {**task.camera, "width": pixels, "height": pixels}
         self._observe = None if observe is None else frozenset(observe)
         sees = observe is None or "events" in observe
         if isinstance(scenes, str):
@@ -395,6 +364,10 @@ class Env:
     def _observations(self) -> Observations:
         seen = self.task.observe(self.view)
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
+
+
+make_env = Env
+"""The function that users call."""
 
 
 def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, Any]:

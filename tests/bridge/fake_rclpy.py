@@ -47,6 +47,11 @@ class DurabilityPolicy(enum.IntEnum):
     UNKNOWN = 3
 
 
+class EventCallbacks:
+    def __init__(self, *, use_default_callbacks: bool = True) -> None:
+        assert not use_default_callbacks, "the fake has no events"
+
+
 class SignalHandlerOptions(enum.IntEnum):
     NO = 0
     SIGINT = 1
@@ -325,6 +330,12 @@ class Node:
     def count_subscribers(self, topic_name: str) -> int:
         return sum(one.topic == topic_name for node in self.world for one in node.subs)
 
+    def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Publisher]:
+        return [one for node in self.world for one in node.pubs if one.topic == topic_name]
+
+    def get_subscriptions_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Subscription]:
+        return [one for node in self.world for one in node.subs if one.topic == topic_name]
+
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         found: dict[str, set[str]] = {}
         for node in self.world:
@@ -445,6 +456,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
             "HistoryPolicy": HistoryPolicy,
             "ReliabilityPolicy": ReliabilityPolicy,
             "DurabilityPolicy": DurabilityPolicy,
+        },
+        "rclpy.event_handler": {
+            "PublisherEventCallbacks": EventCallbacks,
+            "SubscriptionEventCallbacks": EventCallbacks,
         },
         "rclpy.signals": {"SignalHandlerOptions": SignalHandlerOptions},
         "std_msgs": {},

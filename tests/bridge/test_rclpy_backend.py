@@ -120,6 +120,22 @@ def test_who_comes_late_gets_what_is_latched(make: Any) -> None:
     assert [message[8:9] for message in got] == [b"b"]
 
 
+def test_what_does_not_meet_is_said_once(make: Any, caplog: pytest.LogCaptureFixture) -> None:
+    node, other = make(), make(node_name="other")
+    node.publisher("/effort", STRING, Qos(reliability="best_effort"))
+    node.publisher("/fitting", STRING, Qos(durability="transient_local"))
+    node.subscription("/latched", STRING, Qos(durability="transient_local"), print)
+    other.subscription("/effort", STRING, Qos(), print)
+    other.subscription("/fitting", STRING, Qos(reliability="best_effort"), print)
+    other.publisher("/latched", STRING, Qos())
+    wait_for(lambda: node.topics() and len(caplog.records) >= 2)
+    wait_for(lambda: {topic.topic for topic in node.topics()} >= {"/effort", "/fitting", "/latched"})
+    assert sorted(record.getMessage() for record in caplog.records) == [
+        "/effort does not reach a node: its subscriber wants it reliable, its publisher is not",
+        "/latched does not reach a node: its subscriber wants it transient local, its publisher is volatile",
+    ]
+
+
 def test_a_callback_that_raises_does_not_end_the_node(make: Any, caplog: pytest.LogCaptureFixture) -> None:
     node, other = make(), make(node_name="other")
     got: list[bytes] = []

@@ -1,4 +1,4 @@
-"""A reader of a lossy socket learns how many messages there were, also where its queue was full at the end."""
+"""A reader of a lossy socket learns how many messages there were, also where its queue was full."""
 
 from __future__ import annotations
 
