@@ -13,14 +13,16 @@ import warp as wp
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
+    NO_RANDOMISATION,
     PARAMETERS,
     Episodes,
+    Randomisation,
     look_at_vehicles,
     make_routes,
     probe,
 )
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
-from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
+from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.scene_table import SceneSource
@@ -254,25 +256,14 @@ class Env:
         """Begin episodes in the worlds of the mask."""
         episodes, view = self._episodes, self.view
         episodes.begin(self._mask_array)
-        factor = self.randomisation.threshold_factor
-        if self._surface is not None and factor != (1.0, 1.0):
-            threshold = self.task.threshold
-            episodes.scale_thresholds(
-                self._mask_array,
-                self.sim.thresholds(CAMERA),
-                nominal=(threshold, threshold),
-                factor=factor,
-            )
         drawn = self.randomisation
-        if drawn.airframes_differ:
-            episodes.vary_airframes(
-                self._mask_array,
-                self.sim.airframes,
-                mass=drawn.mass_factor,
-                inertia=drawn.inertia_factor,
-                drag=drawn.drag_factor,
-                wind_max_m_s=drawn.wind_m_s,
+        if self._surface is not None and drawn.threshold_factor != (1.0, 1.0):
+            thresholds = self.sim.thresholds(CAMERA)
+            episodes.scale_thresholds(
+                self._mask_array, thresholds, nominal=self.task.threshold, factor=drawn.threshold_factor
             )
+        if drawn.airframes_differ:
+            episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )
@@ -321,24 +312,10 @@ class Env:
         return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
     def _look(self, observation: Any) -> None:
-        look_at_vehicles(
-            self._rows,
-            observation,
-            self._episodes,
-            fields=self.sim.fields,
-            scene_of_world=self.sim.scene_of_world,
-            gyro_bias_rad_s=self.randomisation.gyro_bias_rad_s,
-            gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
-            gravity_noise=self.randomisation.gravity_noise,
-        )
+        where = {"fields": self.sim.fields, "scene_of_world": self.sim.scene_of_world}
+        look_at_vehicles(self._rows, observation, self._episodes, **where, drawn=self.randomisation)
         if self.task.probes:
-            probe(
-                self._distances_array,
-                self._probes,
-                self._rows,
-                fields=self.sim.fields,
-                scene_of_world=self.sim.scene_of_world,
-            )
+            probe(self._distances_array, self._probes, self._rows, **where)
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.episodes import Randomisation, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
-from neurosim_core.learn.task import MIRROR_ACTION, Observations, Randomisation, Task, View
+from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
 from neurosim_core.registry import register
 
 SPEED_MAX_M_S = 0.2
