@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 from cortex_ros2_bridge.backend.base import (
@@ -267,12 +267,9 @@ class RclpyBackend:
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
         loop = self._here()
+        quiet = _no_events("PublisherEventCallbacks")
         made = RclpyPublisher(
-            loop,
-            topic,
-            lambda node: node.create_publisher(
-                kind, topic, profile, event_callbacks=_no_events("PublisherEventCallbacks")
-            ),
+            loop, topic, lambda node: node.create_publisher(kind, topic, profile, event_callbacks=quiet)
         )
         made.qos = qos
         return loop.add(made)
@@ -284,17 +281,9 @@ class RclpyBackend:
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
         loop = self._here()
+        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
         made = RclpySubscription(
-            loop,
-            topic,
-            lambda node: node.create_subscription(
-                kind,
-                topic,
-                made.take,
-                profile,
-                raw=True,
-                event_callbacks=_no_events("SubscriptionEventCallbacks"),
-            ),
+            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, **arguments)
         )
         made.qos = qos
         made.deliver = Delivery(callback, topic)
@@ -320,7 +309,7 @@ class RclpyBackend:
             return []
         node, parts = self._loop.node, self._loop.endpoints()
         for part in parts:
-            self._compare(part, part.others(node))
+            self._compare(part)
         found = []
         for topic, types in node.get_topic_names_and_types():
             own = [sum(isinstance(part, kind) and part.topic == topic for part in parts) for kind in _ENDS]
@@ -329,9 +318,10 @@ class RclpyBackend:
                 found += [TopicInfo(topic, type_name, *others) for type_name in types]
         return sorted(found)
 
-    def _compare(self, own: _Endpoint, others: Iterable[Qos]) -> None:
+    def _compare(self, own: _Endpoint) -> None:
         """Say once why others of a topic do not meet ours."""
-        for other in others:
+        for each in getattr(self._loop.node, own.lister)(own.topic) if own.lister else ():
+            other = _qos_of(each)
             why = why_apart(*((own.qos, other) if isinstance(own, RclpyPublisher) else (other, own.qos)))
             if why and (own.topic, why) not in self._warned:
                 self._warned.add((own.topic, why))
@@ -374,6 +364,8 @@ class _Endpoint:
     """Whether the executor waits for it."""
     destroyer = ""
     """What the node destroys a handle with."""
+    lister = ""
+    """What the node lists the other ends of the topic with."""
     qos = Qos()
 
     def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
@@ -386,10 +378,6 @@ class _Endpoint:
         """Destroy the handle."""
         getattr(node, self.destroyer)(handle)
 
-    def others(self, node: Any) -> list[Qos]:
-        """Return how those on the other end of the topic are made, so far as we compare it."""
-        return []
-
     def close(self) -> None:
         """Withdraw it."""
         if self.handle is not None:
@@ -401,10 +389,7 @@ class RclpyPublisher(_Endpoint):
 
     is_waited_for = False
     destroyer = "destroy_publisher"
-
-    def others(self, node: Any) -> list[Qos]:
-        """Return how the subscriptions are made."""
-        return [_qos_of(each) for each in node.get_subscriptions_info_by_topic(self.topic)]
+    lister = "get_subscriptions_info_by_topic"
 
     @property
     def subscriber_count(self) -> int:
@@ -428,13 +413,10 @@ class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
     destroyer = "destroy_subscription"
+    lister = "get_publishers_info_by_topic"
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
-
-    def others(self, node: Any) -> list[Qos]:
-        """Return how the publishers are made."""
-        return [_qos_of(each) for each in node.get_publishers_info_by_topic(self.topic)]
 
     def take(self, message: bytes) -> None:
         """Deliver a message, and those that have come meanwhile.
