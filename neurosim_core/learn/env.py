@@ -152,6 +152,7 @@ class Env:
         latency = self.randomisation.latency_steps
         self._queue = torch.zeros((latency + 1, worlds, 4), device=self.device)
         self._queue_place = 0
+        self._lagging = torch.zeros((worlds, 4), device=self.device)
         self._each = torch.arange(worlds, device=self.device)
         self.view = self._make_view()
         self._seed = seed
@@ -176,6 +177,7 @@ class Env:
         low, high = self.randomisation.thrust_factor
         found["thrust_factor"] = low + (high - low) * self.view.draws[:, -1]
         found["latency_steps"] = self._latency()
+        found["lag_s"] = self._lag_s()
         if self._surface is not None:
             thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
             found["threshold_factor"] = thresholds / self.task.threshold
@@ -273,6 +275,7 @@ class Env:
         hover = torch.zeros(4, device=self.device)
         hover[0] = view.vehicle.hover_thrust_n
         self._queue = torch.where(mask, hover, self._queue)
+        self._lagging = torch.where(mask, hover, self._lagging)
         self.episode_length.masked_fill_(self._mask, 0)
         view.elapsed_s.masked_fill_(self._mask, 0.0)
         if self._surface is not None:
@@ -299,12 +302,24 @@ class Env:
         command = command.clone()
         command[:, 0] *= low + (high - low) * draws[:, -1]
         length = self._queue.shape[0]
-        if length == 1:
-            return command
-        self._queue[self._queue_place] = command
-        chosen = self._queue[(self._queue_place - self._latency()) % length, self._each]
-        self._queue_place = (self._queue_place + 1) % length
-        return chosen
+        if length > 1:
+            self._queue[self._queue_place] = command
+            command = self._queue[(self._queue_place - self._latency()) % length, self._each]
+            self._queue_place = (self._queue_place + 1) % length
+        return command if self.randomisation.lag_s == (0.0, 0.0) else self._lagged(command)
+
+    def _lagged(self, command: torch.Tensor) -> torch.Tensor:
+        """Return the mean over the step of what follows the commands, first-order."""
+        share = (self._lag_s() / self.view.step_s)[:, None]
+        keep = torch.exp(-1.0 / share)
+        behind = self._lagging - command
+        self._lagging = command + keep * behind
+        return command + share * (1.0 - keep) * behind
+
+    def _lag_s(self) -> torch.Tensor:
+        """Return the time constant of each episode [s], [N]."""
+        low, high = self.randomisation.lag_s
+        return (low + (high - low) * self.view.draws[:, -3]).clamp(min=1e-6)
 
     def _latency(self) -> torch.Tensor:
         """Return the steps from an action to its effect in each episode, int64, [N]."""

@@ -71,6 +71,9 @@ class Randomisation:
     """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
     latency_steps: int = 1
     """Most steps between an action and its effect; each episode has its own, from 0 on."""
+    lag_s: tuple[float, float] = (0.0, 0.0)
+    """Range of the time constant with which thrust and rates follow their commands [s]: slower motors, say,
+    than those of the vehicle, whose own lag is there besides."""
     threshold_factor: tuple[float, float] = (0.8, 1.25)
     """Range of each threshold of the event camera against the nominal one."""
     mass_factor: tuple[float, float] = (1.0, 1.0)
