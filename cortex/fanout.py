@@ -119,7 +119,7 @@ class Fanout:
                 return
 
     def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
-        """A reliable reader has accounted for all below a sequence."""
+        """A reader has accounted for all below a sequence."""
         for each in self.readers.values():
             if each.request.reader == reader:
                 each.confirmed = max(each.confirmed, sequence)
@@ -242,12 +242,17 @@ class Fanout:
         if waited_s >= self._tell_again_s:
             self._tell_again_s = waited_s + TELL_AGAIN_S
             self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
+            # A lossy socket drops it where a queue is full, and does not say so.
+            for outlet in {r.outlet for r in self.readers.values() if self._owes(r)} - {
+                *self._strict_outlets
+            }:
+                outlet.send(last, DONTWAIT)
         behind = [r for r in self.readers.values() if r.outlet in self._untold or self._owes(r)]
         return not (self._untold or behind) or waited_s >= max([linger_s, *(r.timeout_s for r in behind)])
 
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
-        confirms = reader.request.confirms and reader.outlet.strict and reader.member is None
+        confirms = reader.request.confirms and reader.member is None
         return confirms and reader.confirmed < self._gate.sequence
 
     def give_up(self) -> None:
@@ -255,7 +260,7 @@ class Fanout:
         sequence = self._gate.sequence
         for outlet in self._untold:
             outlet.send_anyway(self._news(sequence))
-        count = sum(map(self._owes, self.readers.values()))
+        count = sum(reader.outlet.strict and self._owes(reader) for reader in self.readers.values())
         if count:
             self._outlets.note(
                 f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"

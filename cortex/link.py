@@ -158,8 +158,7 @@ class Link:
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
         self._reader = secrets.randbits(64) or 1
-        # What is in our own process cannot get lost on its way.
-        self._confirms = policy.reliable and not self.address.startswith("inproc:")
+        self._confirms = not self.address.startswith("inproc:")  # within a process nothing is on its way
         if shared_memory and native is not None and self.address.startswith("ipc://"):
             path = self.address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
             try:

@@ -39,7 +39,7 @@ class Attachable(Protocol):
         ...
 
     def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
-        """A reliable reader has accounted for all below a sequence."""
+        """A reader has accounted for all below a sequence."""
         ...
 
 

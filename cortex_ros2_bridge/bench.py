@@ -210,13 +210,7 @@ def _subscribe(streams: Sequence[str], backend_name: str) -> int:
     from cortex_ros2_bridge.backend.choose import open_backend
 
     latencies: dict[str, list[int]] = {name: [] for name in streams}
-    lost = dict.fromkeys(streams, 0)
-
-    def take_diagnostics(data: bytes) -> None:
-        for status in cdr.decode(data, diagnostics.TYPE).status:
-            for name in streams:
-                if status.name.endswith(f"-> {STREAMS[name].ros_topic}"):
-                    lost[name] = int({pair.key: pair.value for pair in status.values}["lost"])
+    diagnosed: list[bytes] = []
 
     def taker(name: str) -> Callable[[bytes], None]:
         append = latencies[name].append
@@ -232,16 +226,24 @@ def _subscribe(streams: Sequence[str], backend_name: str) -> int:
         for name in streams:
             stream = STREAMS[name]
             backend.subscription(stream.ros_topic, stream.ros_type, Qos(depth=1000), taker(name))
-        backend.subscription(diagnostics.TOPIC, diagnostics.TYPE, Qos(), take_diagnostics)
+        backend.subscription(diagnostics.TOPIC, diagnostics.TYPE, Qos(), diagnosed.append)
         sys.stdin.readline()
     finally:
         backend.close()
+    # Read only now: what it takes to read them the first time would hold up the streams for 0.2 s.
+    lost = {
+        status.name.rpartition(" -> ")[2]: int(pair.value)
+        for data in diagnosed
+        for status in cdr.decode(data, diagnostics.TYPE).status
+        for pair in status.values
+        if pair.key == "lost"
+    }
     found = {}
     for name, values in latencies.items():
         at = np.quantile(values, list(QUANTILES.values())) / 1e6 if values else [np.nan] * len(QUANTILES)
         found[name] = {
             "received": len(values),
-            "lost_in_bridge": lost[name],
+            "lost_in_bridge": lost.get(STREAMS[name].ros_topic, 0),
             "latency_ms": dict(zip(QUANTILES, map(float, at), strict=True)),
         }
     print(json.dumps(found), flush=True)

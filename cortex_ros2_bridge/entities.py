@@ -24,6 +24,7 @@ UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 _NAME_NOT_UNIQUE, _NAME_INVALID, _UNSUPPORTED_FORMAT, _NO_RESOURCE = range(101, 105)
 _SPAWN_POSE, _STATE_POSE = 109, 101
 _ROBOT, _DYNAMIC, _STATIC = 1, 4, 5
+_VEHICLES_STAY = "vehicles come and go with the settings"
 _MOTIONS = ("velocity_m_s", "sway", "orbit", "spin_rad_s")
 """Parts of a motion that move a body by themselves."""
 
@@ -110,7 +111,8 @@ class Entities:
                 UNSUPPORTED if request.resource_string else _NO_RESOURCE, "a body of the settings: body:NAME"
             )
         if name not in bodies:
-            refuse(_UNSUPPORTED_FORMAT, f"no body is called {name!r}, known: {', '.join(bodies) or 'none'}")
+            known = ", ".join(bodies) or "none"
+            refuse(_UNSUPPORTED_FORMAT, f"no body is called {name!r}, known: {known}; {_VEHICLES_STAY}")
         if request.name not in ("", name) and not request.allow_renaming:
             refuse(_NAME_INVALID, f"the body {name} keeps its name (allow_renaming)")
         if bodies[name]["present"]:
@@ -121,7 +123,7 @@ class Entities:
 
     def _delete(self, request: Any, response: Any) -> None:
         if self._known(request.entity) not in self._bodies():
-            refuse(UNSUPPORTED, "vehicles come and go with the settings")
+            refuse(UNSUPPORTED, _VEHICLES_STAY)
         self._call("/set_parameters", msg.Parameters.of({f"bodies.{request.entity}.present": False}))
 
     def _place(self, name: str, position: Vector, q: Vector) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
 import sys
 import tempfile
+from pathlib import Path
 
 import warp as wp
 
@@ -38,6 +41,26 @@ def start_warp() -> None:
         held.seek(0)
         lines = held.read().decode(errors="replace").splitlines(keepends=True)
     sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
+    wp._src.context.runtime.get_clang_pch_dir = _header_folder  # type: ignore[attr-defined]
+
+
+def _header_folder() -> str:
+    """Return the folder of the kernel cache with Warp's precompiled headers for kernels of a CPU.
+
+    Warp on its own precompiles them in each thread of each process again, which takes as long as the
+    kernels do (1.7 s). Writers rename whole files into place, so processes can share the folder.
+    """
+    folder = Path(str(wp.config.kernel_cache_dir), "headers", _header_version())
+    folder.mkdir(parents=True, exist_ok=True)  # `wp.clear_kernel_cache` may have removed it
+    return str(folder)
+
+
+@functools.cache
+def _header_version() -> str:
+    """Return a name that differs between installations of Warp: precompiled headers name their sources."""
+    sources = Path(str(wp.__file__)).parent / "native"
+    newest = max(header.stat().st_mtime_ns for header in sources.rglob("*.h"))
+    return hashlib.sha256(f"{sources} {newest}".encode()).hexdigest()[:16]
 
 
 def refuse_forked_process() -> None:

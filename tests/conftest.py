@@ -11,6 +11,8 @@ import pytest
 import warp as wp
 from alone import pytest_runtest_protocol
 
+from neurosim_core.warp_start import start_warp
+
 __all__ = ["pytest_runtest_protocol"]
 
 wp.config.log_level = wp.LOG_WARNING
@@ -50,7 +52,7 @@ def pytest_collection_finish() -> None:
 
 
 def _devices() -> list[str]:
-    wp.init()
+    start_warp()
     return ["cpu"] + (["cuda:0"] if wp.is_cuda_available() else [])
 
 

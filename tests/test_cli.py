@@ -27,7 +27,7 @@ LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
 SETTINGS = {
     "duration_s": 0.3,
     "scene": {"kind": "apartment", "rooms": 1},
-    "render": {"lighting": {"mode": "unshadowed"}},
+    "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "sensors": {
         "events": {"kind": "event_camera", "lens": LENS},
         "rgb": {"kind": "rgb", "lens": LENS},

@@ -16,7 +16,7 @@ CONFIG = {
     "duration_s": 0.02,
     "device": "cpu",
     "scene": {"kind": "apartment", "rooms": 1},
-    "render": {"lighting": {"mode": "unshadowed"}},
+    "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "sensors": {"rgb": {"kind": "rgb", "lens": {"width": 64, "height": 48, "horizontal_fov_rad": 1.5}}},
 }
 

@@ -140,6 +140,15 @@ class BackendError(RuntimeError):
     """ROS 2 cannot be reached, or refused a message."""
 
 
+def why_apart(writer: Qos, reader: Qos) -> str:
+    """Return why two endpoints of a topic do not meet; empty if they do."""
+    if reader.reliability == "reliable" and writer.reliability != "reliable":
+        return "its subscriber wants it reliable, its publisher is not"
+    if reader.durability == "transient_local" and writer.durability != "transient_local":
+        return "its subscriber wants it transient local, its publisher is volatile"
+    return ""
+
+
 def check_message(message: Buffer, topic: str) -> None:
     """Raise `BackendError` unless a message is little-endian CDR."""
     if len(message) <= 4 or bytes(message[:2]) != b"\0\1":

@@ -211,8 +211,7 @@ class _Site(NamedTuple):
             topic,
             kind.__idl_typename__.replace(".", "::"),
             user_data,
-            qos.reliability == "reliable",
-            qos.durability == "transient_local",
+            qos,
         )
         try:
             with ENTITIES:

@@ -66,9 +66,10 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
     """Return the configuration of a domain, in the form of CYCLONEDDS_URI, whose settings win.
 
     ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean to
-    `rmw_cyclonedds_cpp`: Humble keeps to the interface 127.0.0.1, later ones search on this host only. For
-    these the interface 127.0.0.1 is added to the one that Cyclone DDS chooses: nodes on Fast DDS that start
-    later look for others there only, nodes on Cyclone DDS on the chosen one only.
+    `rmw_cyclonedds_cpp`: Humble knows the last one only, and keeps to the interface 127.0.0.1; later ones
+    search on this host only. For these the interface 127.0.0.1 is added to the one that Cyclone DDS
+    chooses: nodes on Fast DDS that start later look for others there only, nodes on Cyclone DDS on the
+    chosen one only.
 
     Raises:
         ValueError: A variable has a value that ROS does not know.
@@ -82,12 +83,12 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
     theirs = environment.get("CYCLONEDDS_URI", "")
     general, discovery = "", _INDEX
-    if _localhost_only(environment):
-        if distro is not None and DISTROS[distro].range_variable == "ROS_LOCALHOST_ONLY":
-            general = f"<Interfaces>{_LOOPBACK}</Interfaces>"
-            area, peers = "SYSTEM_DEFAULT", ["localhost"]
-        else:
-            area, peers = "LOCALHOST", []
+    is_local = _localhost_only(environment)
+    if distro is not None and DISTROS[distro].range_variable == "ROS_LOCALHOST_ONLY":
+        area, peers = "SYSTEM_DEFAULT", ["localhost"] if is_local else []
+        general = f"<Interfaces>{_LOOPBACK}</Interfaces>" if is_local else ""
+    elif is_local:
+        area, peers = "LOCALHOST", []
     if area in ("LOCALHOST", "OFF"):
         general = "<AllowMulticast>false</AllowMulticast>"
     if area == "LOCALHOST":

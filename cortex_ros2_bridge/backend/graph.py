@@ -24,11 +24,12 @@ from cyclonedds.builtin import (
 from cyclonedds.core import DDSException, GuardCondition, InstanceState
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy, Qos
+from cyclonedds.qos import Policy
+from cyclonedds.qos import Qos as DdsQos
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from cortex_ros2_bridge.backend.base import TopicInfo
+from cortex_ros2_bridge.backend.base import Qos, TopicInfo, why_apart
 from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, wait_set, write
 from cortex_ros2_bridge.backend.idl import idl_struct
 from cortex_ros2_bridge.backend.names import TOPIC_PREFIX, ros_topic, ros_type
@@ -59,8 +60,7 @@ class Endpoint(NamedTuple):
     type_name: str
     """As in DDS: "sensor_msgs::msg::dds_::Imu_"."""
     user_data: bytes
-    reliable: bool
-    durable: bool
+    qos: Qos
 
 
 def user_data_of_type(type_name: str, distro: str) -> bytes:
@@ -181,8 +181,7 @@ class Graph:
                 sample.topic_name,
                 sample.type_name,
                 _user_data(qos),
-                Policy.Reliability in qos and qos[Policy.Reliability] != Policy.Reliability.BestEffort,
-                Policy.Durability in qos and qos[Policy.Durability] != Policy.Durability.Volatile,
+                _qos_of(qos),
             )
             with self._lock:
                 self._endpoints[sample.key.bytes] = endpoint
@@ -194,13 +193,8 @@ class Graph:
         if own.topic != other.topic or own.kind == other.kind or own.type_name != other.type_name:
             return
         writer, reader = (own, other) if own.kind == "writer" else (other, own)
-        if reader.reliable and not writer.reliable:
-            why = "its subscriber wants it reliable, its publisher is not"
-        elif reader.durable and not writer.durable:
-            why = "its subscriber wants it transient local, its publisher is volatile"
-        else:
-            return
-        if (own.topic, why) not in self._warned:
+        why = why_apart(writer.qos, reader.qos)
+        if why and (own.topic, why) not in self._warned:
             self._warned.add((own.topic, why))
             _log.warning("%s does not reach a node: %s", ros_topic(own.topic) or own.topic, why)
 
@@ -232,7 +226,7 @@ class Graph:
 
     def _speak(self, distro: str) -> None:
         """Make the writer of announcements, and announce."""
-        qos = Qos(
+        qos = DdsQos(
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.Reliability.Reliable(0),
             Policy.Durability.TransientLocal,
@@ -240,7 +234,7 @@ class Graph:
             Policy.WriterDataLifecycle(autodispose=False),
         )
         if DISTROS[distro].shows_type_hash:
-            qos = Qos(Policy.Userdata(user_data_of_type(DISCOVERY_TYPE, distro)), base=qos)
+            qos = DdsQos(Policy.Userdata(user_data_of_type(DISCOVERY_TYPE, distro)), base=qos)
         with ENTITIES:
             topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
             self._writer = DataWriter(self._participant, topic, qos)
@@ -290,5 +284,14 @@ def _samples(reader: Any) -> Iterator[tuple[Any, bool]]:
             yield sample, info.valid_data and info.instance_state == InstanceState.Alive
 
 
-def _user_data(qos: Qos) -> bytes:
+def _qos_of(found: DdsQos) -> Qos:
+    reliable = Policy.Reliability in found and found[Policy.Reliability] != Policy.Reliability.BestEffort
+    lasting = Policy.Durability in found and found[Policy.Durability] != Policy.Durability.Volatile
+    return Qos(
+        reliability="reliable" if reliable else "best_effort",
+        durability="transient_local" if lasting else "volatile",
+    )
+
+
+def _user_data(qos: DdsQos) -> bytes:
     return bytes(qos[Policy.Userdata].data) if Policy.Userdata in qos else b""

@@ -12,7 +12,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
+from cortex_ros2_bridge.backend.base import (
+    BackendError,
+    Buffer,
+    Qos,
+    Serve,
+    TopicInfo,
+    check_message,
+    why_apart,
+)
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
@@ -27,6 +35,8 @@ _CALL_S = 10.0
 _RESTART_COUNT_MAX = 10
 """An executor that fails more often than this within `_RESTART_PERIOD_S` is given up."""
 _RESTART_PERIOD_S = 10.0
+_TAKE_COUNT_MAX = 32
+"""So many messages of a topic are taken before others have their turn."""
 _SERVICES = "_services"
 """Added to the node's name for the node of its services; `ros2 node list` hides names with a leading "_"."""
 _Result = TypeVar("_Result")
@@ -223,6 +233,7 @@ class RclpyBackend:
         self.distro = chosen_distro() or DEFAULT_DISTRO
         self._lock = threading.Lock()
         self._closed = False
+        self._warned: set[tuple[str, str]] = set()
         self._context = Context()
         self._service_loop: _Loop | None = None
         try:
@@ -256,7 +267,12 @@ class RclpyBackend:
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
         loop = self._here()
-        return loop.add(RclpyPublisher(loop, topic, lambda node: node.create_publisher(kind, topic, profile)))
+        quiet = _no_events("PublisherEventCallbacks")
+        made = RclpyPublisher(
+            loop, topic, lambda node: node.create_publisher(kind, topic, profile, event_callbacks=quiet)
+        )
+        made.qos = qos
+        return loop.add(made)
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
@@ -264,12 +280,13 @@ class RclpyBackend:
         """Subscribe to a topic; all subscriptions share a thread."""
         check_name(topic)
         kind, profile = _interface(type_name), _profile(qos)
-        deliver = Delivery(callback, topic)
         loop = self._here()
+        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
         made = RclpySubscription(
-            loop, topic, lambda node: node.create_subscription(kind, topic, deliver, profile, raw=True)
+            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, **arguments)
         )
-        made.deliver = deliver
+        made.qos = qos
+        made.deliver = Delivery(callback, topic)
         return loop.add(made)
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
@@ -287,10 +304,12 @@ class RclpyBackend:
         return loop.add(made)
 
     def topics(self) -> list[TopicInfo]:
-        """Return what others have."""
+        """Return what others have; what does not meet an endpoint of ours is said once."""
         if self._closed or self._loop.failure:
             return []
         node, parts = self._loop.node, self._loop.endpoints()
+        for part in parts:
+            self._compare(part)
         found = []
         for topic, types in node.get_topic_names_and_types():
             own = [sum(isinstance(part, kind) and part.topic == topic for part in parts) for kind in _ENDS]
@@ -298,6 +317,15 @@ class RclpyBackend:
             if others > (0, 0):
                 found += [TopicInfo(topic, type_name, *others) for type_name in types]
         return sorted(found)
+
+    def _compare(self, own: _Endpoint) -> None:
+        """Say once why others of a topic do not meet ours."""
+        for each in getattr(self._loop.node, own.lister)(own.topic) if own.lister else ():
+            other = _qos_of(each)
+            why = why_apart(*((own.qos, other) if isinstance(own, RclpyPublisher) else (other, own.qos)))
+            if why and (own.topic, why) not in self._warned:
+                self._warned.add((own.topic, why))
+                _log.warning("%s does not reach a node: %s", own.topic, why)
 
     def close(self) -> None:
         """End the node."""
@@ -336,6 +364,9 @@ class _Endpoint:
     """Whether the executor waits for it."""
     destroyer = ""
     """What the node destroys a handle with."""
+    lister = ""
+    """What the node lists the other ends of the topic with."""
+    qos = Qos()
 
     def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
         self.topic = topic
@@ -358,6 +389,7 @@ class RclpyPublisher(_Endpoint):
 
     is_waited_for = False
     destroyer = "destroy_publisher"
+    lister = "get_subscriptions_info_by_topic"
 
     @property
     def subscriber_count(self) -> int:
@@ -381,9 +413,26 @@ class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
     destroyer = "destroy_subscription"
+    lister = "get_publishers_info_by_topic"
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
+
+    def take(self, message: bytes) -> None:
+        """Deliver a message, and those that have come meanwhile.
+
+        An executor spends most of its time on waiting: in this way one that falls behind catches up.
+        """
+        self.deliver(message)
+        waiting = self.handle
+        if waiting is None:
+            return
+        with waiting.handle:
+            for _ in range(_TAKE_COUNT_MAX):
+                taken = waiting.handle.take_message(waiting.msg_type, True)
+                if taken is None:
+                    break
+                self.deliver(taken[0])
 
     @property
     def publisher_count(self) -> int:
@@ -428,6 +477,20 @@ def _interface(type_name: str) -> Any:
             f"unknown ROS type {type_name!r}: the package {package} of this ROS installation has none, or is "
             f"not installed (apt install ros-$ROS_DISTRO-{package.replace('_', '-')})"
         ) from None
+
+
+def _no_events(kind: str) -> Any:
+    """Return callbacks for no events: for each, whether it comes or not, every wait takes 5 us longer."""
+    try:
+        module = importlib.import_module("rclpy.event_handler")
+    except ImportError:  # Humble
+        module = importlib.import_module("rclpy.qos_event")
+    return getattr(module, kind)(use_default_callbacks=False)
+
+
+def _qos_of(endpoint: Any) -> Qos:
+    found = endpoint.qos_profile
+    return Qos(reliability=found.reliability.name.lower(), durability=found.durability.name.lower())
 
 
 def _profile(qos: Qos) -> Any:

@@ -12,15 +12,15 @@ from neurosim_core.install import install_hint
 
 if TYPE_CHECKING:
     from neurosim_core.learn.env import Env, make_env
-    from neurosim_core.learn.episodes import StartConfig
+    from neurosim_core.learn.episodes import Randomisation, StartConfig
     from neurosim_core.learn.surfaces import Counts, LeakySurface, TimeSurface, VoxelGrid
-    from neurosim_core.learn.task import Randomisation, Task, View
+    from neurosim_core.learn.task import Task, View
 
 _HOMES = {
     "neurosim_core.learn.env": ("Env", "make_env"),
-    "neurosim_core.learn.episodes": ("StartConfig",),
+    "neurosim_core.learn.episodes": ("Randomisation", "StartConfig"),
     "neurosim_core.learn.surfaces": ("Counts", "LeakySurface", "TimeSurface", "VoxelGrid"),
-    "neurosim_core.learn.task": ("Randomisation", "Task", "View"),
+    "neurosim_core.learn.task": ("Task", "View"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, avoid, depth, flow, pretrain, or `eval`")
+    learn.add_argument("what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain, or `eval`")
     learn.add_argument(
         "run", nargs="?", type=Path, metavar="RUN", help="for `eval`: folder of a run, or depth.pt, ..."
     )

@@ -46,6 +46,10 @@ class DaggerConfig:
     hint_weight: float = 2.0
     """Of the error of the estimated velocity, against that of the action."""
     gradient_max: float = 1.0
+    hidden: int = 128
+    """Width of the student's GRU,"""
+    widths: tuple[int, ...] = (32, 48, 48, 48, 48)
+    """and channels of its convolutions."""
 
 
 class Dagger:
@@ -66,10 +70,11 @@ class Dagger:
         vector = env.group(self._now, "student")
         _, channels, height, width = self._now["events"].shape
         hints = self._now[env.task.hint].shape[1]
-        self.policy = EventPolicy(channels, height, width, vector.shape[1], hint_count=hints).to(env.device)
+        sizes: dict[str, Any] = {"hint_count": hints, "hidden": config.hidden, "widths": config.widths}
+        self.policy = EventPolicy(channels, height, width, vector.shape[1], **sizes).to(env.device)
         if env.device.type == "cuda":
             self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
+        self.descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
         self._pushed = torch.zeros((env.num_envs, 4), device=env.device)
@@ -100,15 +105,6 @@ class Dagger:
         with torch.no_grad():
             log = self._fly(lead=lead)
         return log | self._learn(rate)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what training goes on from."""
-        return {"policy": self.policy.state_dict(), "optimizer": self._descent.optimizer.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        self.policy.load_state_dict(state["policy"])
-        self._descent.optimizer.load_state_dict(state["optimizer"])
 
     def _make_mirrors(self) -> None:
         """Let half of the worlds be seen in a mirror, if the task says how."""
@@ -199,7 +195,7 @@ class Dagger:
                 stretches, (config.batch,), generator=self._generator, device=self.env.device
             )
             self._rows.copy_(rows)
-            self._descent.step(rate)
+            self.descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()
         return {"imitation": imitation, "hint": hint}
 

@@ -88,6 +88,15 @@ class Descent:
                 group["lr"] = rate
         self._replayed()
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what training goes on from."""
+        return {"policy": self._module.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._module.load_state_dict(state["policy"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
     def _descend(self) -> None:
         loss = self._loss()
         self.optimizer.zero_grad(set_to_none=True)

@@ -13,14 +13,16 @@ import warp as wp
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
+    NO_RANDOMISATION,
     PARAMETERS,
     Episodes,
+    Randomisation,
     look_at_vehicles,
     make_routes,
     probe,
 )
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
-from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
+from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.scene_table import SceneSource
@@ -36,52 +38,6 @@ Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
 """Scenes, or those of a task to train in (`seen`) or to test in (`unseen`)."""
 
 StepResult = tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
-
-
-def make_env(
-    task: str | Task,
-    *,
-    worlds: int = 64,
-    device: str = "auto",
-    observe: Collection[str] | None = None,
-    surface: SurfaceConfig | None = None,
-    scenes: Scenes = "seen",
-    models: Sequence[Model] | None = None,
-    randomise: bool | Randomisation = True,
-    pixels: int | None = None,
-    seed: int = 0,
-) -> Env:
-    """Return a task in many worlds.
-
-    Args:
-        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
-        worlds: N.
-        device: Where everything is: auto, cpu, cuda:0.
-        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
-        surface: How events are shown; None: as the task says.
-        scenes: Where to fly.
-        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
-        randomise: Draw parameters anew in each episode; as the task says, or as told.
-        pixels: Width and height of the event camera [px]; None: as the task says.
-        seed: Of world 0; world i has seed + i.
-
-    Raises:
-        ValueError: There is no such task, or a setting is not for worlds.
-    """
-    chosen = find_task(task) if isinstance(task, str) else task
-    if pixels is not None:
-        chosen.camera = {**chosen.camera, "width": pixels, "height": pixels}
-    return Env(
-        chosen,
-        worlds=worlds,
-        device=device,
-        observe=observe,
-        surface=surface,
-        scenes=scenes,
-        models=models,
-        randomise=randomise,
-        seed=seed,
-    )
 
 
 def find_task(name: str) -> Task:
@@ -104,7 +60,19 @@ class Env:
     nor brings anything to the host; on a CPU it skips what no world needs.
 
     Args:
-        task: What to do; the other arguments are those of `make_env`.
+        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
+        worlds: N.
+        device: Where everything is: auto, cpu, cuda:0.
+        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
+        surface: How events are shown; None: as the task says.
+        scenes: Where to fly.
+        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
+        randomise: Draw parameters anew in each episode; as the task says, or as told.
+        pixels: Width and height of the event camera [px]; None: as the task says.
+        seed: Of world 0; world i has seed + i.
+
+    Raises:
+        ValueError: There is no such task, or a setting is not for worlds.
 
     Attributes:
         task: What is done.
@@ -119,7 +87,7 @@ class Env:
 
     def __init__(
         self,
-        task: Task,
+        task: str | Task,
         *,
         worlds: int = 64,
         device: str = "auto",
@@ -128,9 +96,12 @@ class Env:
         scenes: Scenes = "seen",
         models: Sequence[Model] | None = None,
         randomise: bool | Randomisation = True,
+        pixels: int | None = None,
         seed: int = 0,
     ) -> None:
-        self.task = task
+        self.task = task = find_task(task) if isinstance(task, str) else task
+        if pixels is not None:
+            task.camera = {**task.camera, "width": pixels, "height": pixels}
         self._observe = None if observe is None else frozenset(observe)
         sees = observe is None or "events" in observe
         if isinstance(scenes, str):
@@ -181,6 +152,7 @@ class Env:
         latency = self.randomisation.latency_steps
         self._queue = torch.zeros((latency + 1, worlds, 4), device=self.device)
         self._queue_place = 0
+        self._lagging = torch.zeros((worlds, 4), device=self.device)
         self._each = torch.arange(worlds, device=self.device)
         self.view = self._make_view()
         self._seed = seed
@@ -205,6 +177,7 @@ class Env:
         low, high = self.randomisation.thrust_factor
         found["thrust_factor"] = low + (high - low) * self.view.draws[:, -1]
         found["latency_steps"] = self._latency()
+        found["lag_s"] = self._lag_s()
         if self._surface is not None:
             thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
             found["threshold_factor"] = thresholds / self.task.threshold
@@ -285,25 +258,14 @@ class Env:
         """Begin episodes in the worlds of the mask."""
         episodes, view = self._episodes, self.view
         episodes.begin(self._mask_array)
-        factor = self.randomisation.threshold_factor
-        if self._surface is not None and factor != (1.0, 1.0):
-            threshold = self.task.threshold
-            episodes.scale_thresholds(
-                self._mask_array,
-                self.sim.thresholds(CAMERA),
-                nominal=(threshold, threshold),
-                factor=factor,
-            )
         drawn = self.randomisation
-        if drawn.airframes_differ:
-            episodes.vary_airframes(
-                self._mask_array,
-                self.sim.airframes,
-                mass=drawn.mass_factor,
-                inertia=drawn.inertia_factor,
-                drag=drawn.drag_factor,
-                wind_max_m_s=drawn.wind_m_s,
+        if self._surface is not None and drawn.threshold_factor != (1.0, 1.0):
+            thresholds = self.sim.thresholds(CAMERA)
+            episodes.scale_thresholds(
+                self._mask_array, thresholds, nominal=self.task.threshold, factor=drawn.threshold_factor
             )
+        if drawn.airframes_differ:
+            episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )
@@ -313,6 +275,7 @@ class Env:
         hover = torch.zeros(4, device=self.device)
         hover[0] = view.vehicle.hover_thrust_n
         self._queue = torch.where(mask, hover, self._queue)
+        self._lagging = torch.where(mask, hover, self._lagging)
         self.episode_length.masked_fill_(self._mask, 0)
         view.elapsed_s.masked_fill_(self._mask, 0.0)
         if self._surface is not None:
@@ -339,12 +302,24 @@ class Env:
         command = command.clone()
         command[:, 0] *= low + (high - low) * draws[:, -1]
         length = self._queue.shape[0]
-        if length == 1:
-            return command
-        self._queue[self._queue_place] = command
-        chosen = self._queue[(self._queue_place - self._latency()) % length, self._each]
-        self._queue_place = (self._queue_place + 1) % length
-        return chosen
+        if length > 1:
+            self._queue[self._queue_place] = command
+            command = self._queue[(self._queue_place - self._latency()) % length, self._each]
+            self._queue_place = (self._queue_place + 1) % length
+        return command if self.randomisation.lag_s == (0.0, 0.0) else self._lagged(command)
+
+    def _lagged(self, command: torch.Tensor) -> torch.Tensor:
+        """Return the mean over the step of what follows the commands, first-order."""
+        share = (self._lag_s() / self.view.step_s)[:, None]
+        keep = torch.exp(-1.0 / share)
+        behind = self._lagging - command
+        self._lagging = command + keep * behind
+        return command + share * (1.0 - keep) * behind
+
+    def _lag_s(self) -> torch.Tensor:
+        """Return the time constant of each episode [s], [N]."""
+        low, high = self.randomisation.lag_s
+        return (low + (high - low) * self.view.draws[:, -3]).clamp(min=1e-6)
 
     def _latency(self) -> torch.Tensor:
         """Return the steps from an action to its effect in each episode, int64, [N]."""
@@ -352,24 +327,10 @@ class Env:
         return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
     def _look(self, observation: Any) -> None:
-        look_at_vehicles(
-            self._rows,
-            observation,
-            self._episodes,
-            fields=self.sim.fields,
-            scene_of_world=self.sim.scene_of_world,
-            gyro_bias_rad_s=self.randomisation.gyro_bias_rad_s,
-            gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
-            gravity_noise=self.randomisation.gravity_noise,
-        )
+        where = {"fields": self.sim.fields, "scene_of_world": self.sim.scene_of_world}
+        look_at_vehicles(self._rows, observation, self._episodes, **where, drawn=self.randomisation)
         if self.task.probes:
-            probe(
-                self._distances_array,
-                self._probes,
-                self._rows,
-                fields=self.sim.fields,
-                scene_of_world=self.sim.scene_of_world,
-            )
+            probe(self._distances_array, self._probes, self._rows, **where)
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)
@@ -380,6 +341,8 @@ class Env:
         return View(
             **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
             probes=self._distances,
+            scenes=[model.config.scene for model in self.sim.models],
+            scene=wp.to_torch(self.sim.scene_of_world).long(),
             surface=None if self._surface is None else wp.to_torch(self._surface.array),
             action=torch.zeros((worlds, 4), device=self.device),
             last_action=torch.zeros((worlds, 4), device=self.device),
@@ -393,6 +356,10 @@ class Env:
     def _observations(self) -> Observations:
         seen = self.task.observe(self.view)
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
+
+
+make_env = Env
+"""The function that users call."""
 
 
 def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, Any]:

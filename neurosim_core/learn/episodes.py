@@ -63,6 +63,51 @@ class StartConfig:
     """Whether heading and velocity point at the goal, levelly."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Randomisation:
+    """What differs from episode to episode and from world to world, besides where it begins."""
+
+    thrust_factor: tuple[float, float] = (0.9, 1.1)
+    """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
+    latency_steps: int = 1
+    """Most steps between an action and its effect; each episode has its own, from 0 on."""
+    lag_s: tuple[float, float] = (0.0, 0.0)
+    """Range of the time constant with which thrust and rates follow their commands [s]: slower motors, say,
+    than those of the vehicle, whose own lag is there besides."""
+    threshold_factor: tuple[float, float] = (0.8, 1.25)
+    """Range of each threshold of the event camera against the nominal one."""
+    mass_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the mass; with the inertia of the same shape."""
+    inertia_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the inertia besides."""
+    drag_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of rotor drag and parasitic drag."""
+    wind_m_s: float = 0.0
+    """Strongest wind, level and constant in an episode [m/s]; if > 0, in place of the vehicle's."""
+    gyro_bias_rad_s: float = 0.0
+    """Largest bias of the gyroscope about each axis, constant in an episode [rad/s]."""
+    gyro_noise_rad_s: float = 0.02
+    """Standard deviation of the gyroscope [rad/s]."""
+    gravity_noise: float = 0.01
+    """Standard deviation of each part of the measured direction of gravity."""
+
+    @property
+    def airframes_differ(self) -> bool:
+        """Mass, inertia, drag or wind are drawn."""
+        factors = self.mass_factor, self.inertia_factor, self.drag_factor
+        return self.wind_m_s > 0.0 or any(factor != (1.0, 1.0) for factor in factors)
+
+
+NO_RANDOMISATION = Randomisation(
+    thrust_factor=(1.0, 1.0),
+    latency_steps=0,
+    threshold_factor=(1.0, 1.0),
+    gyro_noise_rad_s=0.0,
+    gravity_noise=0.0,
+)
+"""All worlds are as configured."""
+
+
 @wp.struct
 class _Start:
     speed: wp.vec2
@@ -186,7 +231,7 @@ def _look(
 @wp.kernel
 def _scale_thresholds(
     # Model:
-    nominal: wp.vec2d,
+    nominal: wp.float64,
     low: wp.float32,
     high: wp.float32,
     # In:
@@ -200,7 +245,7 @@ def _scale_thresholds(
         u = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(4), 0))
         on = wp.float64(low + (high - low) * u[0])
         off = wp.float64(low + (high - low) * u[1])
-        thresholds_out[world] = wp.vec2d(on * nominal[0], off * nominal[1])
+        thresholds_out[world] = nominal * wp.vec2d(on, off)
 
 
 @wp.struct
@@ -366,18 +411,14 @@ class Episodes:
         self,
         mask: Any,
         airframes: Any,
-        *,
-        mass: tuple[float, float],
-        inertia: tuple[float, float],
-        drag: tuple[float, float],
-        wind_max_m_s: float,
+        drawn: Randomisation,
     ) -> None:
         """Draw the airframes of the worlds of a mask: factors on those of the first call, and a wind."""
         if self._nominal is None:
             self._nominal = wp.clone(airframes[:1])
         ranges = _Ranges()
-        ranges.mass, ranges.inertia, ranges.drag = wp.vec2(*mass), wp.vec2(*inertia), wp.vec2(*drag)
-        ranges.wind_max = wind_max_m_s
+        ranges.mass, ranges.inertia = wp.vec2(*drawn.mass_factor), wp.vec2(*drawn.inertia_factor)
+        ranges.drag, ranges.wind_max = wp.vec2(*drawn.drag_factor), drawn.wind_m_s
         wp.launch(
             _vary_airframes,
             dim=len(self.seeds),
@@ -387,13 +428,13 @@ class Episodes:
         )
 
     def scale_thresholds(
-        self, mask: Any, thresholds: Any, *, nominal: tuple[float, float], factor: tuple[float, float]
+        self, mask: Any, thresholds: Any, *, nominal: float, factor: tuple[float, float]
     ) -> None:
         """Draw thresholds of an event camera for the worlds of a mask: a factor on each polarity."""
         wp.launch(
             _scale_thresholds,
             dim=len(self.seeds),
-            inputs=[wp.vec2d(*nominal), *factor, mask, self.seeds],
+            inputs=[nominal, *factor, mask, self.seeds],
             outputs=[thresholds],
             device=self._device,
         )
@@ -406,9 +447,7 @@ def look_at_vehicles(
     *,
     fields: Any,
     scene_of_world: Any,
-    gyro_bias_rad_s: float,
-    gyro_noise_rad_s: float,
-    gravity_noise: float,
+    drawn: Randomisation,
 ) -> None:
     """Write what is known of the vehicles of all worlds, in float32; launches only.
 
@@ -418,9 +457,7 @@ def look_at_vehicles(
         episodes: Their seeds address the noise; and where to go.
         fields: Distance to each scene, array of `DistanceField`.
         scene_of_world: Index of the scene of each world.
-        gyro_bias_rad_s: Largest bias of the gyroscope about each axis [rad/s].
-        gyro_noise_rad_s: Standard deviation of the gyroscope [rad/s].
-        gravity_noise: Standard deviation of each part of the measured direction of gravity.
+        drawn: What gyroscope and attitude are measured with.
     """
     state = observation.state
     moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
@@ -430,9 +467,9 @@ def look_at_vehicles(
         inputs=[
             fields,
             scene_of_world,
-            gyro_bias_rad_s,
-            gyro_noise_rad_s,
-            gravity_noise,
+            drawn.gyro_bias_rad_s,
+            drawn.gyro_noise_rad_s,
+            drawn.gravity_noise,
             episodes.seeds,
             *moving,
             episodes.goal,

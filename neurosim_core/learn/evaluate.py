@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from scipy.stats import binomtest
 
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
@@ -40,16 +40,6 @@ class Evaluation:
 
 
 _SAID = ("success", "crash", "speed_m_s")
-
-
-def wilson(share: float, count: int, *, z: float = 1.959964) -> tuple[float, float]:
-    """Return the interval in which the probability behind a share of `count` trials lies, by default of 95 %.
-
-    Reference: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
-    """
-    middle, weight = share + 0.5 * z * z / count, 1.0 + z * z / count
-    half = z * math.sqrt(share * (1.0 - share) / count + 0.25 * (z / count) ** 2)
-    return max((middle - half) / weight, 0.0), min((middle + half) / weight, 1.0)
 
 
 def student_actor(policy: EventPolicy, env: Env, *, blind: bool = False) -> Actor:
@@ -105,5 +95,11 @@ def evaluate(
         episodes=env.num_envs,
         metrics=metrics,
         speeds=speeds,
-        intervals={name: wilson(metrics[name], env.num_envs) for name in ("success", "crash")},
+        intervals={name: _interval(found[name]) for name in ("success", "crash")},
     )
+
+
+def _interval(happened: torch.Tensor) -> tuple[float, float]:
+    """Return the 95 % interval of the probability of what is 1 where it happened."""
+    low, high = binomtest(int(happened.sum()), len(happened)).proportion_ci(0.95, method="wilson")
+    return float(low), float(high)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -80,6 +81,7 @@ class EventPolicy(nn.Module):
         action_count: Numbers in an action.
         hint_count: Numbers that it estimates, at least 1.
         hidden: Width of the GRU.
+        widths: Channels of the convolutions, of which as many are used as halve the picture to 4x4.
     """
 
     def __init__(
@@ -91,9 +93,10 @@ class EventPolicy(nn.Module):
         action_count: int = 4,
         hint_count: int = 3,
         hidden: int = 128,
+        widths: Sequence[int] = (32, 48, 48, 48, 48),
     ) -> None:
         super().__init__()
-        self.shape = {
+        self.shape: dict[str, Any] = {
             "channels": channels,
             "height": height,
             "width": width,
@@ -101,11 +104,12 @@ class EventPolicy(nn.Module):
             "action_count": action_count,
             "hint_count": hint_count,
             "hidden": hidden,
+            "widths": tuple(widths),
         }
         self.memory_size, self.hidden = hidden + hint_count, hidden
         convolutions: list[nn.Module] = []
         rows, columns, inputs, size = height, width, channels, 5
-        for outputs in (32, 48, 48, 48, 48):
+        for outputs in widths:
             convolutions += [nn.Conv2d(inputs, outputs, size, stride=2, padding=size // 2), nn.ELU()]
             rows, columns, inputs, size = -(-rows // 2), -(-columns // 2), outputs, 3
             if max(rows, columns) <= 4:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -49,7 +48,7 @@ class Ppo:
         observations, _ = env.reset()
         sizes = [env.group(observations, name).shape[1] for name in ("actor", "critic")]
         self.policy = ActorCritic(*sizes).to(env.device)
-        self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max, eps=1e-5)
+        self.descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max, eps=1e-5)
         self._batch: dict[str, torch.Tensor] = {}
         size = config.horizon * env.num_envs // config.minibatches
         self._rows = torch.zeros(size, dtype=torch.int64, device=env.device)
@@ -73,15 +72,6 @@ class Ppo:
             batch, log = self._fly()
         self._learn(batch, self.config.learning_rate * (1.0 - 0.9 * done))
         return log
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what training goes on from."""
-        return {"policy": self.policy.state_dict(), "optimizer": self._descent.optimizer.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        self.policy.load_state_dict(state["policy"])
-        self._descent.optimizer.load_state_dict(state["optimizer"])
 
     def _seen(self, observations: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         return self.env.group(observations, "actor"), self.env.group(observations, "critic")
@@ -147,7 +137,7 @@ class Ppo:
             order = torch.randperm(len(advantage), generator=self._generator, device=advantage.device)
             for rows in order.split(len(self._rows))[: self.config.minibatches]:
                 self._rows.copy_(rows)
-                self._descent.step(rate)
+                self.descent.step(rate)
 
     def _loss(self) -> torch.Tensor:
         """Return the loss of the rows of the batch that `_rows` names."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import Routes, StartConfig
+from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.vehicle import MultirotorConfig
@@ -18,48 +18,6 @@ MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
 
 Observations = dict[str, torch.Tensor]
 """What is observed, by name: float32, shape [N, ...]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Randomisation:
-    """What differs from episode to episode and from world to world, besides where it begins."""
-
-    thrust_factor: tuple[float, float] = (0.9, 1.1)
-    """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
-    latency_steps: int = 1
-    """Most steps between an action and its effect; each episode has its own, from 0 on."""
-    threshold_factor: tuple[float, float] = (0.8, 1.25)
-    """Range of each threshold of the event camera against the nominal one."""
-    mass_factor: tuple[float, float] = (1.0, 1.0)
-    """Range of the mass; with the inertia of the same shape."""
-    inertia_factor: tuple[float, float] = (1.0, 1.0)
-    """Range of the inertia besides."""
-    drag_factor: tuple[float, float] = (1.0, 1.0)
-    """Range of rotor drag and parasitic drag."""
-    wind_m_s: float = 0.0
-    """Strongest wind, level and constant in an episode [m/s]; if > 0, in place of the vehicle's."""
-    gyro_bias_rad_s: float = 0.0
-    """Largest bias of the gyroscope about each axis, constant in an episode [rad/s]."""
-    gyro_noise_rad_s: float = 0.02
-    """Standard deviation of the gyroscope [rad/s]."""
-    gravity_noise: float = 0.01
-    """Standard deviation of each part of the measured direction of gravity."""
-
-    @property
-    def airframes_differ(self) -> bool:
-        """Mass, inertia, drag or wind are drawn."""
-        factors = self.mass_factor, self.inertia_factor, self.drag_factor
-        return self.wind_m_s > 0.0 or any(factor != (1.0, 1.0) for factor in factors)
-
-
-NO_RANDOMISATION = Randomisation(
-    thrust_factor=(1.0, 1.0),
-    latency_steps=0,
-    threshold_factor=(1.0, 1.0),
-    gyro_noise_rad_s=0.0,
-    gravity_noise=0.0,
-)
-"""All worlds are as configured."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -91,6 +49,10 @@ class View:
     """Distance from the centre to the scene [m], to a voxel, [N, 1]."""
     probes: torch.Tensor
     """Distance to the scene of the points `Task.probes` [m], to a voxel, [N, K]."""
+    scenes: Sequence[SceneConfig]
+    """Settings of the scenes."""
+    scene: torch.Tensor
+    """Which of them each world is in, int64, [N]."""
     surface: torch.Tensor | None
     """Event surface, [N, C, H, W]; None: there is no camera."""
     action: torch.Tensor

@@ -129,8 +129,8 @@ class Training:
             FileNotFoundError: There is none.
         """
         state = torch.load(self.folder / "checkpoint.pt", map_location=self.env.device, weights_only=True)
-        self._teacher.load_state_dict(state["teacher"])
-        self._student.load_state_dict(state["student"])
+        self._teacher.descent.load_state_dict(state["teacher"])
+        self._student.descent.load_state_dict(state["student"])
         self._generator.set_state(state["generator"].cpu())
         self._done = state["done"]
 
@@ -174,8 +174,8 @@ class Training:
         partial = file.with_suffix(".part")
         torch.save(
             {
-                "teacher": self._teacher.state_dict(),
-                "student": self._student.state_dict(),
+                "teacher": self._teacher.descent.state_dict(),
+                "student": self._student.descent.state_dict(),
                 "shape": self.student.shape,
                 "generator": self._generator.get_state(),
                 "done": self._done,
@@ -205,12 +205,12 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     if not find_device(device).startswith("cuda"):
         small = PpoConfig(**teacher), DaggerConfig(**student)
         return dataclasses.replace(config, teacher=small[0], student=small[1], pixels=24)
-    many = {"worlds": 1024, "iterations": 80, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 84, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=40,
+        block=42,
         evaluation_worlds=512,
     )
 

@@ -91,12 +91,13 @@ def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Mo
 
     Args:
         model: What was made before.
-        config: Its scene, vehicle, device and renderer are those of `model`, or are not looked at.
+        config: Its vehicle, device and renderer are those of `model`; its scene is not looked at.
         replan: Fly the path of `config`; else that of `model`.
 
     Raises:
         ValueError: No path exists.
     """
+    config = config.model_copy(update={"scene": model.config.scene})
     return _make_member(
         config,
         model.device,

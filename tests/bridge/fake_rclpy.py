@@ -5,6 +5,7 @@ Nodes of the same domain reach each other. Messages are carried as they are seri
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import inspect
 import sys
@@ -44,6 +45,11 @@ class DurabilityPolicy(enum.IntEnum):
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
     UNKNOWN = 3
+
+
+class EventCallbacks:
+    def __init__(self, *, use_default_callbacks: bool = True) -> None:
+        assert not use_default_callbacks, "the fake has no events"
 
 
 class SignalHandlerOptions(enum.IntEnum):
@@ -198,6 +204,7 @@ class Subscription:
         self.node, self.msg_type, self.topic, self.callback = node, msg_type, topic, callback
         self.qos_profile = qos
         self.waiting: deque[bytes] = deque(maxlen=qos.depth)
+        self.handle = Taker(self)
 
     destroyed = False
 
@@ -205,6 +212,21 @@ class Subscription:
         with self.node.context.wake:
             self.waiting.append(msg)
             self.node.context.wake.notify_all()
+
+
+class Taker(contextlib.nullcontext[None]):
+    """What a subscription takes its messages from; nothing destroys it within a `with`."""
+
+    def __init__(self, subscription: Subscription) -> None:
+        super().__init__()
+        self.subscription = subscription
+
+    def take_message(self, msg_type: type, raw: bool) -> tuple[bytes, dict[str, int]] | None:
+        """Return the oldest message that waits, and what is known about it."""
+        assert raw, "the fake does not deserialise"
+        assert msg_type is self.subscription.msg_type
+        with self.subscription.node.context.wake:
+            return (self.subscription.waiting.popleft(), {}) if self.subscription.waiting else None
 
 
 class Service:
@@ -307,6 +329,12 @@ class Node:
 
     def count_subscribers(self, topic_name: str) -> int:
         return sum(one.topic == topic_name for node in self.world for one in node.subs)
+
+    def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Publisher]:
+        return [one for node in self.world for one in node.pubs if one.topic == topic_name]
+
+    def get_subscriptions_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Subscription]:
+        return [one for node in self.world for one in node.subs if one.topic == topic_name]
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         found: dict[str, set[str]] = {}
@@ -428,6 +456,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
             "HistoryPolicy": HistoryPolicy,
             "ReliabilityPolicy": ReliabilityPolicy,
             "DurabilityPolicy": DurabilityPolicy,
+        },
+        "rclpy.event_handler": {
+            "PublisherEventCallbacks": EventCallbacks,
+            "SubscriptionEventCallbacks": EventCallbacks,
         },
         "rclpy.signals": {"SignalHandlerOptions": SignalHandlerOptions},
         "std_msgs": {},

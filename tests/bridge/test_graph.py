@@ -237,6 +237,9 @@ def test_environment_of_ros_becomes_configuration(monkeypatch: pytest.MonkeyPatc
     }
     assert settings("humble", ROS_LOCALHOST_ONLY="1") == only
     assert settings("humble", ROS_LOCALHOST_ONLY="0") == INDEX
+    unknown_to_it = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "host"}
+    assert settings("humble", **unknown_to_it) == INDEX
+    assert settings("humble", ROS_LOCALHOST_ONLY="1", **unknown_to_it) == only
     off = settings(ROS_AUTOMATIC_DISCOVERY_RANGE="OFF", ROS_STATIC_PEERS="host")
     assert off.pop("Discovery/Tag").startswith("ros_discovery_off_")
     assert off == {"General/AllowMulticast": "false", "Discovery/ParticipantIndex": "none"}

@@ -82,6 +82,32 @@ def test_messages_go_both_ways(make: Any) -> None:
         publisher.publish(text("late"))
 
 
+def test_what_has_waited_comes_in_its_order_and_once(make: Any) -> None:
+    """More than is taken in one turn, and beside a topic that is never silent."""
+    node, other = make(), make(node_name="other")
+    got: dict[str, list[bytes]] = {"/words": [], "/others": []}
+    busy, go_on = threading.Event(), threading.Event()
+
+    def callback(message: bytes) -> None:
+        busy.set()
+        assert go_on.wait(10.0)
+        got["/words"].append(message)
+
+    publishers = [node.publisher(topic, STRING, Qos(depth=500)) for topic in got]
+    other.subscription("/words", STRING, Qos(depth=500), callback)
+    other.subscription("/others", STRING, Qos(depth=500), got["/others"].append)
+    wait_for(lambda: all(publisher.subscriber_count == 1 for publisher in publishers))
+    words = [text(f"{number:03}") for number in range(200)]
+    publishers[0].publish(words[0])
+    assert busy.wait(10.0)
+    for word in words[1:]:
+        publishers[0].publish(word)
+        publishers[1].publish(word)
+    go_on.set()
+    wait_for(lambda: (len(got["/words"]), len(got["/others"])) == (200, 199))
+    assert [message[: len(words[0])] for message in got["/words"]] == words
+
+
 def test_who_comes_late_gets_what_is_latched(make: Any) -> None:
     node, other = make(), make(node_name="other")
     latched = Qos(durability="transient_local", depth=1)
@@ -92,6 +118,22 @@ def test_who_comes_late_gets_what_is_latched(make: Any) -> None:
     other.subscription("/words", STRING, latched, got.append)
     wait_for(lambda: got)
     assert [message[8:9] for message in got] == [b"b"]
+
+
+def test_what_does_not_meet_is_said_once(make: Any, caplog: pytest.LogCaptureFixture) -> None:
+    node, other = make(), make(node_name="other")
+    node.publisher("/effort", STRING, Qos(reliability="best_effort"))
+    node.publisher("/fitting", STRING, Qos(durability="transient_local"))
+    node.subscription("/latched", STRING, Qos(durability="transient_local"), print)
+    other.subscription("/effort", STRING, Qos(), print)
+    other.subscription("/fitting", STRING, Qos(reliability="best_effort"), print)
+    other.publisher("/latched", STRING, Qos())
+    wait_for(lambda: node.topics() and len(caplog.records) >= 2)
+    wait_for(lambda: {topic.topic for topic in node.topics()} >= {"/effort", "/fitting", "/latched"})
+    assert sorted(record.getMessage() for record in caplog.records) == [
+        "/effort does not reach a node: its subscriber wants it reliable, its publisher is not",
+        "/latched does not reach a node: its subscriber wants it transient local, its publisher is volatile",
+    ]
 
 
 def test_a_callback_that_raises_does_not_end_the_node(make: Any, caplog: pytest.LogCaptureFixture) -> None:

@@ -150,7 +150,8 @@ def total(batch):
 if __name__ == "__main__":
     expected = [total(batch) for batch in data.Stream(sys.argv[1], batch=8)]
     config = {"duration_s": 0.01, "device": "cpu", "renderer": "synthetic", "path": {"kind": "hover"},
-              "scene": {"kind": "apartment", "rooms": 1}, "render": {"lighting": {"mode": "unshadowed"}}}
+              "scene": {"kind": "apartment", "rooms": 1},
+              "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}}
     assert list(ns.run(config))  # Warp has been started
     loader = data.Loader(sys.argv[1], batch=8, workers=2, transform=total)
     assert [*loader] == [*loader] == expected

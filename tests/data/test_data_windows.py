@@ -131,7 +131,7 @@ CONFIG = {
     "duration_s": 0.2,
     "device": "cpu",
     "scene": {"kind": "apartment", "rooms": 1},
-    "render": {"lighting": {"mode": "unshadowed"}},
+    "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "sensors": {
         "cam": {"kind": "event_camera", "lens": LENS},
         "depth": {"kind": "depth", "rate_hz": 20.0, "lens": LENS},

@@ -202,6 +202,22 @@ def test_a_mass_that_is_drawn_is_the_mass_that_flies(make):
     assert not torch.equal(env.parameters["mass_factor"], factor)
 
 
+def test_thrust_follows_its_command_with_the_lag_that_is_drawn(make):
+    """After a step of a g in thrust the vehicle climbs with a g (t - tau (1 - exp(-t / tau)))."""
+    task = calm()
+    env = make(8, task, observe=["state"], randomise=still(lag_s=(0.02, 0.1)))
+    for _ in range(2):  # the second episode does not go on from what lagged in the first
+        env.reset(seed=1)
+        for _ in range(10):
+            env.step(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(8, 1))
+        lag, time_s = env.parameters["lag_s"], 10 * env.view.step_s
+        assert 0.02 <= lag.min() < lag.max() <= 0.1
+        assert lag.std() > 0.005
+        expected = 9.81 * task.thrust_span * (time_s - lag * (1.0 - torch.exp(-time_s / lag)))
+        # inflow takes 0.9 v a second, which is 8 %, and the motors' own lag 5 ms of 110
+        torch.testing.assert_close(env.view.velocity[:, 2], expected, rtol=0.13, atol=0.0)
+
+
 def test_a_wind_that_is_drawn_blows_in_proportion_to_the_drag(make):
     """At rest and level the acceleration is k (v_wind - v) / m, with the drag k that is drawn."""
     env = make(8, calm(), observe=["state"], randomise=still(drag_factor=(0.5, 2.0), wind_m_s=1.0))

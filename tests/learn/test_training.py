@@ -14,7 +14,7 @@ from neurosim_core.registry import register
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor, wilson  # noqa: E402
+from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
@@ -168,15 +168,6 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
     assert "0 % success (0 to 39)" in str(first)  # 1 - 1.96^2 / (6 + 1.96^2) of all might have failed
     del training
-
-
-@pytest.mark.parametrize(("successes", "count"), [(0, 10), (1, 10), (7, 9), (490, 512), (20, 20)])
-def test_an_interval_of_a_share_is_that_of_the_score_test(successes, count):
-    """Its ends are the probabilities that a share lies 1.96 standard deviations from."""
-    from scipy.stats import binomtest
-
-    expected = binomtest(successes, count).proportion_ci(0.95, method="wilson")
-    assert wilson(successes / count, count) == pytest.approx(tuple(expected), abs=1e-7)  # z has seven digits
 
 
 def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):

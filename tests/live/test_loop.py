@@ -54,7 +54,7 @@ SETTINGS: dict[str, Any] = {
             "motion": {"position_m": [-0.6, 0.0, 1.4], "orbit": {"rate_hz": 3.0}, "spin_rad_s": [0, 0, 9]},
         }
     },
-    "render": {"lighting": {"mode": "unshadowed"}},
+    "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "vehicle": {"on_collision": "report"},
     "path": {"kind": "circle", "ramp_s": 0.3, "speed_max_m_s": 3.0},
     "control": {"rate_hz": 200},

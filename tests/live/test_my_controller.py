@@ -23,7 +23,7 @@ SETTINGS: dict[str, Any] = {
     "duration_s": 1.5,
     "device": "cpu",
     "scene": {"kind": "apartment", "rooms": 2},
-    "render": {"lighting": {"mode": "unshadowed"}},
+    "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "vehicle": {"on_collision": "report"},
     "path": {"kind": "hover"},
     "sensors": {

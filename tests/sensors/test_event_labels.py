@@ -62,7 +62,7 @@ def settings(scene, labels, frames=AGILE, pixel=None, **more):
     return {
         "scene": scene, "duration_s": 0.15, "device": "cpu", "sensors": {"events": camera},
         "path": {"kind": "poses", "keyframes": frames},
-        "render": {"lighting": {"mode": "unshadowed"}}, **more,
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}, **more,
     }  # fmt: skip
 
 

@@ -21,7 +21,7 @@ def scene(tmp_path_factory):
 def fly(scene, sensors, **more):
     config = {
         "scene": scene, "duration_s": 0.1, "device": "cpu", "path": {"kind": "poses", "keyframes": STILL},
-        "render": {"lighting": {"mode": "unshadowed"}}, "sensors": sensors, **more,
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}, "sensors": sensors, **more,
     }  # fmt: skip
     found = {}
     for packet in ns.run(config):
@@ -121,7 +121,7 @@ def test_worlds_take_the_frames_of_single_runs_and_begin_anew(scene):
     sensor = camera(shot_noise=True, auto_exposure={"lag_s": 0.1})
     config = {
         "scene": scene, "duration_s": 0.1, "device": "cpu", "path": {"kind": "poses", "keyframes": STILL},
-        "render": {"lighting": {"mode": "unshadowed"}}, "sensors": {"frame": sensor},
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}, "sensors": {"frame": sensor},
         "control": {"rate_hz": 100.0}, "seed": 3,
     }  # fmt: skip
     alone = [p.data for p in ns.run(config) if isinstance(p, Image)]

@@ -23,7 +23,8 @@ def test_events_are_the_steps_of_log_radiance():
         "radiance": {"kind": "log_radiance", "lens": LENS, "rate_hz": 50},
         "depth": {"kind": "depth", "lens": LENS, "rate_hz": 10},
     }
-    config = {"duration_s": 0.2, "device": "cpu", "sensors": sensors}
+    scene = {"kind": "apartment", "rooms": 1}
+    config = {"duration_s": 0.2, "device": "cpu", "scene": scene, "sensors": sensors}
     total, first, seen = np.zeros((18, 24)), None, 0
     for packet in ns.run(config):
         if packet.sensor == "events":

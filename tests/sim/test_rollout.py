@@ -78,7 +78,7 @@ def settings(room: Path, device: str) -> dict[str, Any]:
             "unit_m": 1.0,
             "inside_m": [0.0, 0.0, 1.5],
         },
-        "render": {"lighting": {"mode": "unshadowed"}},
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
         "path": {"kind": "line", "start_m": [-1.0, 0.0, 1.5], "end_m": [1.0, 0.3, 1.4]},
         "sensors": SENSORS,
     }

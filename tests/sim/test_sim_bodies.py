@@ -38,7 +38,7 @@ def settings(room: Path, device: str, bodies: dict[str, Any], **changes: Any) ->
         "duration_s": 0.25,
         "device": device,
         "scene": lamps,
-        "render": {"lighting": {"mode": "unshadowed"}},
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
         "path": {"kind": "hover", "position_m": [0.0, 0.0, 0.0]},
         "bodies": bodies,
         "sensors": {

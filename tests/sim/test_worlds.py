@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from world_rig import RIG, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
+from world_rig import RIG, UNSHADOWED, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
 
 import neurosim_core as ns
 from neurosim_core.packets import Collision, Events
@@ -145,7 +145,7 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     front = {**RIG["front"], "sampling_rate_hz": 600}  # 6 instants: 4 together, then 2
     rig = {"front": front, "rgb": RIG["rgb"]}
     limit = 2 if "too much" in form else 256
-    walking = {"lighting": {"mode": "unshadowed"}, "candidate_lists": {"face_count_max": limit}}
+    walking = {**UNSHADOWED, "candidate_lists": {"face_count_max": limit}}
     commands = commands_of("rates", 4, 2)
     worlds = Simulation(settings(textured, sensors=rig, render=walking), worlds=2)
     seen = record(worlds, commands)
@@ -153,7 +153,7 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     left, left_room = int(walk.data.unresolved_count.numpy()[0]), walk.data.unresolved.shape[0]
     assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
     for world in range(2):
-        for render in (walking, {"lighting": {"mode": "unshadowed"}, "cpu_traversal": "warp"}):
+        for render in (walking, {**UNSHADOWED, "cpu_traversal": "warp"}):
             config = settings(textured, seed=7 + world, sensors=rig, render=render)
             for step, packets in enumerate(fly_alone(config, commands[:, world])):
                 assert_same(seen[step][world], packets)
@@ -197,7 +197,7 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
         given = {"parameters": {"front.lens.horizontal_fov_rad": [1.2, 1.5]}}
     made = [
         Simulation(
-            settings(plain, sensors=rig, render={"lighting": {"mode": "unshadowed"}, **walk}),
+            settings(plain, sensors=rig, render={**UNSHADOWED, **walk}),
             worlds=2,
             **given,
         )
@@ -530,7 +530,9 @@ def test_models_that_were_made_before(plain, textured):
     config = ns.load_config(settings(plain))
     models = [ns.make_model(ns.load_config(settings(path))) for path in (plain, textured)]
     commands = commands_of("rates", 2, 2)
-    seen = record(Simulation(config, worlds=2, models=models), commands)
+    simulation = Simulation(config, worlds=2, models=models)
+    assert [model.config.scene for model in simulation.models] == [model.config.scene for model in models]
+    seen = record(simulation, commands)
     for world, path in enumerate((plain, textured)):
         for step, packets in enumerate(fly_alone(settings(path, seed=7 + world), commands[:, world])):
             assert_same(seen[step][world], packets)
@@ -581,7 +583,7 @@ def test_more_than_32_bits_can_count(plain):
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
     with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
         Simulation(settings(plain, sensors=rig, control={"rate_hz": 100}), worlds=4096)
-    walking = {"lighting": {"mode": "unshadowed"}, "candidate_lists": {"face_count_max": 4096}}
+    walking = {**UNSHADOWED, "candidate_lists": {"face_count_max": 4096}}
     rig["front"]["lens"] = {**lens, "width": 128, "height": 128}
     with pytest.raises(ValueError, match=r"groups of instants of 256 tiles .* are more than 2.31"):
         Simulation(settings(plain, sensors=rig, render=walking), worlds=4096)

@@ -14,6 +14,7 @@ from neurosim_core.packets import Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.sim import StartState
 
 LENS = {"width": 36, "height": 28, "horizontal_fov_rad": 1.5}
+UNSHADOWED: dict[str, Any] = {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}
 RIG: dict[str, Any] = {
     "front": {
         "kind": "event_camera",
@@ -69,7 +70,7 @@ def settings(path: Path, device: str = "cpu", **changes: Any) -> dict[str, Any]:
         "seed": 7,
         "device": device,
         "scene": scene_of(path),
-        "render": {"lighting": {"mode": "unshadowed"}},
+        "render": UNSHADOWED,
         "path": {"kind": "hover", "position_m": [0.0, 0.0, 1.5]},
         "control": {"rate_hz": 100},
         "vehicle": {"on_collision": "report"},

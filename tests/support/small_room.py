@@ -50,7 +50,7 @@ def fly_in_room(path: Path, sensors: dict[str, Any], **changes: Any) -> list[Pac
         "scene": {
             "kind": "mesh", "file": str(path), "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 1.5],
         },
-        "render": {"lighting": {"mode": "unshadowed"}},
+        "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
         "path": {"kind": "hover", "position_m": [0.0, 0.0, 1.5]},
         "sensors": sensors,
         **changes,

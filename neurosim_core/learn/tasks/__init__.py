@@ -1,5 +1,5 @@
 """The tasks that come with the simulator; importing this registers them."""
 
-from neurosim_core.learn.tasks import avoid, hover, hover_paper
+from neurosim_core.learn.tasks import avoid, gates, hover, hover_paper
 
-__all__ = ["avoid", "hover", "hover_paper"]
+__all__ = ["avoid", "gates", "hover", "hover_paper"]

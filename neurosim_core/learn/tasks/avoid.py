@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurosim_core.learn.episodes import Routes, StartConfig
+from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
-from neurosim_core.learn.task import MIRROR_ACTION, Observations, Randomisation, Task, View
+from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 

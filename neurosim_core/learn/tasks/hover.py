@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.episodes import Randomisation, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
-from neurosim_core.learn.task import MIRROR_ACTION, Observations, Randomisation, Task, View
+from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
 from neurosim_core.registry import register
 
 SPEED_MAX_M_S = 0.2
@@ -30,7 +30,7 @@ class Hover(Task):
     episode_s = 5.0
     start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))
-    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 2.0))
+    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 3.0))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
     groups: Mapping[str, Sequence[str]] = {

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.episodes import NO_RANDOMISATION, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
-from neurosim_core.learn.task import NO_RANDOMISATION, Observations, View
+from neurosim_core.learn.task import Observations, View
 from neurosim_core.learn.tasks.hover import Hover
 from neurosim_core.registry import register
 

@@ -1,0 +1,37 @@
+"""Starting Warp: what threads and processes share."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import warp as wp
+
+from neurosim_core.warp_start import start_warp
+
+
+def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch):
+    """The second thread reads the file of the first: Warp on its own would write one for each."""
+    start_warp()
+
+    def compile_adder(amount: int) -> None:
+        @wp.kernel(module="unique", enable_backward=False)
+        def add(out: wp.array[int]) -> None:
+            out[0] = out[0] + wp.static(amount)
+
+        out = wp.zeros(1, dtype=int, device="cpu")
+        wp.launch(add, dim=1, outputs=[out], device="cpu")
+        assert out.numpy()[0] == amount
+
+    def headers() -> set[tuple[str, int]]:
+        files = Path(wp.config.kernel_cache_dir, "headers").rglob("*.pch")
+        return {(str(file), file.stat().st_mtime_ns) for file in files}
+
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    compile_adder(3)
+    first = headers()
+    thread = threading.Thread(target=compile_adder, args=(5,))
+    thread.start()
+    thread.join()
+    assert first
+    assert headers() == first
