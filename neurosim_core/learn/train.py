@@ -44,6 +44,8 @@ class TrainConfig:
     student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
+    widely: bool = True
+    """Draw what `Task.training` says; else what tests draw: what few steps can learn."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
@@ -79,7 +81,7 @@ class Training:
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
         drawn = find_task(config.task).training
-        randomise = True if drawn is None else drawn
+        randomise = drawn if drawn is not None and config.widely else True
         self.env = make_env(
             config.task,
             worlds=config.student.worlds,
@@ -203,8 +205,12 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
-        small = PpoConfig(**teacher), DaggerConfig(**student)
-        return dataclasses.replace(config, teacher=small[0], student=small[1], pixels=24)
+        few = {"worlds": 64, "iterations": 90, "updates": 8, "replay": 10, "learning_rate": 2e-3}
+        few |= {"hidden": 96, "widths": (16, 24, 32)}
+        small = PpoConfig(**teacher), DaggerConfig(**(few | student))
+        return dataclasses.replace(
+            config, teacher=small[0], student=small[1], pixels=24, widely=False, block=90
+        )
     many = {"worlds": 1024, "iterations": 84, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
