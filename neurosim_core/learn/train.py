@@ -205,7 +205,13 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
-        few = {"worlds": 64, "iterations": 90, "updates": 8, "replay": 10, "learning_rate": 2e-3}
+        few: dict[str, Any] = {
+            "worlds": 64,
+            "iterations": 90,
+            "updates": 8,
+            "replay": 10,
+            "learning_rate": 2e-3,
+        }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
