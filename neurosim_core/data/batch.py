@@ -102,7 +102,8 @@ class EventBatch:
             start_us, span_us = int(host.start_us[window]), int(host.stamp_us[window] - host.start_us[window])
             moment = (t - start_us) * ((bins - 1) / span_us)
             begins = np.searchsorted(moment, np.arange(bins - 1))  # events are in the order of time
-            rows, late = grid.reshape(bins, cells), np.zeros(cells)
+            rows = grid.reshape(bins, cells)
+            late: Any = 0.0
             for low, (begin, end) in enumerate(pairwise([*begins, len(t)])):
                 here, share = place[begin:end], (moment[begin:end] - low) * sign[begin:end]
                 rows[low] = late + np.bincount(here, sign[begin:end] - share, cells)
