@@ -85,7 +85,7 @@ def test_the_report_says_what_was_flown(flown):
         "time went to",
         f"{events:,}",
         "packets",
-        "rgb 7, ",
+        "rgb 7",
     ):
         assert part in said
     spent = {
