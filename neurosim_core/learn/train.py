@@ -22,6 +22,7 @@ import torch
 from neurosim_core.learn import need
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
+from neurosim_core.learn.episodes import Randomisation
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
@@ -30,6 +31,7 @@ from neurosim_core.sim.model import Model, find_device
 Say = Callable[[str], None]
 
 _BLOCK = 60
+_RANDOMISE = ("training", "tests", "none")
 _SEEDS_APART = 1 << 20
 
 
@@ -44,11 +46,16 @@ class TrainConfig:
     student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
-    widely: bool = True
-    """Draw what `Task.training` says; else what tests draw: what few steps can learn."""
+    randomise: str = "training"
+    """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
+    learn, or nothing (`none`)."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
+
+    def __post_init__(self) -> None:
+        if self.randomise not in _RANDOMISE:
+            raise ValueError(f"unknown randomise {self.randomise!r}, known: {', '.join(_RANDOMISE)}")
 
 
 class Training:
@@ -81,7 +88,9 @@ class Training:
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
         drawn = find_task(config.task).training
-        randomise = drawn if drawn is not None and config.widely else True
+        randomise: bool | Randomisation = config.randomise != "none"
+        if config.randomise == "training" and drawn is not None:
+            randomise = drawn
         self.env = make_env(
             config.task,
             worlds=config.student.worlds,
@@ -215,14 +224,14 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
-            config, teacher=small[0], student=small[1], pixels=24, widely=False, block=90
+            config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=90
         )
-    many = {"worlds": 1024, "iterations": 84, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=42,
+        block=45,
         evaluation_worlds=512,
     )
 

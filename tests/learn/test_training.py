@@ -14,6 +14,7 @@ from neurosim_core.registry import register
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
+from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
 from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
@@ -35,6 +36,15 @@ class BriefHover(Hover):
 
     camera = {"width": 8, "height": 8, "horizontal_fov_rad": 1.5}  # noqa: RUF012
     episode_s = 0.4
+
+
+CONDITIONS = (
+    "as in the tests",
+    "noise of a DAVIS346",
+    "thresholds 3 to 4 times",
+    "lens of 0.8 times the angle",
+    "mass 0.9 to 1.1 times, wind up to 1 m/s",
+)
 
 
 def small(**changes) -> TrainConfig:
@@ -180,6 +190,27 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert slow.metrics["speed_m_s"] < 0.5 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
+
+
+def test_a_policy_is_evaluated_where_it_was_not_trained(tmp_path, hall, monkeypatch):
+    """Each condition changes what is flown; with none of them the evaluation is that of the tests."""
+    from neurosim_core.learn import transfer
+
+    run(tmp_path, hall)
+    file = hall.config.scene.file
+    changes = {name: transfer.CONDITIONS[name] for name in CONDITIONS}
+    monkeypatch.setattr(transfer, "CONDITIONS", changes)
+    found = dict(transfer.evaluate_transfer(tmp_path, scenes=[str(file)], worlds=3))
+    assert found["as in the tests"] == next(evaluate_run(tmp_path, scenes=str(file), worlds=3))[1]
+    assert len({evaluation.metrics["speed_m_s"] for evaluation in found.values()}) == len(CONDITIONS)
+
+
+def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):
+    training = Training(tmp_path, small(randomise="none"), models=[hall])
+    assert training.env.randomisation == NO_RANDOMISATION
+    assert Training(tmp_path, small(), models=[hall]).env.randomisation == Hover.training
+    with pytest.raises(ValueError, match="unknown randomise 'some', known: training, tests, none"):
+        small(randomise="some")
 
 
 def test_a_task_of_ones_own_is_learnt(monkeypatch):
