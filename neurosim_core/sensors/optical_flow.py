@@ -38,7 +38,7 @@ VISIBLE, HIDDEN, OUTSIDE = 0, 1, 2
 _FAR_M = wp.constant(1.0e9)
 _NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
 """What hides a point is nearer than it by this ratio: rays and points are float32."""
-_CLEARANCE_M = wp.constant(2.0)
+_CLEARANCE_M = wp.constant(0.5)
 """No surface is looked for that is further from a camera than this."""
 _HORIZON_M = wp.constant(1.0e5)
 """Where a way to the sky ends [m]."""
