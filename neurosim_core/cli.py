@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -35,7 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
+    arguments.began_s = began_s
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         if arguments.computes:
             from neurosim_core.warp_start import start_warp
@@ -339,7 +342,7 @@ def _run(arguments: argparse.Namespace) -> int:
         print(to_yaml(config, comments=True), end="")
         return 0
     folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-    report = fly(config, folder, rerun=not arguments.no_rrd)
+    report = fly(config, folder, rerun=not arguments.no_rrd, began_s=arguments.began_s)
     return 130 if report.interrupted else 0
 
 

@@ -84,8 +84,18 @@ def test_the_report_says_what_was_flown(flown):
         "motor_lag",
         "time went to",
         f"{events:,}",
+        "packets",
+        "rgb 7",
     ):
         assert part in said
+    spent = {
+        row[1]: float(row[2])
+        for row in re.finditer(r"(?m)^(\S.*?) +(\d+\.\d\d) +\d+ %", said.split("time went to")[1])
+    }
+    assert {"set-up: libraries, settings", "recording and drawing", "overview"} <= spent.keys()
+    assert spent.pop("all") == pytest.approx(
+        sum(spent.values()), abs=0.005 * (len(spent) + 5)
+    )  # rounded rows
 
 
 def test_the_overview_is_a_picture(flown):
