@@ -152,7 +152,7 @@ def _make_class(type_name: str) -> Any:
     for name, value in _DEFAULTS.get(type_name, {}).items():
         attributes[f"{name.upper()}__DEFAULT"] = value
         fields = [
-            f._replace(default=functools.partial(type(value), value)) if f.name == name else f for f in fields
+            f._replace(default=functools.partial(_as_it_is, value)) if f.name == name else f for f in fields
         ]
     attributes |= {field.name: _accessor(field) for field in fields}
     attributes |= {
@@ -176,6 +176,10 @@ def _reduce(self: Message) -> tuple[Any, ...]:
 def _restore(type_name: str, values: list[Any]) -> Any:
     kind = message_class(type_name)
     return kind(**dict(zip(kind.get_fields_and_field_types(), values, strict=True)))
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
 
 
 def _accessor(field: Field) -> Any:
@@ -242,7 +246,8 @@ def _stored(name: str, description: Any, value: Any) -> Any:
     if kind == Nodetype.NAME:
         fits = isinstance(value, message_class(what))
     elif kind == Nodetype.BASE:
-        fits = _fits(*what, value)
+        base, limit = what
+        fits = _fits(base, limit, value)
     else:
         element, size = what
         fits = isinstance(value, Sequence | AbstractSet | UserList | np.ndarray | array.array)
