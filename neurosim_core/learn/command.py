@@ -35,8 +35,14 @@ def add_parsers(commands: _Commands) -> None:
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
+    learn.add_argument(
+        "--algorithm",
+        choices=("dagger", "ppo"),
+        default="dagger",
+        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher",
+    )
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
-    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
+    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
     learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     learn.add_argument(
         "--scenes",
@@ -117,7 +123,12 @@ def _learn(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
     from neurosim_core.learn.train import default_config, train
 
-    config = default_config(arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    config = default_config(
+        arguments.what,
+        device=arguments.device or "auto",
+        seed=arguments.seed,
+        algorithm=arguments.algorithm,
+    )
     student, teacher = config.student, config.teacher
     if arguments.pixels is not None:
         config = dataclasses.replace(config, pixels=arguments.pixels)

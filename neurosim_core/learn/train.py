@@ -26,9 +26,11 @@ from neurosim_core.learn.episodes import Randomisation
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
+from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
 from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
+Trainer = Ppo | Dagger | RecurrentPpo
 
 _BLOCK = 60
 _RANDOMISE = ("training", "tests", "none")
@@ -43,7 +45,8 @@ class TrainConfig:
     device: str = "auto"
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
-    student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    student: DaggerConfig | RecurrentPpoConfig = dataclasses.field(default_factory=DaggerConfig)
+    """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
     randomise: str = "training"
@@ -103,30 +106,38 @@ class Training:
         device = self.env.device
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
-        teacher_env = make_env(
-            config.task,
-            worlds=config.teacher.worlds,
-            device=config.device,
-            observe=states,
-            models=self.env.sim.models,
-            randomise=randomise,
-            seed=config.seed,
-        )
-        self._teacher = Ppo(teacher_env, config.teacher, self._generator)
-        self._student = Dagger(self.env, self._teacher.policy, config.student, self._generator)
-        self._done = {"teacher": 0, "student": 0}
+        self._trainers: dict[str, Trainer] = {}
+        if isinstance(config.student, DaggerConfig):
+            teacher_env = make_env(
+                config.task,
+                worlds=config.teacher.worlds,
+                device=config.device,
+                observe=states,
+                models=self.env.sim.models,
+                randomise=randomise,
+                seed=config.seed,
+            )
+            teacher = Ppo(teacher_env, config.teacher, self._generator)
+            student = Dagger(self.env, teacher.policy, config.student, self._generator)
+            self._trainers |= {"teacher": teacher, "student": student}
+        else:
+            self._trainers["student"] = RecurrentPpo(self.env, config.student, self._generator)
+        self._done = dict.fromkeys(self._trainers, 0)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
 
     @property
-    def teacher(self) -> ActorCritic:
-        """The policy on states."""
-        return self._teacher.policy
+    def teacher(self) -> ActorCritic | None:
+        """The policy on states, if there is one."""
+        trainer = self._trainers.get("teacher")
+        return trainer.policy if isinstance(trainer, Ppo) else None
 
     @property
     def student(self) -> EventPolicy:
         """The policy on events."""
-        return self._student.policy
+        policy = self._trainers["student"].policy
+        assert isinstance(policy, EventPolicy)
+        return policy
 
     @property
     def models(self) -> Sequence[Model]:
@@ -140,8 +151,8 @@ class Training:
             FileNotFoundError: There is none.
         """
         state = torch.load(self.folder / "checkpoint.pt", map_location=self.env.device, weights_only=True)
-        self._teacher.descent.load_state_dict(state["teacher"])
-        self._student.descent.load_state_dict(state["student"])
+        for stage, trainer in self._trainers.items():
+            trainer.descent.load_state_dict(state[stage])
         self._generator.set_state(state["generator"].cpu())
         self._done = state["done"]
 
@@ -154,14 +165,14 @@ class Training:
         from torch.utils.tensorboard.writer import SummaryWriter
 
         config = self.config
-        limits = (config.teacher.iterations, config.student.iterations) if until is None else until
+        wholes = {"teacher": config.teacher.iterations, "student": config.student.iterations}
+        limits = wholes if until is None else dict(zip(wholes, until, strict=True))
         with SummaryWriter(str(self.folder)) as writer:
-            while self._done["teacher"] < min(limits[0], config.teacher.iterations):
-                self._train_block("teacher", self._teacher, config.teacher.iterations, writer)
-            while self._done["student"] < min(limits[1], config.student.iterations):
-                self._train_block("student", self._student, config.student.iterations, writer)
+            for stage, trainer in self._trainers.items():
+                while self._done[stage] < min(limits[stage], wholes[stage]):
+                    self._train_block(stage, trainer, wholes[stage], writer)
 
-    def _train_block(self, stage: str, trainer: Ppo | Dagger, whole: int, writer: Any) -> None:
+    def _train_block(self, stage: str, trainer: Trainer, whole: int, writer: Any) -> None:
         begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
         trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART)
@@ -185,9 +196,9 @@ class Training:
         partial = file.with_suffix(".part")
         torch.save(
             {
-                "teacher": self._teacher.descent.state_dict(),
-                "student": self._student.descent.state_dict(),
+                **{stage: trainer.descent.state_dict() for stage, trainer in self._trainers.items()},
                 "shape": self.student.shape,
+                "weights": self.student.state_dict(),
                 "generator": self._generator.get_state(),
                 "done": self._done,
             },
@@ -197,7 +208,8 @@ class Training:
 
     def evaluate_teacher(self) -> Evaluation:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
-        env = self._teacher.env
+        assert self.teacher is not None
+        env = self._trainers["teacher"].env
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
@@ -208,11 +220,25 @@ def prepare_torch() -> None:
     torch.set_float32_matmul_precision("high")
 
 
-def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
-    """Return how a task is trained: with more worlds on a GPU, and for longer."""
+def default_config(
+    task: str, *, device: str = "auto", seed: int = 0, algorithm: str = "dagger"
+) -> TrainConfig:
+    """Return how a task is trained: with more worlds on a GPU, and for longer.
+
+    Args:
+        task: Its name.
+        device: Where.
+        seed: Of everything.
+        algorithm: `dagger`: by imitation of a teacher; `ppo`: on events from scratch.
+    """
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
+    if algorithm == "ppo":
+        ppo = RecurrentPpoConfig()
+        if find_device(device).startswith("cuda"):
+            ppo = RecurrentPpoConfig(worlds=1024, iterations=600)
+        return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
     if not find_device(device).startswith("cuda"):
         few: dict[str, Any] = {
             "worlds": 64,
@@ -249,7 +275,8 @@ def read_config(folder: Path) -> TrainConfig:
         )
     values = json.loads(file.read_text())
     values["teacher"] = PpoConfig(**values["teacher"])
-    values["student"] = DaggerConfig(**values["student"])
+    imitates = "replay" in values["student"]
+    values["student"] = (DaggerConfig if imitates else RecurrentPpoConfig)(**values["student"])
     return TrainConfig(**values)
 
 
@@ -264,7 +291,7 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    policy.load_state_dict(state["student"]["policy"])
+    policy.load_state_dict(state["weights"])
     return policy
 
 
@@ -327,7 +354,8 @@ def train(
         training.resume()
     say(f"set up in {time.monotonic() - begin_s:.0f} s")
     training.run()
-    say(f"teacher: {training.evaluate_teacher()}")
+    if training.teacher is not None:
+        say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
     for name, evaluation in evaluate_run(folder):
