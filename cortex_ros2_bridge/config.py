@@ -228,6 +228,14 @@ def _bridge_config(raw: object) -> BridgeConfig:
     )
 
 
+def check_backend(key: str, value: object) -> str:
+    """Return the name of a backend, or of a bag."""
+    text = _text(key, value)
+    if text not in ("auto", "rclpy", "dds") and not text.endswith(".mcap"):
+        raise ConfigError(f"{key} must be auto, rclpy, dds or a path that ends in .mcap, got {text!r}")
+    return text
+
+
 def check_distro(key: str, value: object) -> str:
     """Return the name of a distribution."""
     text = _text(key, value)
@@ -357,7 +365,7 @@ def _ros_name(key: str, value: object) -> str:
 
 
 SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
-    "backend": _text,
+    "backend": check_backend,
     "distro": check_distro,
     "cortex_domain": check_cortex_domain,
     "node": _node_name,

@@ -162,6 +162,10 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
         return f"{shown}: must be the name of a file{got}"
     if shown.endswith("_rad") and isinstance(value, int | float) and kind.startswith("less_than"):
         got += f"; if these are degrees, write {math.radians(value):.6g}"
+    if shown.endswith(("latency_s", "jitter_s")) and isinstance(value, int | float):
+        got += (
+            f"; if these are milliseconds, write {1e-3 * value:.6g}" if kind.startswith("less_than") else ""
+        )
     reason = item["msg"].partition(", unable to")[0].partition(", got")[0]
     return f"{shown}: {reason}{got}" if shown else f"{reason}{got}"
 

@@ -304,10 +304,8 @@ def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> mess
     rate = context.within("yaw rate", rate, "max_rate_rad_s", "rad/s")
     kind = context.frames.kind_of(frame, context.vehicle)
     if kind is None:
-        names = (
-            f"{context.frames.body_of(context.vehicle)}, base_footprint, {context.frames.ros(frames.WORLD)}"
-        )
-        raise ConvertError(f"a velocity in frame {frame!r}, known: {names}")
+        known = ", ".join(context.frames.known(context.vehicle))
+        raise ConvertError(f"a velocity in frame {frame!r}, known: {known}")
     if kind != "world":
         if context.odometry is None:
             raise ConvertError(f"no odometry yet that would say how {frame} is turned")
@@ -324,10 +322,9 @@ def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> mess
 def _pose_command(message: Any, point: Any, quaternion: Any, context: Context) -> messages.PoseCommand:
     frame = message.header.frame_id
     if frame and context.frames.kind_of(frame, context.vehicle) != "world":
-        world = context.frames.ros(frames.WORLD)
-        raise ConvertError(
-            f"a pose in frame {frame!r}, known: {world}, {context.frames.odom_of(context.vehicle)}"
-        )
+        kinds = context.frames.known(context.vehicle)
+        known = ", ".join(name for name, kind in kinds.items() if kind == "world")
+        raise ConvertError(f"a pose in frame {frame!r}, known: {known}")
     position = xyz(point)
     check_finite("position", position)
     position = context.within("position", position, "max_position_m", "m")
