@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -328,3 +332,24 @@ def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
             torch.testing.assert_close(action, actions[step].clamp(-1.0, 1.0))
             torch.testing.assert_close(memory[:, policy.hidden :], estimates[step])
     assert estimates.std() > 0.0
+
+
+def test_two_processes_train_one_policy(tmp_path, hall):
+    """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
+    pytest.importorskip("tensorboard")
+    script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+    def run_it(folder: str, *launcher: str) -> list[dict]:
+        words = [sys.executable, *launcher, script, scene, str(tmp_path / folder)]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    first, second = sorted(run_it("both", *torchrun), key=lambda found: found["rank"])
+    (alone,) = run_it("alone")
+    assert first["digests"] == second["digests"]
+    assert first["position"] != second["position"]
+    assert not set(first["digests"]) & set(alone["digests"])
+    assert (tmp_path / "both" / "checkpoint.pt").exists()
