@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,16 +17,9 @@ from neurosim_core.learn.ppo import PpoConfig
 from neurosim_core.learn.train import TrainConfig, Training
 
 
-def main(scene: str, folder: str) -> None:
+def train(folder: Path, model: ns.Model) -> dict[str, Any]:
+    """Train a little, and return what tells weights and flights apart."""
     torch.set_num_threads(1)
-    mesh = {"kind": "mesh", "file": scene, "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 2.0]}
-    settings = {
-        "device": "cpu",
-        "render": {"samples_per_pixel": 4},
-        "scene": mesh,
-        "path": {"kind": "hover"},
-    }
-    model = ns.make_model(ns.load_config(settings))
     config = TrainConfig(
         task="hover",
         device=ranks.join("cpu"),
@@ -34,7 +28,7 @@ def main(scene: str, folder: str) -> None:
         pixels=8,
         block=2,
     )
-    training = Training(Path(folder), config, say=lambda line: None, models=[model])
+    training = Training(folder, config, say=lambda line: None, models=[model])
     training.run()
     digests = [
         hashlib.sha256(torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()).hexdigest()
@@ -42,7 +36,18 @@ def main(scene: str, folder: str) -> None:
         if policy is not None
     ]
     position = training.env.view.position.sum().item()
-    print(json.dumps({"rank": ranks.rank(), "digests": digests, "position": position}), flush=True)
+    return {"rank": ranks.rank(), "digests": digests, "position": position}
+
+
+def main(scene: str, folder: str) -> None:
+    mesh = {"kind": "mesh", "file": scene, "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 2.0]}
+    settings = {
+        "device": "cpu",
+        "render": {"samples_per_pixel": 4},
+        "scene": mesh,
+        "path": {"kind": "hover"},
+    }
+    print(json.dumps(train(Path(folder), ns.make_model(ns.load_config(settings)))), flush=True)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from neurosim_core.registry import register
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
+import rank_process  # noqa: E402
+
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
 from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
@@ -338,17 +340,18 @@ def test_two_processes_train_one_policy(tmp_path, hall):
     """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
     pytest.importorskip("tensorboard")
     script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-
-    def run_it(folder: str, *launcher: str) -> list[dict]:
-        words = [sys.executable, *launcher, script, scene, str(tmp_path / folder)]
-        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-
-    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    first, second = sorted(run_it("both", *torchrun), key=lambda found: found["rank"])
-    (alone,) = run_it("alone")
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    done = subprocess.run(
+        [*torchrun, script, scene, str(tmp_path / "both")],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    first, second = sorted(found, key=lambda each: each["rank"])
+    alone = rank_process.train(tmp_path / "alone", hall)
     assert first["digests"] == second["digests"]
     assert first["position"] != second["position"]
     assert not set(first["digests"]) & set(alone["digests"])

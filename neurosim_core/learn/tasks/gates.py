@@ -59,8 +59,8 @@ class Gates(Task):
     }
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of 24 tracks to train on, or of four others."""
-        return [_hall(seed) for seed in (range(100, 104) if unseen else range(24))]
+        """Return settings of 40 tracks to train on, or of four others."""
+        return [_hall(seed) for seed in (range(100, 104) if unseen else range(40))]
 
     def routes(self, scene: SceneConfig) -> Routes | None:
         """Return ways to each gate from before it, along the track and against it."""
