@@ -54,12 +54,18 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
     with Node("simulator") as node:
         require_single_instance(node)
         with console.status("preparing") as preparing:
+
+            def show(phase: str) -> None:
+                preparing.update(f"preparing: {phase}")
+                if not console.is_terminal:
+                    console.print(f"preparing: {phase}")
+
             simulator = Simulator(
                 config,
                 node,
                 record=record,
                 overwrite=overwrite,
-                on_phase=lambda phase: preparing.update(f"preparing: {phase}"),
+                on_phase=show,
             )
         gc.collect()
         gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second

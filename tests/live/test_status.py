@@ -220,6 +220,7 @@ def test_serve_prints_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture
         serving.join(SOON_S)
     assert codes == [0]
     printed = " ".join(capsys.readouterr().out.split())
+    assert "preparing: kernels" in printed
     assert "/drone/: imu, odometry, rotor_speeds" in printed
     assert "waiting for the first command on /drone/command/*: `neurosim fly` sends them" in printed
     assert "ended: the 1 s are over" in printed
