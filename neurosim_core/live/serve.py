@@ -227,7 +227,8 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus, *, is_over:
         if now.fail_safe_count > was.fail_safe_count:
             lines.append(f"{now.name}: no command has come in time; the fail-safe flies")
         if was.fail_safe and not now.fail_safe:
-            lines.append(f"{now.name}: commands arrive again (from {now.command_source})")
+            sender = f" (from {now.command_source})" if now.command_source else ""
+            lines.append(f"{now.name}: commands arrive again{sender}")
     return lines
 
 
