@@ -220,7 +220,8 @@ def test_attributes_that_do_not_exist_cannot_be_set():
     ],
 )
 def test_values_of_a_wrong_type_or_range_are_refused(change, reason):
-    with pytest.raises(WRONG, match=reason):
+    is_ours = issubclass(Imu, msgs.Message)
+    with pytest.raises(WRONG, match=reason if is_ours else None):  # rclpy has other words for each
         change()
 
 
