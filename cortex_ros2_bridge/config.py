@@ -82,6 +82,9 @@ class BridgeConfig:
     """Whether it begins active; else ROS configures and activates it, as a managed node."""
     defaults: bool = True
     """Whether topics have routes that no entry of `routes` asks for."""
+    robot: bool = False
+    """Whether a robot in ROS is flown by a controller in Cortex: then its odometry and events come in, its
+    commands go out, and nothing else passes."""
     include: tuple[str, ...] = ("*",)
     """Cortex topics that may have routes: patterns with * and ?."""
     exclude: tuple[str, ...] = ()
@@ -98,6 +101,8 @@ class BridgeConfig:
     def __post_init__(self) -> None:
         if self.is_bag and not self.autostart:
             raise ConfigError(f"autostart: false: nobody can activate a bag ({self.backend})")
+        if self.is_bag and self.robot:
+            raise ConfigError(f"robot: true: nothing comes out of a bag ({self.backend})")
 
     @property
     def is_bag(self) -> bool:
@@ -372,6 +377,7 @@ SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "isolate": _flag,
     "autostart": _flag,
     "defaults": _flag,
+    "robot": _flag,
     "include": _patterns,
     "exclude": _patterns,
     "rename": _renames,

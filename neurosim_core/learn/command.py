@@ -91,6 +91,13 @@ def add_parsers(commands: _Commands) -> None:
     deploy.add_argument(
         "--print-config", action="store_true", help="print settings for `neurosim serve`, and stop"
     )
+    deploy.add_argument(
+        "--ros",
+        nargs="?",
+        const="auto",
+        choices=("auto", "rclpy", "dds"),
+        help="the vehicle is in ROS 2: events and odometry come from there, AttitudeTarget goes there",
+    )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
     predict = commands.add_parser(
@@ -241,4 +248,5 @@ def _deploy(arguments: argparse.Namespace) -> int:
         vehicle=arguments.vehicle,
         events=arguments.events,
         duration_s=arguments.duration,
+        ros=arguments.ros,
     )

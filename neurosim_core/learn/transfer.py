@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from neurosim_core.learn.env import find_task, make_env
-from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor
-from neurosim_core.learn.task import Task
+import torch
+
+from neurosim_core.learn.env import Env, find_task, make_env
+from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate, student_actor
+from neurosim_core.learn.task import Observations, Task
 from neurosim_core.learn.train import load_student, read_config
 
 _NOISY_WORLDS = 128
@@ -28,6 +30,11 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "bias of the gyroscope up to 0.05 rad/s": {"drawn": {"gyro_bias_rad_s": 0.05}},
     "latency up to 2 steps, lag up to 0.05 s": {"drawn": {"latency_steps": 2, "lag_s": (0.0, 0.05)}},
     "mass 0.9 to 1.1 times, wind up to 1 m/s": {"drawn": {"mass_factor": (0.9, 1.1), "wind_m_s": 1.0}},
+    "clock 30 % slower": {"rate_factor": 0.7},
+    "clock 30 % faster": {"rate_factor": 1.3},
+    "actions one step later": {"late": 1.0},
+    "a tenth of the actions lost": {"late": 0.1},
+    "three tenths of the actions lost": {"late": 0.3},
 }
 """What differs from the tests of a task, by name."""
 
@@ -61,13 +68,30 @@ def evaluate_transfer(
         )
         where = {"models": env.sim.models}  # nothing is loaded twice
         policy = load_student(folder, env.device)
-        yield name, evaluate(env, student_actor(policy, env))
+        yield name, evaluate(env, _late(student_actor(policy, env), env, changes.get("late", 0.0)))
+
+
+def _late(actor: Actor, env: Env, share: float) -> Actor:
+    """Return an actor of whose actions a share is replaced by the one before; 1: all come a step later."""
+    generator = torch.Generator(device=env.device).manual_seed(0)
+    last = torch.zeros((env.num_envs, env.action_count), device=env.device)
+
+    def act(observations: Observations, begun: torch.Tensor) -> torch.Tensor:
+        last.masked_fill_(begun[:, None], 0.0)
+        action = actor(observations, begun)
+        lost = torch.rand((env.num_envs, 1), generator=generator, device=env.device) < share
+        taken = torch.where(lost, last, action)
+        last.copy_(action if share == 1.0 else taken)
+        return taken
+
+    return act
 
 
 def _changed_task(name: str, changes: Mapping[str, Any]) -> Task:
     """Return a task with the changes of a condition."""
     task = find_task(name)
     task.pixel = changes.get("pixel", {})
+    task.rate_hz *= changes.get("rate_factor", 1.0)
     task.randomisation = dataclasses.replace(task.randomisation, **changes.get("drawn", {}))
     angle_rad = task.camera["horizontal_fov_rad"] * changes.get("fov_factor", 1.0)
     task.camera = {**task.camera, "horizontal_fov_rad": angle_rad}

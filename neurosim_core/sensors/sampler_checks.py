@@ -37,8 +37,10 @@ def make_sampler(config: StateSensorConfig, context: SamplerContext) -> Sampler:
 class _Rows(dict[str, NDArray[Any]]):
     """The rows of a sample; one that is not there is said by the names of those that are."""
 
+    sensor = ""
+
     def __missing__(self, key: str) -> NDArray[Any]:
-        raise KeyError(f"no array {key!r} was measured, known: {sorted(self)}")
+        raise KeyError(f"sensor {self.sensor!r}: no array {key!r} was measured, known: {sorted(self)}")
 
 
 def sample_packet(
@@ -51,7 +53,9 @@ def sample_packet(
         TypeError: It gives something else than a packet.
         ValueError: The packet has not the header that it was given.
     """
-    packet = sampler.packet(_Rows(rows), stamp_ns=stamp_ns, sequence=sequence, sensor=sensor)
+    known = _Rows(rows)
+    known.sensor = sensor
+    packet = sampler.packet(known, stamp_ns=stamp_ns, sequence=sequence, sensor=sensor)
     if packet is None:
         return None
     if not isinstance(packet, Packet):

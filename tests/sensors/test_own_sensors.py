@@ -91,7 +91,7 @@ def test_the_sensor_is_right_where_nothing_is_left_out(hover):
     [
         ("arrays", TypeError, r"sensor 'height': HeightSampler must set `self\.arrays`"),
         ("slot", ValueError, r"sensor 'height': arrays\['position'\] needs shape \[slot, world, \.\.\.\]"),
-        ("row", KeyError, r"no array 'positon' was measured, known: \['position'\]"),
+        ("row", KeyError, r"sensor 'height': no array 'positon' was measured, known: \['position'\]"),
         ("header", ValueError, r"packet\(\) must pass the header on: Height\(\.\.\., \*\*header\)"),
         ("number", TypeError, r"packet\(\) must return a packet or None, got 1\.2"),
     ],
