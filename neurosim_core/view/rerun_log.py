@@ -263,20 +263,19 @@ class RerunLogger:
         for table in self._tables.values():
             table.send()
 
-    def flush(self) -> None:
-        """Send what waits, and wait until it has left.
+    def check(self) -> None:
+        """See whether all that has left so far could be written; wait for nothing.
 
         Raises:
             OSError: The file cannot be written, such as on a full disk.
         """
-        self.send()
-        self._stream.flush()
+        self._stream.check()
 
     def close(self) -> None:
         """Flush and disconnect from the file or viewer.
 
         Raises:
-            OSError: As `flush`.
+            OSError: As `check`.
         """
         self.send()
         self._stream.close()
