@@ -151,8 +151,8 @@ def _learn(arguments: argparse.Namespace) -> int:
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
     config = dataclasses.replace(config, student=student, teacher=teacher)
-    train(folder, config, resume=arguments.resume)
-    print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    if train(folder, config, resume=arguments.resume):
+        print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
     return 0
 
 
