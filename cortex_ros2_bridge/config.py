@@ -82,6 +82,9 @@ class BridgeConfig:
     """Whether it begins active; else ROS configures and activates it, as a managed node."""
     defaults: bool = True
     """Whether topics have routes that no entry of `routes` asks for."""
+    robot: bool = False
+    """Whether a robot in ROS is flown by a controller in Cortex: then its odometry and events come in, its
+    commands go out, and nothing else passes."""
     include: tuple[str, ...] = ("*",)
     """Cortex topics that may have routes: patterns with * and ?."""
     exclude: tuple[str, ...] = ()
@@ -98,6 +101,8 @@ class BridgeConfig:
     def __post_init__(self) -> None:
         if self.is_bag and not self.autostart:
             raise ConfigError(f"autostart: false: nobody can activate a bag ({self.backend})")
+        if self.is_bag and self.robot:
+            raise ConfigError(f"robot: true: nothing comes out of a bag ({self.backend})")
 
     @property
     def is_bag(self) -> bool:
@@ -221,6 +226,14 @@ def _bridge_config(raw: object) -> BridgeConfig:
     return BridgeConfig(
         **{key: SETTINGS[key](key, value) for key, value in given.items() if value is not None}
     )
+
+
+def check_backend(key: str, value: object) -> str:
+    """Return the name of a backend, or of a bag."""
+    text = _text(key, value)
+    if text not in ("auto", "rclpy", "dds") and not text.endswith(".mcap"):
+        raise ConfigError(f"{key} must be auto, rclpy, dds or a path that ends in .mcap, got {text!r}")
+    return text
 
 
 def check_distro(key: str, value: object) -> str:
@@ -352,7 +365,7 @@ def _ros_name(key: str, value: object) -> str:
 
 
 SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
-    "backend": _text,
+    "backend": check_backend,
     "distro": check_distro,
     "cortex_domain": check_cortex_domain,
     "node": _node_name,
@@ -361,6 +374,7 @@ SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "isolate": _flag,
     "autostart": _flag,
     "defaults": _flag,
+    "robot": _flag,
     "include": _patterns,
     "exclude": _patterns,
     "rename": _renames,

@@ -9,6 +9,7 @@ Reference: the README of event_camera_msgs.
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +94,10 @@ DVS_RECORD = np.dtype(
     }
 )
 """A dvs_msgs/Event in an array, in CDR, from the second one on; the first has no gap before its time."""
+DVS_RECORD_ROS1 = np.dtype(
+    [("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nanosec", "<u4"), ("polarity", "u1")]
+)
+"""The same as ROS 1 serialises it: without gaps."""
 
 
 def dvs_size(count: int) -> int:
@@ -138,34 +143,43 @@ def write_dvs(out: Bytes, events: EventColumns, *, width: int, height: int) -> N
     head[0] = (x[0], y[0], begin, nanosecond[0], polarity[0])
 
 
-def read_dvs(data: Buffer) -> tuple[tuple[int, int], EventColumns]:
-    """Return width and height of the sensor, and the events of a dvs_msgs/EventArray, in CDR.
+def read_dvs(data: Buffer, *, ros1: bool = False) -> tuple[tuple[int, int], EventColumns]:
+    """Return width and height of the sensor, and the events of a dvs_msgs/EventArray.
 
     Args:
-        data: The message, little endian; whole microseconds are kept of its times.
+        data: The message in little-endian CDR; whole microseconds are kept of its times.
+        ros1: It is serialised as by ROS 1 instead.
 
     Raises:
         EventCodecError: It is cut off, or big endian.
     """
     view = memoryview(data).cast("B")
+    if not ros1 and bytes(view[:2]) != b"\0\1":
+        raise EventCodecError("a dvs_msgs/EventArray that is not little-endian CDR")
     try:
-        (length,) = struct.unpack_from("<I", view, 12)
-        begin = 16 + (length + 3 & -4)
+        (length,) = struct.unpack_from("<I", view, 12)  # of the frame's name; CDR ends and pads it
+        begin = 16 + (length if ros1 else length + 3 & -4)
         height, width, count = struct.unpack_from("<III", view, begin)
-        if len(view) < begin + 12 + dvs_size(count):
-            raise ValueError(f"{count} events need more")
-        records = np.zeros(count, DVS_RECORD)
-        if count:
-            x, y, second, nanosecond, polarity = struct.unpack_from("<HHiIB", view, begin + 12)
-            records[0] = (x, y, second, nanosecond, polarity)
-            padded = bytes(view[begin + 26 : begin + 12 + dvs_size(count)]) + bytes(3)
-            records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
+        records = _ros1_records(view[begin + 12 :], count) if ros1 else _records(view[begin + 12 :], count)
     except (struct.error, ValueError) as error:
         raise EventCodecError(f"{len(view)} bytes are no dvs_msgs/EventArray: {error}") from error
-    if bytes(view[:2]) != b"\0\1":
-        raise EventCodecError("a dvs_msgs/EventArray that is not little-endian CDR")
     t = records["sec"].astype(np.int64) * 1_000_000 + records["nanosec"] // 1000
     return (width, height), EventColumns(t, *(records[name].copy() for name in ("x", "y", "polarity")))
+
+
+def _ros1_records(view: memoryview, count: int) -> NDArray[Any]:
+    return np.frombuffer(view, DVS_RECORD_ROS1, count=count)
+
+
+def _records(view: memoryview, count: int) -> NDArray[Any]:
+    if len(view) < dvs_size(count):
+        raise ValueError(f"{count} events need more")
+    records = np.zeros(count, DVS_RECORD)
+    if count:
+        records[0] = struct.unpack_from("<HHiIB", view)
+        padded = bytes(view[14 : dvs_size(count)]) + bytes(3)
+        records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
+    return records
 
 
 class EventPicture:

@@ -210,14 +210,16 @@ def _candidates(seen: Seen, config: BridgeConfig) -> list[tuple[Route, Rule]]:
         if not _is_known(topic):
             continue
         for rule in rules():
-            if rule.cortex_type != topic.type_name or not _may_go(rule, topic, config):
+            if rule.cortex_type != topic.type_name or rule.robot != config.robot:
+                continue
+            if not _may_go(rule, topic, config):
                 continue
             if rule.cortex_type == "cortex/CameraInfo" and topic.topic.removesuffix(INFO) in pictures:
                 continue  # goes with each picture, and with its stamp
             if rule.name == "/tf" and topic.topic.rpartition("/")[2] not in _TF_SOURCES:
                 continue
             found.append((_route(rule, topic.topic), rule))
-    for name, request in () if config.is_bag else seen.services:
+    for name, request in () if config.is_bag or config.robot else seen.services:
         found += [
             (_route(rule, name), rule)
             for rule in RULES

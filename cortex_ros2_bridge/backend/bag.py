@@ -114,7 +114,8 @@ class BagBackend:
             except OSError as error:
                 writer.abort()
                 raise BackendError(f"the bag {self.directory} cannot be completed: {error}") from error
-        _log.info("%d messages are in %s", sum(writer.counts.values()), self.directory)
+        size_mb = sum(file.stat().st_size for file in self.directory.iterdir()) / 1e6
+        _log.info("%d messages, %.1f MB, are in %s", sum(writer.counts.values()), size_mb, self.directory)
 
     def write(
         self, connection: Any, stamp_ns: int | None, message: Buffer, *, at_ns: int | None = None

@@ -23,6 +23,7 @@ import numpy as np
 from neurosim_core.fit.recordings import (
     Floats,
     Still,
+    find_change,
     find_hot,
     find_steps,
     measure_readout,
@@ -131,6 +132,11 @@ def fit_sensor(
     real = observe(stimulus)
     notes: list[str] = []
     settings = _first_guess(real, stimulus, notes)
+    if (change := find_change(stimulus.still)) is not None:
+        notes.append(
+            f"the still recording is not still: its rate goes from {change[0]:,.0f} to {change[1]:,.0f} "
+            "events/s. What moves or flickers there is taken for noise"
+        )
 
     def approach(begin: dict[str, Any], target: Mapping[str, Any], rounds: int) -> dict[str, Any]:
         for _ in range(rounds):

@@ -35,8 +35,14 @@ def add_parsers(commands: _Commands) -> None:
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
+    learn.add_argument(
+        "--algorithm",
+        choices=("dagger", "ppo"),
+        default="dagger",
+        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher",
+    )
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
-    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
+    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
     learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     learn.add_argument(
         "--scenes",
@@ -45,6 +51,17 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
+    learn.add_argument(
+        "--transfer",
+        action="store_true",
+        help="eval: with noise, other lenses, thresholds and dynamics than it was trained with",
+    )
+    learn.add_argument(
+        "--randomise",
+        choices=("training", "tests", "none"),
+        help="what episodes of training draw: as the task says for training (default on a GPU), "
+        "as its tests do, or nothing",
+    )
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
     dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
@@ -73,6 +90,13 @@ def add_parsers(commands: _Commands) -> None:
     )
     deploy.add_argument(
         "--print-config", action="store_true", help="print settings for `neurosim serve`, and stop"
+    )
+    deploy.add_argument(
+        "--ros",
+        nargs="?",
+        const="auto",
+        choices=("auto", "rclpy", "dds"),
+        help="the vehicle is in ROS 2: events and odometry come from there, AttitudeTarget goes there",
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
@@ -106,7 +130,12 @@ def _learn(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
     from neurosim_core.learn.train import default_config, train
 
-    config = default_config(arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    config = default_config(
+        arguments.what,
+        device=arguments.device or "auto",
+        seed=arguments.seed,
+        algorithm=arguments.algorithm,
+    )
     student, teacher = config.student, config.teacher
     if arguments.pixels is not None:
         config = dataclasses.replace(config, pixels=arguments.pixels)
@@ -116,6 +145,8 @@ def _learn(arguments: argparse.Namespace) -> int:
         student = dataclasses.replace(student, iterations=arguments.student_iterations)
     if arguments.teacher_iterations is not None:
         teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
+    if arguments.randomise is not None:
+        config = dataclasses.replace(config, randomise=arguments.randomise)
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
@@ -158,6 +189,14 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
         net, dense = load_dense(arguments.run)
         print(evaluate(net, held_out_windows(dense, arguments.test), dense.head))
+        return 0
+    if arguments.transfer:
+        from neurosim_core.learn.transfer import evaluate_transfer
+
+        where = {"device": arguments.device, "worlds": arguments.worlds}
+        scenes = arguments.scenes if arguments.scenes in ("seen", "unseen") else [arguments.scenes]
+        for name, evaluation in evaluate_transfer(arguments.run, scenes=scenes, **where):
+            print(f"{name}: {evaluation}", flush=True)
         return 0
     from neurosim_core.learn.train import evaluate_run
 
@@ -209,4 +248,5 @@ def _deploy(arguments: argparse.Namespace) -> int:
         vehicle=arguments.vehicle,
         events=arguments.events,
         duration_s=arguments.duration,
+        ros=arguments.ros,
     )

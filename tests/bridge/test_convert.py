@@ -42,8 +42,8 @@ from cortex_ros2_bridge.options import OPTIONS as OPTIONS_OF_ROUTES
 from cortex_ros2_bridge.options import check_option
 from cortex_ros2_bridge.typestore import typestore
 
-OUT = {(r.cortex_type, r.ros_type): r for r in RULES if r.direction == "out"}
-IN = {(r.ros_type, r.cortex_type): r for r in RULES if r.direction in ("in", "call")}
+OUT = {(r.cortex_type, r.ros_type): r for r in RULES if r.direction == "out" and not r.robot}
+IN = {(r.ros_type, r.cortex_type): r for r in RULES if r.direction in ("in", "call") and not r.robot}
 convert = SimpleNamespace(
     **{rule.convert.__name__: rule.convert for rule in RULES if rule.direction != "record"},
     static_transforms=static_transforms,
@@ -631,8 +631,8 @@ def test_every_way_out_is_tested():
     }
     assert OUT.keys() - tested.keys() == below
     assert all(OUT[key].convert is function for key, function in tested.items() if key in OUT)
-    recorded = [rule for rule in RULES if rule.direction == "record"]  # there and back in test_bag
-    assert len(OUT) + len(IN) + len(recorded) == len(RULES)
+    others = [rule for rule in RULES if rule.direction == "record" or rule.robot]  # test_bag, test_robot
+    assert len(OUT) + len(IN) + len(others) == len(RULES)
 
 
 def test_event_image_is_drawn_until_its_period_is_over():
@@ -1209,7 +1209,9 @@ def test_velocities_that_cannot_be_used_are_refused():
             take(convert.twist, message, odometry=state(TURN))
     with pytest.raises(ConvertError, match="no odometry yet"):
         take(convert.twist, velocity())
-    with pytest.raises(ConvertError, match="frame 'other/base_link', known: drone/base_link"):
+    with pytest.raises(
+        ConvertError, match=r"frame 'other/base_link', known: map, drone/odom, .*base_footprint$"
+    ):
         take(convert.twist_stamped, stamped(TwistStamped(), "other/base_link"), odometry=state(TURN))
 
 
@@ -1296,7 +1298,7 @@ def test_poses_that_cannot_be_used_are_refused():
     message.pose.orientation.w = 0.0
     with pytest.raises(ConvertError, match="no unit quaternion"):
         take(convert.pose, message)
-    with pytest.raises(ConvertError, match="frame 'base_link', known: map, drone/odom"):
+    with pytest.raises(ConvertError, match=r"frame 'base_link', known: map, drone/odom, odom, world$"):
         take(convert.pose, stamped(PoseStamped(), "base_link"))
 
 

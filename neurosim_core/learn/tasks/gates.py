@@ -51,7 +51,7 @@ class Gates(Task):
         "student": ("proprioception", "events"),
     }
     teacher: Mapping[str, Any] = {"worlds": 512, "iterations": 300, "reward_scale": 0.1}
-    student: Mapping[str, Any] = {"disturbance": 0.1, "hint_weight": 0.2}
+    student: Mapping[str, Any] = {"iterations": 135, "disturbance": 0.1, "hint_weight": 0.2}
     hint = "next_gate"
     mirror: Mapping[str, Sequence[float]] = {
         "proprioception": (1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, *MIRROR_ACTION),
