@@ -16,11 +16,10 @@ SUBJECTS = [
     "items",
     "native",
     "pack",
-    "ring",
     "socket",
     "unpack",
 ]
-HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy", "ring")
+HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy")
 
 setup(
     ext_modules=[

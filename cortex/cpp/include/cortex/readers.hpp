@@ -12,7 +12,6 @@
 
 #include "cortex/outlet.hpp"
 #include "cortex/broadcast.hpp"
-#include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
@@ -22,7 +21,6 @@ struct Reader {
   std::string key;
   wire::AttachKey request;
   Outlet* outlet = nullptr;
-  std::uint32_t column = wire::no_column;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the outlet
   std::uint64_t confirmed = 0;  // it has accounted for all below this
 };
@@ -40,16 +38,15 @@ class Readers {
   // Those that the outlet itself serves.
   std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
 
-  // Takes a reader in; with a column of the lease table, and through the ring, if it asks for that and there is room.
-  // `first` is the sequence of the first message for it.
+  // Takes a reader in; through the ring, if it asks for that and there is room. `first` is the sequence of the first
+  // message for it.
   const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
-                                     std::uint64_t first, bool shared_memory, Listener& listener) {
+                                     std::uint64_t first, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
     reader->outlet = &outlet;
-    if (request.shared_memory && shared_memory) reader->column = free_column();
-    if (reader->column != wire::no_column) join(*reader, first, listener);
+    if (request.shared_memory) join(*reader, first, listener);
     ++(reader->member >= 0 ? members_ : outlet.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -72,7 +69,12 @@ class Readers {
     if (has_members()) ring_->end(frame);
   }
 
-  // The shortest time for which a reliable reader that has no room in the ring may hold up the publisher.
+  // The ring; there is one if it has members.
+  Broadcast& ring() noexcept { return *ring_; }
+  std::size_t member_count() const noexcept { return members_; }
+
+  // The shortest time for which a reliable reader that has no room in the ring, or with size 0 has not come to all slots,
+  // may hold up the publisher; UINT32_MAX: there is none.
   std::uint32_t patience_ms(std::size_t frame_size) const noexcept {
     std::uint32_t shortest = UINT32_MAX;
     for (const auto& reader : all_) {
@@ -96,45 +98,6 @@ class Readers {
     return std::exchange(all_, {});
   }
 
-  // Readers that share the slots, so that one slow reader cannot take the ring from the others.
-  std::uint32_t shares() const noexcept {
-    std::uint32_t columns = 0;
-    for (const auto& reader : all_) columns += reader->column == wire::no_column ? 0 : 1;
-    return std::max<std::uint32_t>(1, columns + (columns < all_.size() ? 1 : 0));
-  }
-
-  // The slots of a ring that may be pinned, or leased to one reader.
-  std::uint32_t quota(const Ring& ring) const noexcept {
-    return std::max<std::uint32_t>(1, (ring.slots() - 1) / shares());
-  }
-
-  bool has_room(const Reader& reader, Ring& ring) const noexcept {
-    std::uint32_t slots = quota(ring);
-    if (reader.request.quota != 0) slots = std::min<std::uint32_t>(slots, reader.request.quota);
-    return ring.outstanding(reader.column, slots) < slots;
-  }
-
-  // The columns that get a lease of the next message of a ring, and whether some reader is passed over.
-  std::uint64_t grant(Ring& ring, bool& passed_over) const noexcept {
-    std::uint64_t mask = 0;
-    for (const auto& reader : all_) {
-      if (reader->column == wire::no_column) continue;
-      if (has_room(*reader, ring)) {
-        mask |= std::uint64_t{1} << reader->column;
-      } else {
-        passed_over = true;
-      }
-    }
-    return mask;
-  }
-
-  // Whether some reader of this outlet has no part in shared memory.
-  bool any_inline(const Outlet& outlet) const noexcept {
-    return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
-      return reader->outlet == &outlet && reader->column == wire::no_column;
-    });
-  }
-
   // The longest that a reader which this outlet itself serves may hold up the publisher.
   std::uint32_t timeout_ms(const Outlet& outlet) const noexcept {
     std::uint32_t longest = 0;
@@ -146,7 +109,8 @@ class Readers {
 
  private:
   bool is_full(const Reader& reader, std::size_t frame_size) const noexcept {
-    return reader.member >= 0 && ring_->is_full(reader.member, frame_size);
+    if (reader.member < 0) return false;
+    return frame_size == 0 ? ring_->is_behind(reader.member) : ring_->is_full(reader.member, frame_size);
   }
 
   void join(Reader& reader, std::uint64_t first, Listener& listener) {
@@ -158,15 +122,6 @@ class Readers {
     } else {
       reader.member = ring_->add(hello, reader.request.strict, first);
     }
-  }
-
-  std::uint32_t free_column() const noexcept {
-    for (std::uint32_t column = 0; column < wire::column_count; ++column) {
-      if (std::none_of(all_.begin(), all_.end(), [&](const auto& other) { return other->column == column; })) {
-        return column;
-      }
-    }
-    return wire::no_column;
   }
 
   List all_;
