@@ -133,6 +133,13 @@ static PyObject *cast_end(Broadcast *cast, PyObject *frame) {
     Py_RETURN_NONE;
 }
 
+static PyObject *cast_dissolve(Broadcast *cast, PyObject *unused) {
+    (void)unused;
+    if (!cast_is_open(cast)) return NULL;
+    cortex_writer_dissolve(&cast->writer);
+    return cast_close(cast, NULL);
+}
+
 static PyObject *cast_in_the_way(Broadcast *cast, PyObject *size) {
     const Py_ssize_t bytes = PyLong_AsSsize_t(size);
     if ((bytes == -1 && PyErr_Occurred()) || !cast_is_open(cast)) return NULL;
@@ -384,6 +391,7 @@ static PyMethodDef cast_methods[] = {
     {"send", (PyCFunction)(void (*)(void))cast_send, METH_FASTCALL,
      "Send a frame to all; `again` if a reliable reader has no room, False if one is late and loses it."},
     {"end", (PyCFunction)cast_end, METH_O, "Send the last frame, for which there is room."},
+    {"dissolve", (PyCFunction)cast_dissolve, METH_NOARGS, "Send all readers another way, and close it; what is in it stays theirs."},
     {"in_the_way", (PyCFunction)cast_in_the_way, METH_O, "The reliable readers that have no room for so many bytes."},
     {"give_up", (PyCFunction)cast_give_up, METH_O, "Wait for a reader no more, until it has read half."},
     {"provide", (PyCFunction)cast_provide, METH_VARARGS, "Go on in a ring with so many slots of so many bytes, a multiple of 4096."},
@@ -415,7 +423,7 @@ typedef struct {
     PyObject *receive, *again;
     PyObject *body; /* of the frame that was taken last, if it names a slot; else NULL */
     int socket_fd, wait_ms;
-    int open, told;  /* that it is broken */
+    int open, told;  /* that nothing more comes */
     int is_crowded;  /* the next message finds no memory until others are let go */
 } RingReader;
 
@@ -512,7 +520,7 @@ static PyObject *next_frame(RingReader *reader) {
     }
     if (size == 0 || reader->told) return NULL;
     reader->told = 1;
-    return PyBytes_FromStringAndSize(NULL, 0); /* no frame: the link rejects it, and sees why */
+    return PyBytes_FromStringAndSize(NULL, 0); /* no frame: the link sees why */
 }
 
 PyObject *reader_body(PyObject *object, const char **data, Py_ssize_t *size) {
@@ -548,7 +556,7 @@ static PyObject *reader_take_body(RingReader *reader, PyObject *unused) {
 static PyObject *next_or_arm(RingReader *reader) {
     while (1) {
         PyObject *frame = next_frame(reader);
-        if (frame != NULL || PyErr_Occurred() || !reader->open || reader->ring.ring == NULL || reader->ring.broken || reader->is_crowded
+        if (frame != NULL || PyErr_Occurred() || !reader->open || reader->ring.ring == NULL || reader->ring.state != CORTEX_SOUND || reader->is_crowded
             || cortex_reader_arm(&reader->ring))
             return frame;
     }
@@ -652,7 +660,12 @@ static void reader_dealloc(RingReader *reader) {
 
 static PyObject *reader_broken(RingReader *reader, void *unused) {
     (void)unused;
-    return PyBool_FromLong(reader->ring.broken);
+    return PyBool_FromLong(reader->ring.state == CORTEX_BROKEN);
+}
+
+static PyObject *reader_ended(RingReader *reader, void *unused) {
+    (void)unused;
+    return PyBool_FromLong(reader->ring.state == CORTEX_ENDED);
 }
 
 static PyObject *reader_fd(RingReader *reader, void *unused) {
@@ -668,6 +681,7 @@ static PyObject *reader_is_crowded(RingReader *reader, void *unused) {
 static PyGetSetDef reader_properties[] = {
     {"is_crowded", (getter)reader_is_crowded, NULL, "Whether the next message waits, as too many large ones are kept.", NULL},
     {"broken", (getter)reader_broken, NULL, "Whether there is something in the ring that is no frame.", NULL},
+    {"ended", (getter)reader_ended, NULL, "Whether all that follows comes another way.", NULL},
     {"fd", (getter)reader_fd, NULL, "Becomes readable when a frame comes after none was there.", NULL},
     {NULL, NULL, NULL, NULL, NULL},
 };

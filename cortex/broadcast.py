@@ -20,6 +20,7 @@ import zmq
 
 from cortex.compiled import native
 from cortex.outlet import Outlet
+from cortex.patience import Patience
 from cortex.wire import AttachKey
 
 logger = logging.getLogger(__name__)
@@ -39,6 +40,8 @@ DEEP_SLOTS = 128
 DEEP_QUOTA = 67
 """A reader that may hold so many messages keeps more than by default, see `keep_last`."""
 SLOTS_BYTES_MAX = 2 << 30
+MOVE_S = 0.1
+"""How long readers have at least to come to their sockets, where there is no memory for slots."""
 RETRY_S = 5.0
 """After slots could not be made, it is not tried again for so long."""
 
@@ -130,9 +133,9 @@ class Broadcast:
 
     Args:
         source: The publisher's number.
-        await_room: Calls a function until it returns true, for so many seconds at most, and says whether it
-            did; the lock is let go meanwhile.
-        is_over: Says whether nobody is waited for any more.
+        patience: Waits for readers; the lock is let go meanwhile.
+        await_room: As `patience.wait_for`; says so when a reader was too late.
+        reroute: Called when frames go another way to readers of the ring.
         note: Says that something goes wrong.
         expected_bytes: Make slots for messages of this size before the first reader is answered; 0: do not.
     """
@@ -140,19 +143,24 @@ class Broadcast:
     def __init__(
         self,
         source: int,
+        patience: Patience,
         await_room: Callable[[Callable[[], bool], float], bool],
-        is_over: Callable[[], bool],
+        reroute: Callable[[], None],
         note: Callable[[str], None],
         expected_bytes: int = 0,
     ) -> None:
         self._source = source
+        self._patience = patience
         self._await_room = await_room
-        self._is_over = is_over
+        self._reroute = reroute
         self._note = note
         self._expected_bytes = expected_bytes
         self._unavailable_until_s = 0.0
+        self._is_dissolved = False
         self._ring: Any = None
         self._readers: dict[int, Reader] = {}
+        self._moving: set[Reader] = set()
+        """Those that were sent another way, and have not come there yet."""
         self.sends: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
         """Takes a frame and flags, or raises `zmq.Again`; with what to call then, see `send`."""
 
@@ -163,9 +171,12 @@ class Broadcast:
         if hello is None:
             return
         try:
-            if self._ring is None:
+            if self._ring is None and not self._is_dissolved:
                 self._ring = native.Broadcast(self._source, zmq.Again)
-        except OSError:  # no memory
+        except OSError as error:
+            self._is_dissolved = True
+            self._note(f"no shared memory for a ring: {error}")
+        if self._is_dissolved:
             hello.close()
             return
         with contextlib.suppress(OSError):  # it has left
@@ -177,6 +188,7 @@ class Broadcast:
 
     def dismiss(self, reader: Reader) -> None:
         """A reader has left."""
+        self._moving.discard(reader)
         if reader.member is None or self._ring is None:
             return
         self._ring.remove(reader.member)
@@ -220,7 +232,10 @@ class Broadcast:
         Returns:
             None if there is none.
         """
-        if not self._readers or not self._provide(size, exact=exact):
+        if not self._readers:
+            return None
+        if not self._provide(size, exact=exact):
+            self._dissolve()
             return None
         slot: Any = None
 
@@ -261,6 +276,21 @@ class Broadcast:
             return bool(fits)
         return True
 
+    def _dissolve(self) -> None:
+        """Send all readers to their sockets, for good, and wait a little until they are there."""
+        self._moving = set(self._readers.values())
+        self._is_dissolved = True
+        self._ring.dissolve()
+        self._forget()
+        self._reroute()
+        timeout_s = max(MOVE_S, *(reader.timeout_s for reader in self._moving))
+        self._patience.wait_for(lambda: not self._moving, timeout_s)
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether a reliable reader has still to come to its socket: it misses what is sent meanwhile."""
+        return any(reader.request.strict for reader in self._moving)
+
     def _send(self, send: Callable[[], bool], size: int) -> bool:
         """Call what sends a frame of so many bytes, until reliable readers have room or had their time."""
         on_time = True
@@ -288,7 +318,7 @@ class Broadcast:
             timeout_s = min(reader.timeout_s for reader in slow)
             if self._await_room(attempt, timeout_s - (time.monotonic() - begin_s)):
                 return
-            waited_s, is_over = time.monotonic() - begin_s, self._is_over()
+            waited_s, is_over = time.monotonic() - begin_s, self._patience.is_over()
             for member in in_the_way():
                 if is_over or self._readers[member].timeout_s <= waited_s:
                     self._ring.give_up(member)
@@ -306,9 +336,13 @@ class Broadcast:
 
     def close(self) -> None:
         """Send no more."""
+        if self._ring is not None:
+            self._ring.close()
+        self._forget()
+
+    def _forget(self) -> None:
         for reader in self._readers.values():
             reader.member = None
         self._readers.clear()
         self.sends = {}
-        if self._ring is not None:
-            self._ring.close()
+        self._ring = None

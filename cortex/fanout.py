@@ -82,8 +82,9 @@ class Fanout:
         self.readers: dict[bytes, Reader] = {}
         self.ring = Broadcast(
             source,
+            patience,
             self._await_room,
-            patience.is_over,
+            self.route,
             lambda text: outlets.note(f"{topic}: {text}"),
             expected_bytes,
         )
@@ -158,7 +159,7 @@ class Fanout:
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
         self._lossy_sends = tuple(sends)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        usual = self._plain and not self.late
+        usual = self._plain and not self.late and not self.ring.has_lost
         retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
         self._retries = retries | self.ring.sends
         self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
@@ -188,7 +189,7 @@ class Fanout:
         """Send a frame to all, waiting for reliable readers; False if one of them lost it."""
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        on_time = not self.late
+        on_time = not (self.late or self.ring.has_lost)
         for outlet in self._strict_outlets:
             try:
                 outlet.send(frame, DONTWAIT)
@@ -215,7 +216,7 @@ class Fanout:
         rest = REST.pack(sequence, stamp_ns, publish_ns, size, 0)
         if self.latching:
             self.latched = self._large_head + rest + body
-        on_time = not self.late
+        on_time = not (self.late or self.ring.has_lost)
         for outlet in {r.outlet for r in self.readers.values() if r.member is None}:
             on_time &= self._send_body(outlet, self._large_head + rest, body)
         if slot is None:

@@ -182,6 +182,9 @@ class Link:
 
     def handle(self, frame: bytes) -> list[Item]:
         """Take in a frame that is not a plain small message."""
+        if not frame and self._ring is not None and self._ring.ended:
+            self._do_without_shared_memory("it has none for such messages")
+            return []
         handler = self._handlers.get(frame[:16])
         try:
             if handler is None or len(frame) < HEADER_SIZE:
@@ -420,8 +423,9 @@ class Link:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
         if self._ring is not None:
             self._use_socket()
-        self.socket.unsubscribe(self._key)
+        key = self._key
         self._ask(shared_memory=False)
+        self.socket.unsubscribe(key)  # after that, so that the publisher counts us all the time
 
     def leave(self) -> None:
         """The publisher has left: what it wrote into its ring counts, also if its answer never came."""

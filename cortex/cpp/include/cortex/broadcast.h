@@ -32,6 +32,7 @@ enum {
 };
 
 enum { CORTEX_FRAME = 0, CORTEX_MOVED = 1 };                          /* what an entry is */
+enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a ring is to its reader */
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
 enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT }; /* what a reader finds in a slot */
 
@@ -114,7 +115,8 @@ typedef struct {
     uint64_t capacity, source, tail;
     uint64_t first; /* sequence of the first message that is sent to it */
     int socket, bell;
-    int armed, broken;
+    int armed;
+    int state; /* CORTEX_BROKEN: it carries something that is no frame; CORTEX_ENDED: more comes through another way only */
 } CortexReader;
 
 /* A message in a slot, which stays as it is until `cortex_lease_end`; any thread may call that. */
@@ -266,6 +268,12 @@ static inline void cortex_writer_end(CortexWriter *writer, const void *frame, si
     cortex_writer_wake(writer);
 }
 
+/* Send all readers another way: they find the end of the ring after what is in it, and attach anew. It is to be closed. */
+static inline void cortex_writer_dissolve(CortexWriter *writer) {
+    writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_MOVED, NULL, 0);
+    cortex_writer_wake(writer);
+}
+
 /* Slots, of the publisher. */
 
 static inline uint8_t *cortex_slot_memory(const CortexMap *map, int slot) { return map->slots + (uint64_t)slot * map->slot_bytes; }
@@ -388,9 +396,9 @@ static inline void cortex_reader_skip(CortexReader *reader) {
     cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
 }
 
-/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if it is broken. */
+/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
-    while (!reader->broken) {
+    while (reader->state == CORTEX_SOUND) {
         const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
         uint32_t entry[2];
         if (!left) return 0;
@@ -399,9 +407,9 @@ static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **f
         if (left > reader->capacity || !cortex_reader_is_whole(reader)) {
             cortex_reader_skip(reader);
         } else if (entry[1] == CORTEX_MOVED) {
-            reader->broken = cortex_reader_follow(reader) < 0;
+            if (cortex_reader_follow(reader) < 0) reader->state = CORTEX_ENDED;
         } else if (entry[1] != CORTEX_FRAME || !entry[0] || cortex_entry_bytes(entry[0]) > left) {
-            reader->broken = 1;
+            reader->state = CORTEX_BROKEN;
         } else {
             *frame = place + CORTEX_ENTRY_BYTES;
             return entry[0];

@@ -109,6 +109,8 @@ class Broadcast {
   int put(Span<const std::uint8_t> frame) noexcept { return cortex_writer_put(&writer_, frame.data(), frame.size(), 0); }
   // The last frame of all, of 64 bytes.
   void end(Span<const std::uint8_t> frame) noexcept { cortex_writer_end(&writer_, frame.data(), frame.size()); }
+  // Sends all readers another way; nothing else may be called after this.
+  void dissolve() noexcept { cortex_writer_dissolve(&writer_); }
   // Whether a reliable reader has no room for a frame.
   bool is_full(int member, std::size_t size) noexcept {
     return cortex_member_is_full(&writer_, &writer_.members[member], cortex_entry_bytes(size) + CORTEX_SPARE_BYTES) != 0;
@@ -176,7 +178,8 @@ class RingReader {
   }
 
   int fd() const noexcept { return reader_.bell; }
-  bool broken() const noexcept { return reader_.broken != 0; }
+  // CORTEX_SOUND; CORTEX_BROKEN or CORTEX_ENDED if nothing more comes through it.
+  int state() const noexcept { return reader_.state; }
   // 1 if the publisher has taken us in, -1 if we cannot map its ring, else 0.
   int welcomed() noexcept { return cortex_reader_welcomed(&reader_); }
   // Whether the next message waits, because too many large ones are kept.
@@ -212,7 +215,7 @@ class RingReader {
         cortex_reader_disarm(&reader_);
         return {frame_.data(), frame_.size()};
       }
-    } while (!broken() && cortex_reader_arm(&reader_) == 0);
+    } while (reader_.state == CORTEX_SOUND && cortex_reader_arm(&reader_) == 0);
     return {};
   }
 

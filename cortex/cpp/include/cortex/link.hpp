@@ -101,10 +101,8 @@ class Link {
           take_in({bytes, nullptr}, queue);
           continue;
         }
-        if (end_->broken()) {
-          reject("something in the ring is no frame");
-          go_without_memory("its ring cannot be read");
-        }
+        if (end_->state() == CORTEX_BROKEN) reject("something in the ring is no frame");
+        if (end_->state() != CORTEX_SOUND) go_without_memory("nothing more comes through its ring");
       }
       zmq::message_t message;
       if (!socket_.recv(message, zmq::recv_flags::dontwait)) return true;
@@ -344,9 +342,10 @@ class Link {
     }
     in_ring_ = false;
     end_.reset();
-    socket_.set(zmq::sockopt::unsubscribe, key_);
+    const std::string key = key_;
     attached_ = false;
     attach(false);
+    socket_.set(zmq::sockopt::unsubscribe, key);  // after that, so that the publisher counts us all the time
   }
 
   std::string address_;

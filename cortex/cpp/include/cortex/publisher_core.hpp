@@ -80,7 +80,7 @@ class PublisherCore {
     counters_.bytes += size;
     if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
-    bool on_time = !is_late_;
+    bool on_time = !is_late_ && !readers_.is_moving(true);
     if (has_sockets(outlets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
     on_time &= send_to_ring(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
@@ -91,7 +91,7 @@ class PublisherCore {
   Slot acquire(std::size_t size, bool for_loan) {
     Lock lock(outlets_->mutex);
     prepare(lock, true);
-    if (!provide(size)) return private_slot(size);
+    if (!provide(lock, size)) return private_slot(size);
     Slot slot = readers_.ring().acquire();
     if (slot.index < 0 && !for_loan) {
       wait_for_readers(lock, 0, [&] {
@@ -128,7 +128,7 @@ class PublisherCore {
       latched_ = head;
       latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
     }
-    bool on_time = !is_late_;
+    bool on_time = !is_late_ && !readers_.is_moving(true);
     bool passed_over = false;
     for (Outlet* outlet : {&outlets_->lossy, &outlets_->strict}) {
       if (!outlets_->closed && has_sockets(*outlet)) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
@@ -207,6 +207,7 @@ class PublisherCore {
  private:
   static constexpr std::int64_t refresh_ns = 1'000'000;
   static constexpr std::int64_t silence_ns = 100'000'000;
+  static constexpr std::uint32_t move_ms = 100;
 
   void write_header(std::uint8_t* out, char kind, std::uint64_t sequence, std::int64_t stamp_ns, std::uint64_t size,
                     std::uint64_t aux) const noexcept {
@@ -362,12 +363,15 @@ class PublisherCore {
     return on_time;
   }
 
-  // Whether there are slots for bodies of a size, made if need be.
-  bool provide(std::size_t size) {
-    if (!readers_.has_members() || monotonic_ns() < unavailable_until_ns_) return false;
+  // Whether there are slots for bodies of a size, made if need be. Where there is no memory for them readers are sent to
+  // their sockets, and waited for a little.
+  bool provide(Lock& lock, std::size_t size) {
+    if (!readers_.has_members()) return false;
     if (readers_.ring().provide(size, exact_, readers_.member_count())) return true;
     complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
-    unavailable_until_ns_ = monotonic_ns() + 5'000'000'000;
+    readers_.dissolve();
+    const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(outlets_->lossy), readers_.timeout_ms(outlets_->strict)});
+    await_room(lock, timeout_ms, [&] { return !readers_.is_moving(false); });
     return false;
   }
 
@@ -382,7 +386,6 @@ class PublisherCore {
   std::shared_ptr<net::Complaints> complaints_;
   Readers readers_;
   std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);
-  std::int64_t unavailable_until_ns_ = 0;
   std::uint64_t sequence_ = 0;
   std::uint64_t told_ = 0;  // what readers know that `sequence_` was
   std::string latched_;

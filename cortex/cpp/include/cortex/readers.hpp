@@ -23,6 +23,7 @@ struct Reader {
   Outlet* outlet = nullptr;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the outlet
   std::uint64_t confirmed = 0;  // it has accounted for all below this
+  bool is_moving = false;       // it was sent from the ring to its socket, and has not come there yet
 };
 
 // Calls are made under the publisher's lock. Readers are shared so that one may leave while the publisher, having let
@@ -67,6 +68,26 @@ class Readers {
   int put(Span<const std::uint8_t> frame) noexcept { return has_members() ? ring_->put(frame) : CORTEX_WRITTEN; }
   void end(Span<const std::uint8_t> frame) noexcept {
     if (has_members()) ring_->end(frame);
+  }
+
+  // Sends all members of the ring to their sockets, for good.
+  void dissolve() noexcept {
+    ring_->dissolve();
+    ring_.reset();
+    is_dissolved_ = true;
+    for (const auto& reader : all_) {
+      if (reader->member < 0) continue;
+      reader->member = -1;
+      reader->is_moving = true;
+      --members_;
+      ++(reader->outlet->strict ? strict_ : lossy_);
+    }
+  }
+  // Whether some reader has still to come to its socket; a reliable one misses what is sent meanwhile.
+  bool is_moving(bool strict_only) const noexcept {
+    return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
+      return reader->is_moving && (reader->request.strict || !strict_only);
+    });
   }
 
   // The ring; there is one if it has members.
@@ -116,7 +137,7 @@ class Readers {
   void join(Reader& reader, std::uint64_t first, Listener& listener) {
     CortexHello hello;
     if (!listener.take(reader.request.source, reader.request.reader, hello)) return;
-    if (ring_ == nullptr) ring_ = Broadcast::open(reader.request.source);
+    if (ring_ == nullptr && !is_dissolved_) ring_ = Broadcast::open(reader.request.source);
     if (ring_ == nullptr) {
       cortex_hello_close(&hello);
     } else {
@@ -126,6 +147,7 @@ class Readers {
 
   List all_;
   std::unique_ptr<Broadcast> ring_;
+  bool is_dissolved_ = false;
   std::size_t members_ = 0;
   std::size_t lossy_ = 0;
   std::size_t strict_ = 0;
