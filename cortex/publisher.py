@@ -191,9 +191,10 @@ class Publisher(Generic[T]):
             published when the block ends, and dropped if the block raises. Do not keep its arrays.
 
         Raises:
-            RuntimeError: All slots are out on loan.
+            RuntimeError: All slots are out on loan. Reliable readers that have not come to them are waited for as
+                by `publish`.
         """
-        loan = self.try_loan(dtypes, **dims)
+        loan = self._lend(dtypes, dims, may_wait=True)
         if loan is None:
             with self._lock:
                 self._skip()
@@ -215,13 +216,18 @@ class Publisher(Generic[T]):
         Returns:
             The message; None if there is no slot for it now.
         """
+        return self._lend(dtypes, dims, may_wait=False)
+
+    def _lend(
+        self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
+    ) -> Loan | None:
         size = self.codec.draft_size(dims, dtypes)
         slot = None
         if size > self._inline_max:
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
-                slot = self._acquire(size, now_ns)
+                slot = self._acquire(size, now_ns, may_wait=may_wait)
                 if slot is None and self._fanout.ring.has_slots(size):
                     return None
         self._check_open()

@@ -90,10 +90,8 @@ def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
     assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
 
 
-def test_messages_without_a_slot_go_through_the_ring(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
-    """A C++ publisher that has no descriptor left for slots sends whole bodies through the ring."""
+def test_no_memory_for_slots(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """A C++ publisher that has no descriptor left for slots sends its readers to their sockets."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "full")
     for number in range(100):
@@ -445,7 +443,24 @@ def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> 
     assert result["wrong"] == 0
     assert result["rejected"] == len(bad) + 1 + 1  # with the body, and the ring
     assert result["lost"] == 2  # 4 and 5
-    assert "cannot be read" in peer.end()
+    assert "nothing more comes through its ring" in peer.end()
+
+
+def test_ring_that_ends(programs: Path, impostor: RingImpostor) -> None:
+    """All that is in it is read, what follows comes through the socket, and nothing is rejected."""
+    peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
+    impostor.take_in(impostor.await_key())
+    for number in range(3):
+        assert impostor.ring.send(make_frame(b"M", number, body_of(number)))
+    impostor.ring.dissolve()
+    second = impostor.await_key()
+    assert not second[24] & 1
+    impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(3, b"")))
+    impostor.xpub.send_multipart([make_frame(b"L", 3, b"", size=len(body_of(3))), body_of(3)])
+    impostor.xpub.send(make_frame(b"M", 4, codec_of(Scan).encode(scan(-1, 0), 1000)))
+    result = result_of(peer)
+    assert (result["received"], result["wrong"], result["rejected"], result["lost"]) == (4, 0, 0, 0)
+    peer.end()
 
 
 def test_publisher_that_takes_nobody_in(programs: Path, impostor: RingImpostor) -> None:

@@ -93,7 +93,7 @@ class PublisherCore {
     prepare(lock, true);
     if (!provide(lock, size)) return private_slot(size);
     Slot slot = readers_.ring().acquire();
-    if (slot.index < 0 && !for_loan) {
+    if (slot.index < 0) {
       wait_for_readers(lock, 0, [&] {
         if (!readers_.has_members()) return true;
         slot = readers_.ring().acquire();
