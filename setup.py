@@ -16,6 +16,7 @@ SUBJECTS = [
     "items",
     "native",
     "pack",
+    "ring_reader",
     "socket",
     "unpack",
 ]

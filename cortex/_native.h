@@ -23,6 +23,7 @@ int add_coder(PyObject *module);
 int add_construct(PyObject *module);
 int add_gate(PyObject *module);
 int add_inlet(PyObject *module);
+int add_ring_reader(PyObject *module);
 int add_socket(PyObject *module);
 
 /* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
