@@ -51,7 +51,7 @@ class Matcher:
             if matches(subscriber.topic, publisher.topic)
         }
         subscriber.refused &= wanted.keys()
-        present = subscriber.sources()
+        present = subscriber.sources().keys()
         for source in present - wanted.keys():
             subscriber.forget(source)
         for source in wanted.keys() - present:

@@ -207,7 +207,7 @@ class Node:
     def subscriber(
         self,
         topic: str,
-        message_type: type[T] | None,
+        message_type: type[T] | None = None,
         callback: Callable[[T], object] | None = None,
         *,
         policy: Policy | None = None,

@@ -541,10 +541,10 @@ class Subscriber(Generic[T]):
             self._inlet.exhausted = False  # a descriptor shows nothing until its socket was found empty once
             self._links_changed()
 
-    def sources(self) -> set[int]:
-        """The publishers that are connected and have not left."""
+    def sources(self) -> dict[int, int]:
+        """The publishers that are connected and have not left, and the sequence that comes next of each."""
         with self._turn:
-            return {link.source for link in self._links if link not in self._leaving}
+            return {link.source: link.expected for link in self._links if link not in self._leaving}
 
     def revive(self, source: int) -> bool:
         """A publisher that had left is back: keep its connection; False if there is none. For the node."""

@@ -1,7 +1,8 @@
 """Bags as files of messages of Cortex: written by the rules of the bridge, and read back.
 
 What is written is what the bridge would send, each message at its own stamp, but for drawings of events. What
-is read back are events, pictures, inertial measurements, odometry and commands, of any bag, also of others.
+is read back are events, pictures, inertial measurements, odometry and commands, of any bag, also of others,
+and of ROS 1.
 
     with contextlib.closing(BagWriter(Path("flight.mcap"))) as bag:
         bag.write("/drone/imu", Imu(...))
@@ -16,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader
 
 from cortex import messages
 from cortex.evt3 import EVT3_SIZE_MAX, EventCodecError, EventColumns, Evt3Decoder
@@ -32,6 +33,7 @@ from cortex_ros2_bridge.convert.registry import Rule
 from cortex_ros2_bridge.event_codec import decode_mono, read_dvs
 from cortex_ros2_bridge.frames import rotate
 from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, rule_of, vehicle_of
+from cortex_ros2_bridge.typestore import typestore
 
 __all__ = ["EVENT_TYPES", "BackendError", "BagError", "BagReader", "BagWriter", "ConvertError"]
 
@@ -121,7 +123,7 @@ class BagReader:
     """Reads the messages of a bag that have a counterpart in Cortex.
 
     Args:
-        path: A directory, or a file of type MCAP.
+        path: A directory, a file of type MCAP, or a file of ROS 1 whose name ends in ".bag".
         max_thrust_n: Thrust of an AttitudeTarget with thrust 1 [N]; None: of the default airframe.
 
     Raises:
@@ -135,11 +137,13 @@ class BagReader:
     def __init__(self, path: Path, *, max_thrust_n: float | None = None) -> None:
         self._path = path
         self._max_thrust_n = max_thrust_n
+        self._ros1 = path.suffix == ".bag" and path.is_file()
         try:
-            self._reader = Reader(path)
+            self._reader = (rosbag1 if self._ros1 else rosbag2).Reader(path)
             self._reader.open()
         except Exception as error:  # what rosbags raises for damage is not listed anywhere
             raise BagError(f"{path} is not a readable bag: {error}") from None
+        self._closed = False
         of_commands = [each for each in self._reader.connections if _rules_of(each)]
         self._connections = [each for each in self._reader.connections if each.msgtype in _DECODERS]
         drawn = {f"{each.topic}/image" for each in self._connections if each.msgtype in EVENT_TYPES}
@@ -168,6 +172,8 @@ class BagReader:
                 raise BagError(f"{self._path}: {connection.topic}: {error}") from None
 
     def _decoder_of(self, connection: Connection) -> Callable[[Buffer], Any]:
+        if self._ros1 and connection.msgtype == _EVENT_ARRAY:
+            return lambda data: _event_array(data, ros1=True)
         if connection.msgtype in _DECODERS:
             return _DECODERS[connection.msgtype]()
         rules = _rules_of(connection)
@@ -184,13 +190,16 @@ class BagReader:
     def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, Buffer]]:
         try:
             for connection, _, data in self._reader.messages(connections):
+                if self._ros1 and connection.msgtype != _EVENT_ARRAY:
+                    data = typestore().ros1_to_cdr(data, connection.msgtype)
                 yield connection, data
         except Exception as error:
             raise BagError(f"{self._path} is damaged: {error}") from None
 
     def close(self) -> None:
-        """Close the bag."""
-        if self._reader.is_open:
+        """Close the bag. Closing twice is allowed."""
+        if not self._closed:
+            self._closed = True
             self._reader.close()
 
 
@@ -272,8 +281,8 @@ class _PacketDecoder:
         return self._decoder.decode(made.events, **size)
 
 
-def _event_array(data: Buffer) -> messages.Events:
-    size, columns = read_dvs(data)
+def _event_array(data: Buffer, *, ros1: bool = False) -> messages.Events:
+    size, columns = read_dvs(data, ros1=ros1)
     stamp_us = int(columns.t[0]) if len(columns.t) else 0
     return _events(columns, stamp_us, size)
 
@@ -300,10 +309,11 @@ def _vector(made: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([made.x, made.y, made.z])
 
 
-EVENT_TYPES = frozenset({"event_camera_msgs/msg/EventPacket", "dvs_msgs/msg/EventArray"})
+_EVENT_ARRAY = "dvs_msgs/msg/EventArray"
+EVENT_TYPES = frozenset({"event_camera_msgs/msg/EventPacket", _EVENT_ARRAY})
 _DECODERS: dict[str, Callable[[], Callable[[Buffer], Any]]] = {
     "event_camera_msgs/msg/EventPacket": _PacketDecoder,
-    "dvs_msgs/msg/EventArray": lambda: _event_array,
+    _EVENT_ARRAY: lambda: _event_array,
     "sensor_msgs/msg/Image": lambda: _image,
     "sensor_msgs/msg/Imu": lambda: _imu,
     "nav_msgs/msg/Odometry": lambda: _odometry,

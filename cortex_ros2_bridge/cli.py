@@ -24,6 +24,7 @@ from cortex_ros2_bridge.config import (
     ROOTED,
     SETTINGS,
     BridgeConfig,
+    check_backend,
     check_cortex_domain,
     check_distro,
     check_namespace,
@@ -138,7 +139,7 @@ def _config(options: argparse.Namespace, ros: RosArguments, parameters: Mapping[
     """Return settings: those of the file, over them parameters, over them options, over them remappings."""
     config = load(options.config, parameters)
     checks: dict[str, Callable[[str, object], Any]] = {
-        "backend": lambda _, value: value,
+        "backend": check_backend,
         "distro": check_distro,
         "cortex_domain": check_cortex_domain,
         "namespace": check_namespace,

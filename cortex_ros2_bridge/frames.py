@@ -66,19 +66,20 @@ class FrameNames:
         """Return the name in ROS of a vehicle's body frame."""
         return self.ros(f"{vehicle}/{BODY}" if vehicle else BODY)
 
-    def kind_of(self, ros_frame: str, vehicle: str) -> FrameKind | None:
-        """Return what a frame is that a command names; None if it is none of a vehicle's.
+    def known(self, vehicle: str) -> dict[str, FrameKind]:
+        """Return the frames that a command for a vehicle may name, by their full and by their short names."""
+        ground = self.ros(WORLD), self.odom_of(vehicle), self.map, self.odom, WORLD
+        body = self.body_of(vehicle), f"{vehicle}/{BODY}", BODY
+        heading = self.ros(f"{vehicle}/{HEADING}"), f"{vehicle}/{HEADING}", HEADING
+        return {
+            **dict.fromkeys(ground, "world"),
+            **dict.fromkeys(body, "body"),
+            **dict.fromkeys(heading, "heading"),
+        }
 
-        Besides their full names, `map`, `world`, `odom`, `base_link` and `base_footprint` are understood.
-        """
-        name = ros_frame.lstrip("/")
-        if name in (self.ros(WORLD), self.odom_of(vehicle), self.map, self.odom, WORLD):
-            return "world"
-        if name in (self.body_of(vehicle), f"{vehicle}/{BODY}", BODY):
-            return "body"
-        if name in (self.ros(f"{vehicle}/{HEADING}"), f"{vehicle}/{HEADING}", HEADING):
-            return "heading"
-        return None
+    def kind_of(self, ros_frame: str, vehicle: str) -> FrameKind | None:
+        """Return what a frame is that a command names; None if it is none of a vehicle's."""
+        return self.known(vehicle).get(ros_frame.lstrip("/"))
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Vector:

@@ -16,6 +16,7 @@ from cortex_ros2_bridge.incoming import SERVICES, Caller, Incoming, Target
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
 from cortex_ros2_bridge.routes import INFO, Route, Seen, kind_of, odometry_of, rule_of, vehicle_of
+from cortex_ros2_bridge.run_log import RunLog
 from cortex_ros2_bridge.tally import Tally, Totals
 
 Opened = tuple[Tally, Callable[[], int]]
@@ -89,6 +90,8 @@ class Connections:
         self._static = StaticTransforms(self._frames)
         self._static_publisher: RosPublisher | None = None
         self._resources = contextlib.ExitStack()
+        self._run_log = RunLog(config.ros_topic("/reset"))
+        self._is_logged = False
 
     def open(self, route: Route, seen: Seen) -> Link:
         """Open a route.
@@ -131,9 +134,14 @@ class Connections:
         self._static_publisher.publish(self._static.message())
 
     def watch_vehicles(self, seen: Seen) -> None:
-        """Follow what time it is for the vehicles that are commanded, and what they can do."""
+        """Follow the run, what time it is for the vehicles that are commanded, and what they can do."""
         self._seen = seen
         clock, simulation = (_topic_of(kind, seen) for kind in ("cortex/Clock", "cortex/Simulation"))
+        status = _topic_of("cortex/SimulatorStatus", seen)
+        if status is not None and not self._is_logged:
+            self._is_logged = True
+            feed = self._feed(status, "cortex/SimulatorStatus", self._resources)
+            self._tap(feed, self._run_log.take, lambda: True, self._resources)
         for vehicle, whereabouts in self._vehicles.items():
             topics = odometry_of(vehicle, seen), clock, simulation
             if whereabouts.sources == topics:
@@ -159,6 +167,7 @@ class Connections:
         self._resources.close()
         self._static_publisher = None
         self._static = StaticTransforms(self._frames)
+        self._is_logged = False
 
     def _open_out(self, route: Route, stack: contextlib.ExitStack) -> Opened:
         publisher = self._publisher(route.ros_topic, route.ros_type, route.qos, stack)

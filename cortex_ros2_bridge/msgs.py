@@ -5,8 +5,8 @@
     imu.orientation_covariance[0] = -1.0
 
 A stand-in has the constructor, attributes, defaults, constants and array types of the class that rclpy uses.
-It refuses what that refuses when it checks its fields, as those of Humble always do, and those of Jazzy with
-ROS_PYTHON_CHECK_FIELDS=1: with an `AssertionError`, or the error of the array that the constructor makes.
+As those of Humble do always, and those of Jazzy with ROS_PYTHON_CHECK_FIELDS=1, it refuses values that do not
+fit: with an `AssertionError`, or the error of the array that is made of them.
 """
 
 from __future__ import annotations
@@ -61,13 +61,9 @@ class Field(NamedTuple):
     name: str
     slot: str
     """Attribute that holds the value."""
-    idl_type: str
-    """As rclpy names it, such as "sequence<double>"."""
-    check: Callable[[Any], Any]
-    """Returns the value to store, or raises AssertionError."""
+    description: Any
+    """Its type, as rosbags has it."""
     default: Callable[[], Any]
-    convert: Callable[[Any], Any]
-    """What the constructor does with a value before it is checked."""
 
 
 class Message:
@@ -85,7 +81,7 @@ class Message:
         assert not unknown, f"Invalid arguments passed to constructor: {', '.join(sorted(unknown))}"
         for field in self.__ros_fields__:
             if field.name in values:
-                setattr(self, field.name, field.convert(values[field.name]))
+                setattr(self, field.name, values[field.name])
             else:
                 setattr(self, field.slot, field.default())
 
@@ -166,7 +162,7 @@ def _make_class(type_name: str) -> Any:
         "__qualname__": base,
         "__reduce__": _reduce,
         "__ros_type__": type_name,
-        "_fields_and_field_types": {field.name: field.idl_type for field in fields},
+        "_fields_and_field_types": {field.name: _idl_type(field.description) for field in fields},
         "__ros_fields__": tuple(fields),
     }
     return type(base, (Message,), attributes)
@@ -182,17 +178,15 @@ def _restore(type_name: str, values: list[Any]) -> Any:
     return kind(**dict(zip(kind.get_fields_and_field_types(), values, strict=True)))
 
 
-def _accessor(field: Field) -> Any:
-    slot, check = field.slot, field.check
-
-    def put(self: Message, value: Any) -> None:
-        setattr(self, slot, check(value))
-
-    return property(operator.attrgetter(slot), put, doc=f"Message field '{field.name}'.")
-
-
 def _as_it_is(value: Any) -> Any:
     return value
+
+
+def _accessor(field: Field) -> Any:
+    def put(self: Message, value: Any) -> None:
+        setattr(self, field.slot, _stored(field.name, field.description, value))
+
+    return property(operator.attrgetter(field.slot), put, doc=f"Message field '{field.name}'.")
 
 
 def _idl_type(desc: Any) -> str:
@@ -208,52 +202,27 @@ def _idl_type(desc: Any) -> str:
     return f"sequence<{_idl_type(element)}, {size}>" if size else f"sequence<{_idl_type(element)}>"
 
 
-def _field(name: str, desc: Any) -> Field:
-    check: Callable[[Any], Any]
+def _field(name: str, description: Any) -> Field:
     default: Callable[[], Any]
-    convert: Callable[[Any], Any] = _as_it_is
-    kind, what = desc
+    kind, what = description
     if kind == Nodetype.NAME:
         default = message_class(what)
-        check = _nested(name, default)
     elif kind == Nodetype.BASE:
-        base, limit = what
-        check, default = _scalar(name, base, limit), _DEFAULT_OF[_check_of(base)]
+        default = functools.partial(bytes, 1) if what[0] == "byte" else _PYTHON.get(what[0], int)
     else:
-        element, size = what
-        base = element[1][0] if element[0] == Nodetype.BASE else ""
-        if base in TYPE_CODES and kind == Nodetype.ARRAY:
-            dtype = np.dtype("uint8" if base == "char" else base)
-            check = _fixed(name, base, dtype, size)
-            default = functools.partial(np.zeros, size, dtype)
-            convert = functools.partial(np.array, dtype=dtype)
-        elif base in TYPE_CODES:
-            check = _sequence(name, base, size)
-            default = functools.partial(array.array, TYPE_CODES[base])
-            convert = functools.partial(_to_array, base)
+        (of, element), size = what
+        if of == Nodetype.BASE and element[0] in TYPE_CODES:
+            code = TYPE_CODES[element[0]]
+            zeros = functools.partial(np.zeros, size, code)
+            default = zeros if kind == Nodetype.ARRAY else functools.partial(array.array, code)
         else:
-            one = _field(name, element)
-            check = _list(name, one, size, exact=kind == Nodetype.ARRAY)
-            default = functools.partial(_defaults, one, size) if kind == Nodetype.ARRAY else list
-    return Field(name, f"_{name}", _idl_type(desc), check, default, convert)
+            one = _field(name, what[0])
+            default = functools.partial(_defaults, one, size if kind == Nodetype.ARRAY else 0)
+    return Field(name, f"_{name}", description, default)
 
 
 def _defaults(field: Field, size: int) -> list[Any]:
     return [field.default() for _ in range(size)]
-
-
-def _check_of(base: str) -> str:
-    return {"float32": "float", "float64": "float", "string": "string", "bool": "bool", "byte": "byte"}.get(
-        base, "int"
-    )
-
-
-def _nested(name: str, kind: Any) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        assert isinstance(value, kind), f"The '{name}' field must be a sub message of type '{kind.__name__}'"
-        return value
-
-    return check
 
 
 _PYTHON: dict[str, type[Any]] = {
@@ -266,132 +235,62 @@ _PYTHON: dict[str, type[Any]] = {
 """What Python has for a base type; int for all others."""
 
 
-def _scalar(name: str, base: str, limit: int) -> Callable[[Any], Any]:
-    kind: type[Any] = _PYTHON.get(base, int)
-    low, high = _bounds(base) if kind is int else (-_FLOAT32_MAX, _FLOAT32_MAX)
-    number = "float" if kind is float else "integer" if low else "unsigned integer"
-
-    def check(value: Any) -> Any:
-        if kind is bytes and isinstance(value, bytearray | memoryview):
-            value = bytes(value)
-        assert isinstance(value, kind), f"The '{name}' field must be of type '{kind.__name__}'"
-        if kind is str:
-            assert not limit or len(value) <= limit, f"The '{name}' field must be at most {limit} long"
-        elif kind is bytes:
-            assert len(value) == 1, f"The '{name}' field must have a length of 1"
-        elif kind is int or (base == "float32" and math.isfinite(value)):
-            article = "an" if kind is int else "a"
-            assert low <= value <= high, f"The '{name}' field must be {article} {number} in [{low}, {high}]"
-        return value
-
-    return check
-
-
-_DEFAULT_OF: dict[str, Callable[[], Any]] = {
-    "string": str,
-    "bool": bool,
-    "byte": functools.partial(bytes, 1),
-    "int": int,
-    "float": float,
-}
-
-
-def _bounds(base: str) -> tuple[int, int]:
-    if base == "char":
-        base = "uint8"
-    info = np.iinfo(base)
-    return int(info.min), int(info.max)
-
-
-def _is_collection(value: Any) -> bool:
-    return isinstance(value, Sequence | AbstractSet | UserList | np.ndarray | array.array) and not isinstance(
-        value, str
-    )
-
-
-def _fixed(name: str, base: str, dtype: np.dtype[Any], size: int) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            assert value.dtype == dtype, (
-                f"The '{name}' numpy.ndarray() must have the dtype of 'numpy.{dtype}'"
-            )
-            assert value.shape == (size,), f"The '{name}' numpy.ndarray() must have a size of {size}"
-            return value
-        assert _is_collection(value), f"The '{name}' field must be a set or sequence"
-        assert len(value) == size, f"The '{name}' field must be a set or sequence with length {size}"
-        _check_numbers(name, base, value)
-        return np.array(list(value), dtype=dtype)
-
-    return check
-
-
-def _sequence(name: str, base: str, limit: int) -> Callable[[Any], Any]:
-    code = TYPE_CODES[base]
-
-    def check(value: Any) -> Any:
-        if isinstance(value, array.array):
-            assert value.typecode == code, f"The '{name}' array.array() must have the type code of '{code}'"
-        else:
-            assert _is_collection(value), f"The '{name}' field must be a set or sequence"
-            if not isinstance(value, np.ndarray | bytes):
-                _check_numbers(name, base, value)
-            try:
-                value = _to_array(base, value)
-            except (TypeError, OverflowError) as error:
-                raise AssertionError(
-                    f"The '{name}' field must be a set or sequence and each value of {base}: {error}"
-                ) from None
-        assert not limit or len(value) <= limit, f"The '{name}' field must be at most {limit} long"
-        return value
-
-    return check
-
-
-def _to_array(base: str, value: Any) -> array.array[Any]:
-    """Return a sequence of numbers as an array; without a Python loop where it is one already.
+def _stored(name: str, description: Any, value: Any) -> Any:
+    """Return what a field stores for a value: of numbers in a row, the array that rclpy has.
 
     Raises:
-        TypeError: It is none of numbers, or has more than one dimension.
-        OverflowError: A number does not fit.
+        AssertionError: The field cannot hold it.
+        TypeError, OverflowError: An array of such numbers cannot hold it.
     """
+    kind, what = description
+    if kind == Nodetype.NAME:
+        fits = isinstance(value, message_class(what))
+    elif kind == Nodetype.BASE:
+        base, limit = what
+        fits = _fits(base, limit, value)
+    else:
+        element, size = what
+        fits = isinstance(value, Sequence | AbstractSet | UserList | np.ndarray | array.array)
+        fits = fits and not isinstance(value, str)
+        if fits and element[0] == Nodetype.BASE and element[1][0] in TYPE_CODES:
+            value = _numbers(element[1][0], value, fixed=kind == Nodetype.ARRAY)
+        elif fits:
+            for each in value:
+                _stored(name, element, each)
+        count = len(value) if fits else 0
+        fits = fits and (count == size if kind == Nodetype.ARRAY else not size or count <= size)
+    assert fits, f"The '{name}' field must be of type '{_idl_type(description)}', got {value!r:.80}"
+    return value
+
+
+def _fits(base: str, limit: int, value: Any) -> bool:
+    """Return whether a value is one of a base type; `limit` is the longest text, 0: any."""
+    kind = _PYTHON.get(base, int)
+    if not isinstance(value, kind):
+        return False
+    if kind is int:
+        info = np.iinfo(TYPE_CODES[base])
+        return bool(info.min <= value <= info.max)
+    if base == "float32":
+        return not math.isfinite(value) or abs(value) <= _FLOAT32_MAX
+    return len(value) == 1 if kind is bytes else kind is not str or not limit or len(value) <= limit
+
+
+def _numbers(base: str, value: Any, *, fixed: bool) -> Any:
+    """Return numbers in a row as rclpy has them; without a Python loop where they are an array already."""
     code = TYPE_CODES[base]
-    flat: array.array[Any] = array.array(code)
-    if isinstance(value, np.ndarray) and value.ndim != 1:
-        raise TypeError(f"only arrays of one dimension can be converted, got {value.ndim}")
-    if isinstance(value, np.ndarray) and value.dtype == np.dtype("uint8" if base == "char" else base):
-        flat.frombytes(np.ascontiguousarray(value).view(np.uint8).data)
-        return flat
-    if code == "B" and isinstance(value, bytes | bytearray):
-        flat.frombytes(value)
-        return flat
-    return array.array(code, value)
-
-
-def _check_numbers(name: str, base: str, values: Any) -> None:
-    check = _scalar(name, base, 0)
-    for value in values:
-        check(value)
-
-
-def _list(name: str, one: Field, size: int, *, exact: bool) -> Callable[[Any], Any]:
-    kind = type(one.default()).__name__
-
-    def check_all(value: Any) -> Any:
-        assert _is_collection(value), f"The '{name}' field must be a set or sequence"
-        for element in value:
-            try:
-                one.check(element)
-            except AssertionError:
-                raise AssertionError(
-                    f"The '{name}' field must be a set or sequence and each value of type '{kind}'"
-                ) from None
-        if exact:
-            assert len(value) == size, f"The '{name}' field must be a set or sequence with length {size}"
-        else:
-            assert not size or len(value) <= size, f"The '{name}' field must be at most {size} long"
-        return value
-
-    return check_all
+    if isinstance(value, np.ndarray):
+        if value.ndim != 1 or (fixed and value.dtype != np.dtype(code)):
+            raise TypeError(
+                f"an array of {value.ndim} dimensions of {value.dtype} for one of {np.dtype(code)}"
+            )
+        if not fixed and value.dtype == np.dtype(code):
+            return array.array(code, value.tobytes())
+    if isinstance(value, array.array) and value.typecode != code:
+        raise TypeError(f"an array of type code {value.typecode!r} for one of {code!r}")
+    if fixed:
+        return value if isinstance(value, np.ndarray) else np.array(list(value), code)
+    return value if isinstance(value, array.array) else array.array(code, value)
 
 
 @functools.cache

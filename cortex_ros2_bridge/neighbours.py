@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 
 from cortex import Node
@@ -36,6 +37,7 @@ class Neighbours:
         ours = {route.ros_topic: route for route in routes}
         return (
             self._of_other_types(ours)
+            + self._of_unread_topics(ours)
             + self._of_another_bridge(ours, config, now_s)
             + self._of_settings(seen, config, now_s)
         )
@@ -56,6 +58,24 @@ class Neighbours:
                 hint = f"; for {info.type_name}: {' or '.join(right)}" if right else ""
                 notes.append(
                     f"{info.topic}: a node publishes {info.type_name}, wanted is {route.ros_type}{hint}"
+                )
+        return notes
+
+    def _of_unread_topics(self, ours: dict[str, Route]) -> list[str]:
+        """Say which topics that nobody reads look like one of our commands."""
+        notes = []
+        for info in self._backend.topics():
+            if info.topic in ours or info.subscriber_count or not info.publisher_count:
+                continue
+            commands = [
+                route.ros_topic
+                for route in ours.values()
+                if (route.direction, route.ros_type) == ("in", info.type_name)
+            ]
+            if near := difflib.get_close_matches(info.topic, commands, 1):
+                notes.append(
+                    f"{info.topic}: a node publishes {info.type_name}, which nobody reads; "
+                    f"did you mean {near[0]}?"
                 )
         return notes
 

@@ -50,6 +50,7 @@ OPTIONS: Mapping[str, Option] = MappingProxyType(
         **dict.fromkeys(_STANDARD_DEVIATIONS, _not_negative(0.0)),
         **dict.fromkeys(_LIMITS, _not_negative(None)),
         "encoding": _one_of("evt3", "mono"),
+        "packet_rate_hz": _not_negative(None),
         "period_s": _not_negative(1.0 / 30.0),
         "stale_s": Option(0.5, lambda v: v is None or (_is_number(v) and v > 0.0), "a number > 0 or null"),
         "stamp": _one_of("header", "now"),

@@ -53,9 +53,9 @@ class Tally(Totals):
         """Count a message that went out."""
         self._count("sent", 1)
 
-    def refuse(self, reason: str) -> None:
-        """Count a message that makes no sense."""
-        self._count("refused", 1, reason)
+    def refuse(self, reason: str, count: int = 1) -> None:
+        """Count messages that make no sense."""
+        self._count("refused", count, reason)
 
     def clamp(self, reason: str) -> None:
         """Count a command that was out of range."""

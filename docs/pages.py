@@ -161,10 +161,20 @@ def python_page() -> str:
     """The names of `import neurosim_core as ns`, from their docstrings."""
     lines = ["# Python", "", "`import neurosim_core as ns` offers these names; nothing else is public."]
     for home, names in ns._HOMES.items():
-        for name in names:
-            if home != "neurosim_core.packets":  # they have a page of their own
-                lines += ["", f"::: {home}.{name}", "    options:", f"      heading: ns.{name}"]
+        if home != "neurosim_core.packets":  # they have a page of their own
+            lines += [line for name in names for line in entry(f"{home}.{name}", f"ns.{name}")]
+    lines += ["", "## ns.data", "", "Windows of events with ground truth: [data sets](../data.md)."]
+    for name, home in ns.data._HOME.items():
+        lines += entry(f"neurosim_core.data.{home}.{name}", f"ns.data.{name}")
+    lines += ["", "## ns.sensors", "", "What [sensors of your own](../tutorials/own-sensor.md) are made of."]
+    for name, home in ns.sensors._HOME.items():
+        lines += entry(f"{home}.{name}", f"ns.sensors.{name}")
     return "\n".join(lines) + "\n"
+
+
+def entry(place: str, heading: str) -> list[str]:
+    """Return the lines that bring the documentation of a name."""
+    return ["", f"::: {place}", "    options:", f"      heading: {heading}"]
 
 
 def messages_page() -> str:

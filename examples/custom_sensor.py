@@ -33,7 +33,7 @@ class ProximityConfig(StateSensorConfig):
     """A switch that closes below a height."""
 
     kind: Literal["proximity"] = "proximity"
-    rate_hz: float = 100.0
+    rate_hz: ns.sensors.RateHz = 100.0
     """Readings a second [Hz]."""
     threshold_m: float = 1.0
     """Height below which it closes [m]."""

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
     from neurosim_core.control.setpoints import AttitudeThrust, BodyRates, MotorSpeeds, Position, Velocity
     from neurosim_core.frames import Mount
+    from neurosim_core.live.messages import message_type, to_packet
     from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
     from neurosim_core.record import Recording
     from neurosim_core.registry import register
@@ -39,6 +40,7 @@ _HOMES = {
         "Velocity",
     ),
     "neurosim_core.frames": ("Mount",),
+    "neurosim_core.live.messages": ("message_type", "to_packet"),
     "neurosim_core.packets": ("Collision", "Events", "Image", "ImuSample", "Odometry", "Packet"),
     "neurosim_core.record": ("Recording",),
     "neurosim_core.registry": ("register",),
@@ -88,6 +90,7 @@ __all__ = [
     "make_model",
     "make_renderer",
     "make_state",
+    "message_type",
     "packets",
     "preset",
     "register",
@@ -97,6 +100,7 @@ __all__ = [
     "scene",
     "sensors",
     "step",
+    "to_packet",
     "to_yaml",
     "upload_scene",
 ]

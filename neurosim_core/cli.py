@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -24,6 +25,8 @@ from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
+    from neurosim_core.config import SimulationConfig
+
     _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
@@ -35,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
+    arguments.began_s = began_s
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         if arguments.computes:
             from neurosim_core.warp_start import start_warp
@@ -109,14 +114,12 @@ def _parser() -> argparse.ArgumentParser:
 def _add_run(commands: _Commands) -> None:
     run = commands.add_parser("run", help="fly, record, and draw a picture of it")
     _add_settings(run)
+    _add_print_config(run)
     run.add_argument(
         "--out", type=Path, metavar="DIR", help="where to leave the flight (default: ./flight, flight-2, ...)"
     )
     run.add_argument("--overwrite", action="store_true", help="replace a flight that is already in --out")
     run.add_argument("--no-rrd", action="store_true", help="leave out flight.rrd")
-    run.add_argument(
-        "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
-    )
     run.set_defaults(command=_run)
 
 
@@ -273,8 +276,15 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
 
 
+def _add_print_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
+    )
+
+
 def _add_live(parser: argparse.ArgumentParser) -> None:
     """What a simulator needs to know besides."""
+    _add_print_config(parser)
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for the command of every control period"
     )
@@ -330,24 +340,33 @@ def _run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     with Console(stderr=True).status("preparing: libraries"):  # on the screen before they are there
-        from neurosim_core.config import load_config, to_yaml
+        from neurosim_core.config import load_config
 
         config = load_config(arguments.config, overrides=_overrides(arguments), options=_options(arguments))
         if not arguments.print_config:
             from neurosim_core.flight import fly, new_folder
     if arguments.print_config:
-        print(to_yaml(config, comments=True), end="")
-        return 0
+        return _print_config(config)
     folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-    report = fly(config, folder, rerun=not arguments.no_rrd)
+    report = fly(config, folder, rerun=not arguments.no_rrd, began_s=arguments.began_s)
     return 130 if report.interrupted else 0
+
+
+def _print_config(config: SimulationConfig) -> int:
+    from neurosim_core.config import to_yaml
+
+    print(to_yaml(config, comments=True), end="")
+    return 0
 
 
 def _serve(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.live.serve import serve
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
+    if arguments.print_config:
+        return _print_config(config)
+    from neurosim_core.live.serve import serve
+
     return serve(config, record=arguments.record, overwrite=arguments.overwrite)
 
 
@@ -369,9 +388,12 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 def _up(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.live.up import up
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
+    if arguments.print_config:
+        return _print_config(config)
+    from neurosim_core.live.up import up
+
     return up(config, viewer=arguments.viewer, record=arguments.record, overwrite=arguments.overwrite)
 
 

@@ -204,6 +204,10 @@ class SimulationConfig(Settings):
                 )
             if name == "odometry" and sensor.kind != "odometry":
                 raise ValueError(f"a sensor named 'odometry' must be of kind odometry, got {sensor.kind}")
+            try:
+                _ = sensor.clock, sensor.packets
+            except ValueError as error:  # of a kind of others, whose fields have no bounds
+                raise ValueError(f"{name}: {error}") from None
         return sensors
 
     @model_validator(mode="after")

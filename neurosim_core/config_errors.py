@@ -12,6 +12,8 @@ from pydantic import BaseModel, ValidationError
 
 _GROUP = frozenset({"model_type", "model_attributes_type", "dict_type", "dataclass_type"})
 _LIST = frozenset({"tuple_type", "list_type"})
+_OTHER_TYPE = _LIST | {"missing", "too_long", "too_short"}
+"""Errors of a value that is of none of several types, besides `..._type` and `..._parsing`."""
 _SHOWN_MAX = 80
 
 
@@ -22,8 +24,9 @@ def explain(model: type[BaseModel], error: ValidationError) -> list[str]:
         model: What was to be made.
         error: Why it could not be.
     """
-    items = error.errors()
+    items: list[Mapping[str, Any]] = [*error.errors()]
     # a list of which an item is wrong is also said to be too short, and one that is too short to lack items
+    items = list(_of_choices(model, items))
     inner = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
     lines = [
         _line(model, item) for item in items if not (item["type"] == "too_short" and item["loc"] in inner)
@@ -83,6 +86,40 @@ def _holds(raw: Mapping[str, Any], key: str) -> bool:
     return True
 
 
+def _of_choices(model: type[BaseModel], items: list[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """Join the errors of a value that may be of several types, such as a number or a list of three.
+
+    Each type has its own errors: those of the type that the value is of remain, else one of them all.
+    """
+    seen: set[tuple[int | str, ...]] = set()
+    for item in items:
+        place = _choice(model, item["loc"])
+        if place is None:
+            yield item
+        elif place not in seen:
+            seen.add(place)
+            own = [other for other in items if other["loc"][: len(place)] == place]
+            inner = [
+                other
+                for other in own
+                if not (other["type"] in _OTHER_TYPE or other["type"].endswith(("_type", "_parsing")))
+            ]
+            for other in inner:
+                yield {**other, "loc": place + other["loc"][len(place) + 1 :]}
+            if not inner:
+                yield {"type": "choice", "loc": place, "input": own[0]["input"]}
+
+
+def _choice(model: type[BaseModel], loc: tuple[int | str, ...]) -> tuple[int | str, ...] | None:
+    """Return the place of a value that may be of several types, none a group, above that of an error."""
+    for size in range(1, len(loc)):
+        annotation = _follow(model, loc[:size])[0]
+        choices = [choice for choice in _alternatives(annotation) if choice is not type(None)]
+        if len(choices) > 1 and not any(map(_is_model, choices)) and isinstance(loc[size], str):
+            return loc[:size]
+    return None
+
+
 def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
     kind, loc, value = item["type"], item["loc"], item["input"]
     if kind == "missing" and isinstance(loc[-1], int):  # of a list of so many numbers
@@ -105,7 +142,10 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
     if kind == "union_tag_invalid":
         context = item["ctx"]
         own = "; one of your own is found once its module is imported, or installed as a plugin"
-        hint = own if loc[0] == "sensors" else ""
+        hint = suggestion(
+            str(context["tag"]), [tag.strip(" '") for tag in context["expected_tags"].split(",")]
+        )
+        hint = f"; {hint}".rstrip("; ") or (own if loc[0] == "sensors" else "")
         return f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}{hint}"
     if kind == "value_error":
         reason = item["msg"].removeprefix("Value error, ")
@@ -113,7 +153,7 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
     got = f", got {_shorten(value)}"
     if loc and loc[-1] == "[key]":
         return f"{'.'.join(keys[:-1])}: a name is a letter, then letters, digits and _{got}"
-    if kind in _LIST or kind in _GROUP:
+    if kind == "choice" or kind in _LIST or kind in _GROUP:
         return f"{shown}: must be {_wanted(annotation)}{got}"
     if kind == "too_short":
         least = item["ctx"]["min_length"]
@@ -122,6 +162,10 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
         return f"{shown}: must be the name of a file{got}"
     if shown.endswith("_rad") and isinstance(value, int | float) and kind.startswith("less_than"):
         got += f"; if these are degrees, write {math.radians(value):.6g}"
+    if shown.endswith(("latency_s", "jitter_s")) and isinstance(value, int | float):
+        got += (
+            f"; if these are milliseconds, write {1e-3 * value:.6g}" if kind.startswith("less_than") else ""
+        )
     reason = item["msg"].partition(", unable to")[0].partition(", got")[0]
     return f"{shown}: {reason}{got}" if shown else f"{reason}{got}"
 
@@ -241,7 +285,8 @@ def _described(choice: Any) -> str:
             return f"a list, such as [{_example(inner)}]"
         size = len(get_args(inner))
         return f"a list of lists of {size} numbers" if get_origin(inner) is tuple else "a list of numbers"
-    return getattr(choice, "__name__", "something else")
+    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    return names.get(choice, str(getattr(choice, "__name__", "something else")))
 
 
 def _example(model: type[BaseModel]) -> str:

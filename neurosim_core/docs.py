@@ -30,7 +30,7 @@ def add_parser(commands: Any) -> None:
 
 
 def build_site() -> Path:
-    """Build the site; a warning is an error. Return its folder.
+    """Build the site, and say that it takes its time; a warning is an error. Return its folder.
 
     Raises:
         FileNotFoundError: The package lies outside of a checkout, which has the documents.
@@ -41,6 +41,7 @@ def build_site() -> Path:
         raise FileNotFoundError(f"no documents beside {ROOT / 'neurosim_core'}: they are in a checkout")
     if importlib.util.find_spec("mkdocstrings") is None or importlib.util.find_spec("material") is None:
         raise ImportError(f"the site needs a generator: {install_hint('docs')}")
+    print("building the site (half a minute)", flush=True)
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(SITE)]
     done = subprocess.run(
         command,
@@ -65,7 +66,6 @@ def is_current() -> bool:
 
 def _docs(arguments: argparse.Namespace) -> int:
     if arguments.build or not is_current():
-        print("building the site (half a minute)", flush=True)
         build_site()
     if arguments.build:
         print(f"{SITE / 'index.html'}")

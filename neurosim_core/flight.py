@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 import yaml
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -41,6 +42,7 @@ from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import open_rerun
 from neurosim_core.view.rerun_shapes import scene_shapes
+from neurosim_core.warp_start import has_kernels
 
 _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
 """What a recording needs, and the extra that brings it."""
@@ -73,7 +75,12 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
 
 
 def fly(
-    config: SimulationConfig, folder: Path, *, rerun: bool = True, console: Console | None = None
+    config: SimulationConfig,
+    folder: Path,
+    *,
+    rerun: bool = True,
+    console: Console | None = None,
+    began_s: float | None = None,
 ) -> FlightReport:
     """Fly a configuration and leave config.yaml, flight.h5, flight.rrd and overview.png in a folder.
 
@@ -86,6 +93,7 @@ def fly(
         folder: Where to leave the flight; made if need be.
         rerun: Write flight.rrd.
         console: Where to print; standard output if None.
+        began_s: When the command began, as `time.perf_counter` says; None: now.
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
@@ -94,18 +102,24 @@ def fly(
     console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()
     begin = time.perf_counter()
+    began_s = begin if began_s is None else began_s
+    report.libraries_s = begin - began_s
+    if not has_kernels():
+        console.print(
+            "first flight here: its kernels are compiled, which takes 10 s to a minute, and kept in "
+            f"{wp.config.kernel_cache_dir}",
+            highlight=False,
+        )
     with _new_folder(folder), console.status("preparing") as status:
         model = make_model(
             config, on_phase=lambda phase: status.update(f"preparing: {phase}"), meanwhile=warm_flight
         )
-        status.update(
-            "preparing: kernels (the first run compiles them, 10 s to a minute; then they are kept)"
-        )
+        status.update("preparing: kernels (compiled once, then kept)")
         state = make_state(model)
         packets = run_model(model, state)
         first = next(packets, None)  # builds all kernels; there is none without sensors
         (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
-    report.setup_s = time.perf_counter() - begin
+    report.setup_s = time.perf_counter() - began_s
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
 
@@ -123,7 +137,7 @@ def fly(
                         break
                     files.write(packet)
                     summary.log(packet)
-                    report.note(model, packet)
+                    report.note(packet)
                     report.flight_s = time.perf_counter() - begin
                     if packet.stamp_ns > report.simulated_ns:
                         report.simulated_ns = packet.stamp_ns
@@ -142,8 +156,9 @@ def fly(
             report.failure = OSError(f"{error}; flight.h5 is kept up to {files.kept_ns / NS_PER_S:.3f} s")
     report.flight_s = time.perf_counter() - begin
     report.event_count = summary.event_count
+    begin = time.perf_counter()
     if _has("matplotlib", console, "overview.png"):
-        track = None if report.tracking_errors_m else _planned_track(model, state.stamp_ns)
+        track = None if report.positions else _planned_track(model, state.stamp_ns)
         factor = report.real_time_factor
         try:
             save_overview(
@@ -152,6 +167,7 @@ def fly(
         except OSError as error:
             (folder / "overview.png").unlink(missing_ok=True)
             console.print(f"overview.png is left out: {error}", style="yellow", markup=False)
+    report.overview_s = time.perf_counter() - begin
     print_report(console, model, state, report, folder)
     if report.failure is not None:
         raise report.failure
@@ -329,7 +345,7 @@ class _Files:
         self._checked_s = time.monotonic()
         why = ""
         try:
-            self._rerun.flush()
+            self._rerun.check()
         except OSError as error:
             why = str(error)
         if shutil.disk_usage(self._folder).free < _ROOM_BYTES:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -28,17 +29,24 @@ class FlightReport:
     """What is told about a flight besides its packets."""
 
     setup_s: float = 0.0
-    """Wall-clock time until the first packet [s]."""
+    """Wall-clock time until the first packet, from the beginning of the command [s]."""
+    libraries_s: float = 0.0
+    """What of it had passed before the settings were there [s]."""
     setup_wall_s: dict[str, float] = field(default_factory=dict)
     """What of `State.wall_s` had passed by then."""
     flight_s: float = 0.0
     """Wall-clock time of the flight, recording included [s]."""
+    overview_s: float = 0.0
+    """Wall-clock time to draw the overview [s]."""
     simulated_ns: int = 0
     event_count: int = 0
-    packet_count: int = 0
+    packet_counts: dict[str, int] = field(default_factory=dict)
+    """By sensor."""
+    lost_counts: dict[str, int] = field(default_factory=dict)
+    """How many of each sensor are lost between its packets."""
     collisions: list[Collision] = field(default_factory=list)
-    tracking_errors_m: list[float] = field(default_factory=list)
-    """Distance from the path at every odometry packet [m]."""
+    positions: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
+    """Stamp [ns] and p_WB [m] of every odometry packet."""
     interrupted: bool = False
     failure: DynamicsError | OSError | None = None
     """What ended the flight early."""
@@ -48,14 +56,15 @@ class FlightReport:
         """Simulated time over wall-clock time."""
         return self.simulated_ns / NS_PER_S / self.flight_s if self.flight_s > 0.0 else 0.0
 
-    def note(self, model: Model, packet: Packet) -> None:
+    def note(self, packet: Packet) -> None:
         """Take one packet."""
-        self.packet_count += 1
+        count = self.packet_counts.get(packet.sensor, 0) + 1
+        self.packet_counts[packet.sensor] = count
+        self.lost_counts[packet.sensor] = packet.sequence + 1 - count
         if isinstance(packet, Collision):
             self.collisions.append(packet)
         elif isinstance(packet, Odometry):
-            wanted = model.path.evaluate([packet.stamp_ns]).position[0]
-            self.tracking_errors_m.append(float(np.linalg.norm(packet.position - wanted)))
+            self.positions.append((packet.stamp_ns, packet.position.copy()))
 
 
 def print_plan(console: Console, model: Model) -> None:
@@ -104,12 +113,16 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
         facts.add_row("renders", f"{counts['renders']:,} ({groups})")
         if model.schedule.sparse:
             facts.add_row("left out", _describe_left_out(counts))
+    if model.config.sensors:
+        counts_of = (_describe_packets(name, report, state) for name in model.config.sensors)
+        facts.add_row("packets", ", ".join(counts_of))
     if any(isinstance(sensor, EventSensorConfig) for sensor in model.config.sensors.values()):
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")
-    if report.tracking_errors_m:
-        errors_cm = 100.0 * np.array(report.tracking_errors_m)
+    if report.positions:
+        stamp_ns, position = map(np.array, zip(*report.positions, strict=True))
+        errors_cm = 100.0 * np.linalg.norm(position - model.path.evaluate(stamp_ns).position, axis=1)
         rms_cm = np.sqrt((errors_cm**2).mean())
         facts.add_row("path", f"followed to {rms_cm:.1f} cm RMS, {errors_cm.max():.1f} cm at most")
     ending = "; the run ended there" if state.ended else ""
@@ -127,16 +140,19 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     spent.add_column("time went to", min_width=24)
     spent.add_column("s", justify="right")
     spent.add_column("share", justify="right")
-    setup = {f"set-up: {phase}": seconds for phase, seconds in model.setup_s.items()}
+    setup = {"set-up: libraries, settings": report.libraries_s}
+    setup |= {f"set-up: {phase}": seconds for phase, seconds in model.setup_s.items()}
     setup["set-up: kernels, first packet"] = max(0.0, report.setup_s - sum(setup.values()))
     inside = {phase: seconds - report.setup_wall_s.get(phase, 0.0) for phase, seconds in state.wall_s.items()}
     inside["recording and drawing"] = max(0.0, report.flight_s - sum(inside.values()))
+    inside["overview"] = report.overview_s
     rows = [*setup.items(), *inside.items()]
     total = sum(seconds for _, seconds in rows)
     for name, seconds in rows:
         if seconds < 0.005:
             continue
         spent.add_row(name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %")
+    spent.add_row("all", f"{total:.2f}", "100 %")
     console.print()
     console.print(spent, highlight=False)
     console.print()
@@ -159,6 +175,14 @@ def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:
     more = f"; {redone:,} intervals were too rough for that, and redone in adaptive steps" if redone else ""
     steps = f"rkmk4, at most {1e3 * vehicle.max_step_s:g} ms{more}"
     return f"{counts['steps']:,} of the dynamics ({steps}), {commands}"
+
+
+def _describe_packets(name: str, report: FlightReport, state: State) -> str:
+    """Say how many packets a sensor has given, and how many it has lost."""
+    count, lost = report.packet_counts.get(name, 0), report.lost_counts.get(name, 0)
+    if count == 0 and (samples := state.sequence.get(name, 0)):
+        return f"[yellow]{name} none of {samples:,}: its packet() returned None each time[/]"
+    return f"{name} {count:,}" + (f" ({lost:,} lost)" if lost else "")
 
 
 def _describe_group(group: RenderGroup) -> str:

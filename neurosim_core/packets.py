@@ -210,6 +210,8 @@ def _field_schema(cls: type, name: str, hint: Any, doc: str) -> FieldSchema:
         spec = next((extra for extra in extras if isinstance(extra, FieldSpec)), None)
     if get_origin(kind) is Literal:
         kind = type(get_args(kind)[0])
+    if (alias := getattr(get_origin(kind), "__value__", None)) is not None:  # NDArray of NumPy 2.5
+        kind = alias[get_args(kind)]
     dtype = spec.dtype if spec is not None else ""
     is_array = get_origin(kind) is np.ndarray
     if not dtype and is_array:

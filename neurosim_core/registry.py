@@ -15,6 +15,7 @@ import importlib
 import importlib.metadata
 import logging
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TypeVar
@@ -41,7 +42,8 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
         kind: The name under which settings ask for the class, such as "depth".
 
     Raises:
-        ValueError: There is no such seam, or another class has this kind.
+        TypeError: The class lacks what every class of the seam has.
+        ValueError: There is no such seam, another class has this kind, or the class says that it has another.
     """
     table = _table(seam)
 
@@ -54,9 +56,17 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
                 f"the {seam} kind {kind!r} is taken by {known.__module__}.{known.__qualname__}: "
                 f"give {cls.__module__}.{cls.__qualname__} another"
             )
+        own = getattr(cls, "model_fields", {}).get("kind")
+        if own is not None and own.default != kind:
+            raise ValueError(
+                f"{cls.__qualname__} is registered as the {seam} kind {kind!r}, and its field `kind` says "
+                f"{own.default!r}: give both the same name"
+            )
+        check: Callable[[], None] | None = getattr(cls, "check_class", None)
+        if check is not None:
+            check()
         table[kind] = cls
-        for listener in _listeners:
-            listener(seam)
+        _tell(seam)
         return cls
 
     return add
@@ -94,7 +104,7 @@ def load_plugins() -> None:
     """Import every module of `neurosim_core.sensors`, and those that entry points name, once in a process.
 
     A foreign module that cannot be imported is left out with a warning: one broken package must not take the
-    others down.
+    others down. What it has registered before it failed is forgotten.
     """
     global _loaded
     if _loaded:
@@ -104,10 +114,26 @@ def load_plugins() -> None:
     for module in pkgutil.iter_modules(sensors.__path__, f"{sensors.__name__}."):
         importlib.import_module(module.name)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
+        before = {seam: dict(table) for seam, table in _tables.items()}
         try:
             entry.load()
         except Exception as error:  # whatever a foreign module raises when it is imported
+            for seam, table in _tables.items():
+                broken = [
+                    kind
+                    for kind in table.keys() - before[seam].keys()
+                    if table[kind].__module__ not in sys.modules
+                ]
+                for kind in broken:
+                    del table[kind]
+                if broken:
+                    _tell(seam)
             _logger.warning("the plug-in %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
+
+
+def _tell(seam: str) -> None:
+    for listener in _listeners:
+        listener(seam)
 
 
 def _table(seam: str) -> dict[str, type]:

@@ -44,6 +44,11 @@ def start_warp() -> None:
     wp._src.context.runtime.get_clang_pch_dir = _header_folder  # type: ignore[attr-defined]
 
 
+def has_kernels() -> bool:
+    """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
+    return any(Path(str(wp.config.kernel_cache_dir)).glob("wp_neurosim_core.*"))
+
+
 def _header_folder() -> str:
     """Return the folder of the kernel cache with Warp's precompiled headers for kernels of a CPU.
 

@@ -84,8 +84,18 @@ def test_the_report_says_what_was_flown(flown):
         "motor_lag",
         "time went to",
         f"{events:,}",
+        "packets",
+        "rgb 7",
     ):
         assert part in said
+    spent = {
+        row[1]: float(row[2])
+        for row in re.finditer(r"(?m)^(\S.*?) +(\d+\.\d\d) +\d+ %", said.split("time went to")[1])
+    }
+    assert {"set-up: libraries, settings", "recording and drawing", "overview"} <= spent.keys()
+    assert spent.pop("all") == pytest.approx(
+        sum(spent.values()), abs=0.005 * (len(spent) + 5)
+    )  # rounded rows
 
 
 def test_the_overview_is_a_picture(flown):
@@ -147,7 +157,7 @@ def test_view_serves_a_file_on_its_port_and_ends_with_its_viewer(flown):
 def test_view_without_a_display_says_what_to_do(flown, monkeypatch, capfd):
     folder, _ = flown
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")
     assert cli.main(["view", str(folder)]) == 1
     assert "there is no display to open a window on: `neurosim view FILE --web`" in capfd.readouterr().err
 
@@ -236,12 +246,20 @@ def test_folders_are_numbered_when_none_is_asked_for(tmp_path, monkeypatch):
         folder.mkdir()
 
 
-def test_printed_settings_are_settings(tmp_path, capsys):
-    assert cli.main(["run", "--print-config", "--set", "scene.seed=3", "--duration", "2"]) == 0
+@pytest.mark.parametrize(
+    ("command", "live"),
+    [
+        (["run"], {}),
+        (["serve", "--lockstep"], {"mode": "lockstep", "run_on": False}),
+        (["up"], {"run_on": False}),
+    ],
+)
+def test_printed_settings_are_settings(tmp_path, capsys, command, live):
+    assert cli.main([*command, "--print-config", "--set", "scene.seed=3", "--duration", "2"]) == 0
     said = capsys.readouterr().out
     file = tmp_path / "scene.yaml"
     file.write_text(said)
-    assert load_config(file) == load_config({"scene": {"seed": 3}, "duration_s": 2.0})
+    assert load_config(file) == load_config({"scene": {"seed": 3}, "duration_s": 2.0, "live": live})
     assert sum(line.lstrip().startswith("#") for line in said.splitlines()) > 50
 
 
@@ -249,6 +267,7 @@ def test_printed_settings_are_settings(tmp_path, capsys):
     ("arguments", "said"),
     [
         (["run", "nothing.yaml"], "nothing.yaml"),
+        (["run", "--set", "links.imu.latency_s=8"], "got 8; if these are milliseconds, write 0.008"),
         (["run", "--set", "scene.romms=3"], "did you mean 'rooms'"),
         (["run", "--set", "duration_s"], "KEY=VALUE"),
         (["run", "--device", "cuda:77"], "cuda:77"),

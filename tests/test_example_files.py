@@ -8,7 +8,11 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
+import neurosim_core as ns
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -38,6 +42,7 @@ def test_a_sensor_of_an_outside_package_is_flown_recorded_and_shown(tmp_path):
 
 NUMBERS = {
     "first_events": lambda events: events > 10_000,
+    "anemometer": lambda wind_m_s: 4.0 < wind_m_s < 5.5,  # the vehicle gives way; white noise of 0.05
     "own_scene": lambda distance_m: distance_m == pytest.approx(3.9, abs=1e-4),  # 4 m less the mount of 0.1 m
     "own_controller": lambda error_m: error_m < 0.01,
     "many_worlds": lambda counts: counts == sorted(counts, reverse=True) and counts[-1] > 1000,
@@ -54,6 +59,39 @@ def test_an_example_ends_on_its_number(name, capsys):
     assert capsys.readouterr().out
 
 
+def test_an_anemometer_reads_gusts_and_turbulence_in_all_worlds():
+    load("anemometer")
+    gust = {"velocity_m_s": [0.0, 6.0, 0.0], "start_s": 0.0, "rise_s": 0.03}
+    parameters = {"wind_m_s": [1.0, 0.0, 0.0], "gusts": [gust], "turbulence": {"wind_20ft_m_s": 15.0}}
+    exact = {"kind": "anemometer", "errors": {"white": 0.0, "markov": 0.0}}
+    config = {
+        "duration_s": 0.1,
+        "scene": {"rooms": 1},
+        "device": "cpu",
+        "path": {"kind": "hover"},
+        "control": {"rate_hz": 100},
+        "vehicle": {"parameters": parameters},
+        "sensors": {"wind": exact, "odometry": {"kind": "odometry", "rate_hz": 100}},
+    }
+    packets = list(ns.run({**config, "seed": 7}))
+    states = [packet for packet in packets if packet.sensor == "odometry"]
+    read = [packet.air for packet in packets if packet.sensor == "wind"]
+    turned = [Rotation.from_quat(state.orientation) for state in states]
+    air = np.array([turn.apply(a) + s.velocity for turn, a, s in zip(turned, read, states, strict=True)])
+    steady = np.array([[1.0, 6.0 * np.sin(0.5 * np.pi * min(k / 3, 1.0)) ** 2, 0.0] for k in range(11)])
+    assert 0.1 < np.abs(air - steady).max() < 8.0  # turbulence of 1.5 m/s vertically, more across
+    worlds = ns.Simulation(config, worlds=3, seeds=[5, 6, 7])
+    worlds.reset()
+    for k in range(1, 11):
+        seen = worlds.rollout(1)
+        rows = seen.samples["wind"].arrays["air"].numpy()[-1]
+        assert rows[2].tobytes() == read[k].tobytes()
+        assert (rows[0] != rows[2]).all()
+        velocity = seen.state.air_velocity.numpy() - seen.state.velocity.numpy()
+        at = Rotation.from_quat(seen.state.orientation.numpy())
+        np.testing.assert_allclose(at.inv().apply(velocity), rows, atol=1e-12)
+
+
 def test_examples_are_short_and_tested():
     names = {file.stem for file in EXAMPLES.glob("*.py")}
     assert len(names) >= 10
@@ -63,7 +101,6 @@ def test_examples_are_short_and_tested():
 
 
 def test_a_kind_that_is_taken_is_refused():
-    import neurosim_core as ns
     from neurosim_core.sensors.base import StateSensorConfig
 
     taken = r"the sensor kind 'imu' is taken by neurosim_core\.sensors\.imu\.ImuSensorConfig"

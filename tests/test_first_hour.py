@@ -76,3 +76,7 @@ def test_mistakes_in_python_are_answered_as_well():
         ns.preset("humingbird")
     with pytest.raises(FileNotFoundError, match=r"no file nothing\.h5"):
         ns.Recording("nothing.h5")
+    with pytest.raises(TypeError, match="Stream has no argument 'batch_size'; did you mean 'batch'"):
+        ns.data.Stream("data", batch_size=8)
+    with pytest.raises(TypeError, match="Dataset has no argument 'window'; did you mean 'window_s'"):
+        ns.data.Dataset("data", window=0.05)

@@ -7,7 +7,20 @@ from pathlib import Path
 
 import warp as wp
 
-from neurosim_core.warp_start import start_warp
+from neurosim_core.warp_start import has_kernels, start_warp
+
+
+def test_an_empty_kernel_cache_is_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    (tmp_path / "wp_somebody.else_0123").mkdir()
+    assert not has_kernels()
+
+    @wp.kernel(module=wp.get_module("neurosim_core.first"), enable_backward=False)
+    def store(out: wp.array[int]) -> None:
+        out[0] = 1
+
+    wp.launch(store, dim=1, outputs=[wp.zeros(1, dtype=int, device="cpu")], device="cpu")
+    assert has_kernels()
 
 
 def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch):

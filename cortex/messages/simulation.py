@@ -112,7 +112,7 @@ class SensorStatus:
     subscriber_count: UInt32
     """Who listens."""
     published_count: UInt64
-    """Messages since the beginning of the run."""
+    """Messages that were published, or only recorded, since the beginning of the run."""
     dropped_count: UInt64
     """Frames that were not rendered, because the machine was too slow, and messages that a link lost."""
     injected_lost_count: UInt64 = 0
@@ -157,6 +157,8 @@ class VehicleStatus:
     """Commands out of range that were clamped."""
     clamped_reason: str = ""
     """What was out of range the last time; empty if nothing was."""
+    command_source: str = ""
+    """Name of the node that commands, or names of several; empty before the first command."""
 
 
 @message(name="cortex/SimulatorStatus")

@@ -50,15 +50,9 @@ class BagBackend:
     failure = trouble = ""
 
     def __init__(self, path: str | Path, *, distro: str | None = None, storage: str = "mcap") -> None:
-        """Begin a bag.
-
-        Args:
-            path: The directory to make, or `flight.mcap` for the directory `flight`.
-            distro: Distribution whose message definitions are written; None: ROS_DISTRO, else a recent one.
-            storage: "mcap" or "sqlite3".
+        """Begin a bag; see `choose.open_backend`. The storage is "mcap" or "sqlite3".
 
         Raises:
-            ValueError: The distribution is unknown.
             BackendError: There is something at the path already, or it cannot be written.
         """
         self.distro = chosen_distro(distro) or DEFAULT_DISTRO
@@ -114,7 +108,8 @@ class BagBackend:
             except OSError as error:
                 writer.abort()
                 raise BackendError(f"the bag {self.directory} cannot be completed: {error}") from error
-        _log.info("%d messages are in %s", sum(writer.counts.values()), self.directory)
+        size_mb = sum(file.stat().st_size for file in self.directory.iterdir()) / 1e6
+        _log.info("%d messages, %.1f MB, are in %s", sum(writer.counts.values()), size_mb, self.directory)
 
     def write(
         self, connection: Any, stamp_ns: int | None, message: Buffer, *, at_ns: int | None = None

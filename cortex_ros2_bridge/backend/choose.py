@@ -8,6 +8,7 @@ import logging
 from pathlib import Path
 
 from cortex_ros2_bridge.backend.base import Backend, BackendError
+from cortex_ros2_bridge.backend.names import check_kind
 
 _log = logging.getLogger(__name__)
 
@@ -41,10 +42,7 @@ def open_backend(
         from cortex_ros2_bridge.backend.bag import BagBackend
 
         return BagBackend(kind, distro=distro)
-    if kind not in ("auto", "rclpy", "dds"):
-        raise ValueError(
-            f"backend must be 'auto', 'rclpy', 'dds' or a path that ends in '.mcap', got {kind!r}"
-        )
+    check_kind(kind)
     if kind == "rclpy" or (kind == "auto" and _has_rclpy()):
         if not _has_rclpy():
             raise BackendError(

@@ -4,7 +4,7 @@ Stamps are the same numbers on both sides: simulated time. What is given in anot
 convention in ROS is said at each function. What cannot be used is refused, with a reason.
 """
 
-from cortex_ros2_bridge.convert import camera, commands, events, simulator, state
+from cortex_ros2_bridge.convert import camera, commands, events, robot, simulator, state
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.registry import RULES, from_ros, share, to_ros
 from cortex_ros2_bridge.convert.state import check_transform, static_transforms
@@ -18,6 +18,7 @@ __all__ = [
     "commands",
     "events",
     "from_ros",
+    "robot",
     "share",
     "simulator",
     "state",

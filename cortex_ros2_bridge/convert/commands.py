@@ -70,7 +70,7 @@ def attitude(message: Any, context: Context) -> messages.AttitudeCommand | None:
     return messages.AttitudeCommand(
         stamp_ns=_stamp_ns(message, context),
         thrust_n=_thrust_n(message, context),
-        orientation=_unit(message.orientation),
+        orientation=unit(message.orientation),
         sequence=context.sequence,
     )
 
@@ -96,7 +96,7 @@ def rates(message: Any, context: Context) -> messages.RateThrustCommand | None:
         raise ConvertError(
             f"type_mask {message.type_mask} ignores the attitude and a body rate: all three are needed then"
         )
-    rate = _xyz(message.body_rate)
+    rate = xyz(message.body_rate)
     check_finite("body rates", rate)
     rate = context.within("body rate", rate, "max_rate_rad_s", "rad/s")
     return messages.RateThrustCommand(
@@ -212,12 +212,12 @@ def reset(message: Any, context: Context) -> messages.Reset:
     if message.use_seed:
         chosen["seed"] = int(message.seed)
     if message.use_pose:
-        chosen["position"] = _xyz(message.pose.position)
+        chosen["position"] = xyz(message.pose.position)
         check_finite("position", chosen["position"])
-        chosen["orientation"] = _unit(message.pose.orientation)
+        chosen["orientation"] = unit(message.pose.orientation)
     if message.use_twist:
-        chosen["velocity"] = _xyz(message.twist.linear)
-        chosen["body_rate"] = _xyz(message.twist.angular)
+        chosen["velocity"] = xyz(message.twist.linear)
+        chosen["body_rate"] = xyz(message.twist.angular)
         check_finite("twist", chosen["velocity"], chosen["body_rate"])
     return messages.Reset(vehicle=message.vehicle, **chosen)
 
@@ -237,11 +237,13 @@ def steps(message: Any, context: Context) -> messages.Step:
     return messages.Step(count)
 
 
-def _xyz(vector: Any) -> NDArray[np.float64]:
+def xyz(vector: Any) -> NDArray[np.float64]:
+    """Return the numbers of a Vector3 or Point."""
     return np.array([vector.x, vector.y, vector.z], np.float64)
 
 
-def _unit(quaternion: Any) -> NDArray[np.float64]:
+def unit(quaternion: Any) -> NDArray[np.float64]:
+    """Return the numbers of a Quaternion, xyzw; refuses what is none."""
     q = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
     check_finite("orientation", q)
     norm = math.hypot(*q)
@@ -292,7 +294,7 @@ def _check_mask(mask: int) -> None:
 
 
 def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> messages.VelocityCommand:
-    velocity, rate = _xyz(message.linear), _xyz(message.angular)
+    velocity, rate = xyz(message.linear), xyz(message.angular)
     check_finite("velocity", velocity, rate)
     if rate[0] or rate[1]:
         raise ConvertError(
@@ -302,10 +304,8 @@ def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> mess
     rate = context.within("yaw rate", rate, "max_rate_rad_s", "rad/s")
     kind = context.frames.kind_of(frame, context.vehicle)
     if kind is None:
-        names = (
-            f"{context.frames.body_of(context.vehicle)}, base_footprint, {context.frames.ros(frames.WORLD)}"
-        )
-        raise ConvertError(f"a velocity in frame {frame!r}, known: {names}")
+        known = ", ".join(context.frames.known(context.vehicle))
+        raise ConvertError(f"a velocity in frame {frame!r}, known: {known}")
     if kind != "world":
         if context.odometry is None:
             raise ConvertError(f"no odometry yet that would say how {frame} is turned")
@@ -322,16 +322,15 @@ def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> mess
 def _pose_command(message: Any, point: Any, quaternion: Any, context: Context) -> messages.PoseCommand:
     frame = message.header.frame_id
     if frame and context.frames.kind_of(frame, context.vehicle) != "world":
-        world = context.frames.ros(frames.WORLD)
-        raise ConvertError(
-            f"a pose in frame {frame!r}, known: {world}, {context.frames.odom_of(context.vehicle)}"
-        )
-    position = _xyz(point)
+        kinds = context.frames.known(context.vehicle)
+        known = ", ".join(name for name, kind in kinds.items() if kind == "world")
+        raise ConvertError(f"a pose in frame {frame!r}, known: {known}")
+    position = xyz(point)
     check_finite("position", position)
     position = context.within("position", position, "max_position_m", "m")
     return messages.PoseCommand(
         stamp_ns=_stamp_ns(message, context),
         position=position,
-        yaw_rad=frames.yaw_rad(_unit(quaternion)),
+        yaw_rad=frames.yaw_rad(unit(quaternion)),
         sequence=context.sequence,
     )

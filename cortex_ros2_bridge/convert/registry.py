@@ -70,6 +70,8 @@ class Rule(NamedTuple):
     """False: only where the settings ask for it."""
     options: frozenset[str] = frozenset()
     """Names of the options that the conversion knows."""
+    robot: bool = False
+    """For a robot in ROS, whose sensors come in and whose commands go out: see `BridgeConfig.robot`."""
 
 
 RULES: list[Rule] = []
@@ -88,7 +90,7 @@ def standard(
     """Register a conversion of the bridge's own, which makes a record or CDR; see `Rule`."""
 
     def register(function: F) -> F:
-        _add_rule(kind, ros_type, direction, name, qos, _encoded(function), default, options)
+        _add_rule(kind, ros_type, direction, name, qos, encoded(function), default, options)
         return function
 
     return register
@@ -111,7 +113,9 @@ def request(kind: type[Any], ros_type: str, name: str = "{topic}") -> Callable[[
     return _incoming(kind, ros_type, "call", name, True, ())
 
 
-def _encoded(function: Callable[..., Any]) -> Out:
+def encoded(function: Callable[..., Any]) -> Out:
+    """Return a conversion to CDR, of one that makes a record or CDR."""
+
     @functools.wraps(function)
     def convert(message: Any, context: Context) -> Buffer | None:
         made = function(message, context)
@@ -169,7 +173,7 @@ def to_ros(kind: type[Any], ros_type: str, *, name: str = "{topic}", qos: Qos = 
     """
 
     def register(function: F) -> F:
-        _add(kind, Rule(schema_of(kind).name, ros_type, "out", name, qos, _encoded(function)))
+        _add(kind, Rule(schema_of(kind).name, ros_type, "out", name, qos, encoded(function)))
         return function
 
     return register
@@ -268,7 +272,7 @@ def _picture_rules(plain: Any) -> Iterable[Rule]:
 
     yield Rule(name, pictures, "out", "{topic}/image_raw", PACKETS, send)
     if any(field["name"] == "labels" and field["type"] == "str" for field in plain["fields"]):
-        labels = _encoded(lambda message, _: record(texts)(message.labels))
+        labels = encoded(lambda message, _: record(texts)(message.labels))
         yield Rule(name, texts, "out", "{topic}/labels", LATCHED, labels)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -98,14 +99,16 @@ class EventBatch:
             if bins == 1:
                 grid[0] = np.bincount(place, sign, cells).reshape(grid.shape[1:])
                 continue
-            span_us = int(host.stamp_us[window] - host.start_us[window])
-            moment = (t - host.start_us[window]) * ((bins - 1) / span_us)
-            low = np.minimum(moment.astype(np.intp), bins - 2)
-            place += low * cells
-            late = sign * (moment - low)
-            total = np.bincount(place, sign - late, bins * cells)
-            total[cells:] += np.bincount(place, late, (bins - 1) * cells)
-            grid[:] = total.reshape(grid.shape)
+            start_us, span_us = int(host.start_us[window]), int(host.stamp_us[window] - host.start_us[window])
+            moment = (t - start_us) * ((bins - 1) / span_us)
+            begins = np.searchsorted(moment, np.arange(bins - 1))  # events are in the order of time
+            rows = grid.reshape(bins, cells)
+            late: Any = 0.0
+            for low, (begin, end) in enumerate(pairwise([*begins, len(t)])):
+                here, share = place[begin:end], (moment[begin:end] - low) * sign[begin:end]
+                rows[low] = late + np.bincount(here, sign[begin:end] - share, cells)
+                late = np.bincount(here, share, cells)
+            rows[-1] = late
         return self._as_given(grids)
 
     def surface(self, tau_s: float | Sequence[float] = (0.01, 0.05)) -> NDArray[np.float32]:

@@ -133,7 +133,8 @@ def _tiles(path: Path, label: str) -> list[Picture.Image]:
     tiles = []
     for field in ("events", "rgb", "depth"):
         try:
-            data = Dataset(path, window_s=_WINDOW_S, fields=[field])
+            ends = None if field == "events" else field
+            data = Dataset(path, window_s=_WINDOW_S, fields=[field], ends=ends)
         except ValueError:  # this flight has no such sensor, or at other times
             continue
         if len(data):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import pickle
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from neurosim_core.data.arguments import refuse_unknown
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import Position, Stream
 from neurosim_core.install import install_hint
@@ -50,11 +50,7 @@ class Loader:
     ) -> None:
         torch = _import_torch()
         known = [name for name in inspect.signature(Stream).parameters if name not in ("source", "transform")]
-        for name in options:
-            if name not in known:
-                close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-                hint = f"did you mean {close[0]!r}? " if close else ""
-                raise TypeError(f"Loader has no argument {name!r}; {hint}known: workers, {', '.join(known)}")
+        refuse_unknown("Loader", options, ["workers", *known])
         self.stream = Stream(source, transform=transform, **options)
         self._device = device
         self._position = Position(0, 0)

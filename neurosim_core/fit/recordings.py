@@ -34,6 +34,10 @@ _WINDOW_US = 200
 """Time over which a saturated readout is counted."""
 _RUN_MIN = 5
 """Windows in a row that a readout must be busy."""
+_PARTS = 20
+"""Of a still recording, whose rates are compared."""
+_UNSTEADY = 1.5
+"""Factor between the busiest and the quietest part of a recording that is not still."""
 _ROWS = 10
 """Rows whose readout is timed together: stamps are whole microseconds."""
 
@@ -74,6 +78,18 @@ def sort_still(events: EventArrays, width: int, height: int, span_s: float | Non
         pixel[order][1:][same],
         on[order][1:][same],
     )
+
+
+def find_change(events: EventArrays) -> tuple[float, float] | None:
+    """Return the lowest and the highest event rate of a recording [Hz], if it is not one of still light."""
+    span_us = int(events.t[-1] - events.t[0]) + 1 if len(events.t) else 0
+    if span_us < _PARTS:
+        return None
+    count = np.bincount((events.t - events.t[0]) * _PARTS // span_us, minlength=_PARTS)
+    low, high = np.sort(count)[[1, -2]]  # one part may have been disturbed
+    by_chance = high - low < 8.0 * math.sqrt(count.mean())
+    rate_hz = _PARTS / (1e-6 * span_us)
+    return None if by_chance or high < _UNSTEADY * low else (low * rate_hz, high * rate_hz)
 
 
 def find_hot(still: Still) -> NDArray[np.bool_]:

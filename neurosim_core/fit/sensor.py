@@ -23,6 +23,7 @@ import numpy as np
 from neurosim_core.fit.recordings import (
     Floats,
     Still,
+    find_change,
     find_hot,
     find_steps,
     measure_readout,
@@ -40,6 +41,8 @@ _GAIN = 1.3
 _SIMULATED_EVENTS = 2_000_000
 """Events of a simulation at most, about: it has fewer pixels than the recording where there are more."""
 _PERIODS_MAX = 12
+_ALIKE = 0.25
+"""Pixels are alike whose thresholds spread by less than this share of what one event more or less makes."""
 _DEFAULT_THRESHOLD = 0.2
 
 Numbers = dict[str, float]
@@ -131,6 +134,11 @@ def fit_sensor(
     real = observe(stimulus)
     notes: list[str] = []
     settings = _first_guess(real, stimulus, notes)
+    if (change := find_change(stimulus.still)) is not None:
+        notes.append(
+            f"the still recording is not still: its rate goes from {change[0]:,.0f} to {change[1]:,.0f} "
+            "events/s. What moves or flickers there is taken for noise"
+        )
 
     def approach(begin: dict[str, Any], target: Mapping[str, Any], rounds: int) -> dict[str, Any]:
         for _ in range(rounds):
@@ -156,10 +164,34 @@ def fit_sensor(
     share = settings.get("hot_pixels.fraction", 0.0)
     if share:
         errors["hot_pixels.fraction"] = math.sqrt(share * (1.0 - share) / (stimulus.width * stimulus.height))
+    _tell_alike(centred, errors, real.numbers, notes)
     for key in ("readout.bandwidth_hz", "readout.row_s"):
         if key in settings and all(key in twin.numbers for twin in twins):
             errors[key] = float(np.std([twin.numbers[key] for twin in twins], ddof=1))
     return SensorFit(settings=centred, errors=errors, real=real, simulated=twins[0], notes=notes)
+
+
+def _tell_alike(
+    settings: Mapping[str, Any], errors: Numbers, numbers: Mapping[str, Any], notes: list[str]
+) -> None:
+    """Widen the errors of thresholds where all pixels have the same whole number of events in a step.
+
+    Thresholds within C / (n + 1) have n events then. Where pixels differ by more, their mean tells it better.
+    """
+    widened = False
+    for name, counted in (("on", "ON events a rise"), ("off", "OFF events a fall")):
+        key = f"threshold_{name}"
+        if counted not in numbers:
+            continue
+        alike = settings[key] / (numbers[counted] + 1.0)
+        if settings.get(f"threshold_spread.sigma_{name}", 0.0) < _ALIKE * alike:
+            errors[key] = math.hypot(errors.get(key, 0.0), alike / math.sqrt(12.0))
+            widened = True
+    if widened:
+        notes.append(
+            "all pixels have the same whole number of events in a step, which tells thresholds less exactly "
+            "than steps of a higher contrast would"
+        )
 
 
 def observe(stimulus: Stimulus) -> Observation:

@@ -1,7 +1,8 @@
 """Bags of ROS 2: directories of rosbag2 (MCAP or SQLite), and single MCAP files, which Foxglove opens.
 
-The bridge writes and reads them, by the conversions that it has for running systems. It is a package that
-this one does not depend on: it is named here, and imported when a bag is wanted.
+Files of ROS 1 (`.bag`) are read, too. The bridge does all this, by the conversions that it has for running
+systems. It is a package that this one does not depend on: it is named here, and imported when a bag is
+wanted.
 """
 
 from __future__ import annotations

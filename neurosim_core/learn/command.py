@@ -17,9 +17,15 @@ if TYPE_CHECKING:
 def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain, or `eval`")
     learn.add_argument(
-        "run", nargs="?", type=Path, metavar="RUN", help="for `eval`: folder of a run, or depth.pt, ..."
+        "what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain; `eval` or `rate`"
+    )
+    learn.add_argument(
+        "run",
+        nargs="?",
+        type=Path,
+        metavar="RUN",
+        help="eval: folder of a run, or depth.pt, ...; rate: a task",
     )
     learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
     learn.add_argument(
@@ -35,8 +41,14 @@ def add_parsers(commands: _Commands) -> None:
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
+    learn.add_argument(
+        "--algorithm",
+        choices=("dagger", "ppo"),
+        default="dagger",
+        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher",
+    )
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
-    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
+    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
     learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     learn.add_argument(
         "--scenes",
@@ -45,6 +57,17 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
+    learn.add_argument(
+        "--transfer",
+        action="store_true",
+        help="eval: with noise, other lenses, thresholds and dynamics than it was trained with",
+    )
+    learn.add_argument(
+        "--randomise",
+        choices=("training", "tests", "none"),
+        help="what episodes of training draw: as the task says for training (default on a GPU), "
+        "as its tests do, or nothing",
+    )
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
     dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
@@ -74,6 +97,13 @@ def add_parsers(commands: _Commands) -> None:
     deploy.add_argument(
         "--print-config", action="store_true", help="print settings for `neurosim serve`, and stop"
     )
+    deploy.add_argument(
+        "--ros",
+        nargs="?",
+        const="auto",
+        choices=("auto", "rclpy", "dds"),
+        help="the vehicle is in ROS 2: events and odometry come from there, AttitudeTarget goes there",
+    )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
     predict = commands.add_parser(
@@ -100,13 +130,20 @@ def _learn(arguments: argparse.Namespace) -> int:
     need("torch")
     if arguments.what == "eval":
         return _evaluate(arguments)
+    if arguments.what == "rate":
+        return _measure_rate(arguments)
     if arguments.what in ("depth", "flow", "pretrain"):
         return _learn_dense(arguments)
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
     from neurosim_core.learn.train import default_config, train
 
-    config = default_config(arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    config = default_config(
+        arguments.what,
+        device=arguments.device or "auto",
+        seed=arguments.seed,
+        algorithm=arguments.algorithm,
+    )
     student, teacher = config.student, config.teacher
     if arguments.pixels is not None:
         config = dataclasses.replace(config, pixels=arguments.pixels)
@@ -116,12 +153,41 @@ def _learn(arguments: argparse.Namespace) -> int:
         student = dataclasses.replace(student, iterations=arguments.student_iterations)
     if arguments.teacher_iterations is not None:
         teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
+    if arguments.randomise is not None:
+        config = dataclasses.replace(config, randomise=arguments.randomise)
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
     config = dataclasses.replace(config, student=student, teacher=teacher)
-    train(folder, config, resume=arguments.resume)
-    print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    if train(folder, config, resume=arguments.resume):
+        print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    return 0
+
+
+def _measure_rate(arguments: argparse.Namespace) -> int:
+    """Print steps a second of a task, with one and two renders in each, and what endings cost."""
+    from neurosim_core.learn.env import find_task, make_env
+    from neurosim_core.learn.rate import measure_steps
+
+    where: dict[str, Any] = {}
+    for renders in (1, 2):
+        task = find_task(str(arguments.run or "hover"))
+        task.renders_per_step = renders
+        where = where or {"scenes": task.scenes(unseen=False)[:4]}
+        env = make_env(
+            task,
+            worlds=arguments.worlds or 64,
+            device=arguments.device or "auto",
+            pixels=arguments.pixels,
+            **where,
+        )
+        where = {"models": env.sim.models}
+        rate, least, most = measure_steps(env)
+        ended, _, _ = measure_steps(env, ending=max(env.num_envs // 100, 1))
+        print(
+            f"steps_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f}; {renders} renders a step, {env.device})"
+        )
+        print(f"step_with_endings {rate / ended:.3f} (1 % of the worlds, or one, in each step)", flush=True)
     return 0
 
 
@@ -158,6 +224,14 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
         net, dense = load_dense(arguments.run)
         print(evaluate(net, held_out_windows(dense, arguments.test), dense.head))
+        return 0
+    if arguments.transfer:
+        from neurosim_core.learn.transfer import evaluate_transfer
+
+        where = {"device": arguments.device, "worlds": arguments.worlds}
+        scenes = arguments.scenes if arguments.scenes in ("seen", "unseen") else [arguments.scenes]
+        for name, evaluation in evaluate_transfer(arguments.run, scenes=scenes, **where):
+            print(f"{name}: {evaluation}", flush=True)
         return 0
     from neurosim_core.learn.train import evaluate_run
 
@@ -209,4 +283,5 @@ def _deploy(arguments: argparse.Namespace) -> int:
         vehicle=arguments.vehicle,
         events=arguments.events,
         duration_s=arguments.duration,
+        ros=arguments.ros,
     )

@@ -1,16 +1,24 @@
-"""A policy as a Cortex node: odometry and events in, thrust and body rates out."""
+"""A policy as a Cortex node: odometry and events in, thrust and body rates out, also from and to ROS 2."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cortex import Closed, Node, synchronised
 from cortex.messages import Events, Odometry, RateThrustCommand
 from neurosim_core.install import check_cortex
-from neurosim_core.learn.pilot import CAMERA, Pilot
+from neurosim_core.learn.pilot import CAMERA, Pilot, card_airframe
 
 check_cortex()
 
@@ -21,6 +29,7 @@ def deploy(
     vehicle: str = "drone",
     events: str = CAMERA,
     duration_s: float | None = None,
+    ros: str | None = None,
     say: Callable[[str], None] = print,
 ) -> int:
     """Fly a vehicle by a policy until its simulator ends; in lockstep it answers every odometry.
@@ -32,6 +41,9 @@ def deploy(
         vehicle: Name of the vehicle.
         events: Name of its event camera.
         duration_s: Stop after so much simulated time [s]; None: never.
+        ros: The vehicle is in ROS 2: nav_msgs/Odometry and event_camera_msgs/EventPacket come in from topics
+            of these names, mavros_msgs/AttitudeTarget goes out, through a bridge that is started, with
+            the backend auto, rclpy or dds.
         say: Told what happens, line by line.
 
     Returns:
@@ -40,9 +52,14 @@ def deploy(
     Raises:
         TimeoutError: Events that are due have not come.
         ValueError: The file is no policy, or the rate of the events is another.
+        RuntimeError: The bridge has ended.
     """
     pilot = Pilot(policy)
-    with Node("policy") as node:
+    with contextlib.ExitStack() as stack:
+        domain = None if ros is None else _BRIDGED_DOMAIN
+        node = stack.enter_context(Node("policy", domain=domain))
+        if ros is not None:
+            stack.enter_context(_bridge(pilot.card, node, backend=ros, events=f"/{vehicle}/{events}"))
         commands = node.publisher(f"/{vehicle}/command/rates", RateThrustCommand)
         last_ns, count = -1, 0
         try:
@@ -80,3 +97,43 @@ def deploy(
             pass
     say(f"{count} commands")
     return 0
+
+
+_BRIDGED_DOMAIN = 1 + os.getpid() % 200
+"""Domain of Cortex of a policy and its own bridge: a simulator in another one reaches them by ROS only."""
+
+
+@contextlib.contextmanager
+def _bridge(card: dict[str, Any], node: Node, *, backend: str, events: str) -> Iterator[None]:
+    """Run a bridge to a vehicle in ROS; the node is closed if it ends by itself.
+
+    Raises:
+        RuntimeError: It has.
+    """
+    parameters = {
+        "backend": backend,
+        "cortex_domain": node.domain,
+        "node": "policy",
+        "robot": True,
+        "routes.events.cortex": events,
+        "routes.events.options.packet_rate_hz": float(card["rate_hz"]),
+        "routes.thrust.cortex": "*/command/rates",
+        "routes.thrust.options.max_thrust_n": card_airframe(card).thrust_max_n,
+    }
+    words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
+    command = [sys.executable, "-m", "cortex_ros2_bridge", "--ros-args", *words]
+    bridge = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+
+    def close_at_end() -> None:
+        bridge.wait()
+        node.close()
+
+    threading.Thread(target=close_at_end, daemon=True).start()
+    try:
+        yield
+        if bridge.poll() is not None:
+            raise RuntimeError(f"the bridge to ROS 2 ended with status {bridge.returncode}")
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            bridge.send_signal(signal.SIGINT)
+        bridge.wait()

@@ -371,7 +371,7 @@ def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, A
         "mount": dict(task.mount),
         "sampling_rate_hz": rate_hz,
         "packet_rate_hz": rate_hz,
-        "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},
+        "pixel": dict(task.pixel) or {"threshold_on": task.threshold, "threshold_off": task.threshold},
     }
     vehicle = {"on_collision": "end", "max_step_s": 0.004, **task.vehicle}
     if wind:  # that of the episodes takes its place

@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.learn import need, surfaces
+from neurosim_core.vehicle import MultirotorConfig
 
 CARD = "neurosim"
 """Key of the metadata of a file: JSON that says what the policy was trained for."""
@@ -166,6 +167,13 @@ def pilot_settings(card: Mapping[str, Any]) -> dict[str, Any]:
             "odometry": {"kind": "odometry", "rate_hz": rate_hz},
         },
     }
+
+
+def card_airframe(card: Mapping[str, Any]) -> MultirotorConfig:
+    """Return the airframe that a policy was trained with."""
+    from neurosim_core.config import load_config
+
+    return load_config(pilot_settings(card)).vehicle.airframe()
 
 
 def shipped_policy(name: str) -> Path:

@@ -22,12 +22,11 @@ def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-class ActorCritic(nn.Module):
-    """A policy and its value from vectors, for PPO.
+class Critic(nn.Module):
+    """What PPO needs besides the mean of actions: their spread, and the value of what is seen.
 
     Args:
-        actor_size: Numbers that the actor sees.
-        critic_size: Numbers that the critic sees.
+        critic_size: Numbers that it sees.
         action_count: Numbers in an action.
         hidden: Widths of the hidden layers.
         spread: Standard deviation of actions at first.
@@ -35,7 +34,6 @@ class ActorCritic(nn.Module):
 
     def __init__(
         self,
-        actor_size: int,
         critic_size: int,
         action_count: int = 4,
         *,
@@ -43,28 +41,44 @@ class ActorCritic(nn.Module):
         spread: float = 0.4,
     ) -> None:
         super().__init__()
-        self.actor = _perceptron([actor_size, *hidden, action_count])
         self.critic = _perceptron([critic_size, *hidden, 1])
         self.log_spread = nn.Parameter(torch.full((action_count,), math.log(spread)))
 
-    def forward(self, seen: torch.Tensor) -> torch.Tensor:
-        """Return the mean action, in [-1, 1] but for what the simulator clamps."""
-        mean: torch.Tensor = self.actor(seen)
-        return mean
-
     def value(self, seen: torch.Tensor) -> torch.Tensor:
-        """Return what is expected to be rewarded from here on, [N]."""
+        """Return what is expected to be rewarded from here on, [...]."""
         value: torch.Tensor = self.critic(seen).squeeze(-1)
         return value
 
     def log_probability(self, mean: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Return the logarithm of the density of actions, [N]."""
+        """Return the logarithm of the density of actions, [...]."""
         scaled = (action - mean) * torch.exp(-self.log_spread)
         return (-0.5 * scaled.square() - self.log_spread - 0.5 * math.log(2.0 * math.pi)).sum(-1)
 
     def entropy(self) -> torch.Tensor:
         """Return the entropy of an action."""
         return (self.log_spread + 0.5 * (1.0 + math.log(2.0 * math.pi))).sum()
+
+
+class ActorCritic(Critic):
+    """A policy and its value from vectors, for PPO.
+
+    Args:
+        actor_size: Numbers that the actor sees.
+        critic_size: Numbers that the critic sees.
+        action_count: Numbers in an action.
+        hidden: Widths of the hidden layers.
+    """
+
+    def __init__(
+        self, actor_size: int, critic_size: int, action_count: int = 4, *, hidden: Sequence[int] = (64, 64)
+    ) -> None:
+        super().__init__(critic_size, action_count, hidden=hidden)
+        self.actor = _perceptron([actor_size, *hidden, action_count])
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        """Return the mean action, in [-1, 1] but for what the simulator clamps."""
+        mean: torch.Tensor = self.actor(seen)
+        return mean
 
 
 class EventPolicy(nn.Module):
@@ -145,8 +159,15 @@ class EventPolicy(nn.Module):
         self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions in [-1, 1], [N, 4], and the memory for the next step, [N, memory_size]."""
+        mean, memory = self.act(surfaces, vector, memory)
+        return torch.clamp(mean, -1.0, 1.0), memory
+
+    def act(
+        self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return actions (not clamped), and the memory for the next step."""
         memory = self.remember(self.see(surfaces, vector), memory)
-        return torch.clamp(self.head(torch.cat([memory, vector], dim=1)), -1.0, 1.0), memory
+        return self.head(torch.cat([memory, vector], dim=1)), memory
 
     def unroll(
         self, surfaces: torch.Tensor, vectors: torch.Tensor, begun: torch.Tensor, memory: torch.Tensor

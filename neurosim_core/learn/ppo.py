@@ -8,7 +8,7 @@ import torch
 
 from neurosim_core.learn.descent import Descent
 from neurosim_core.learn.env import Env
-from neurosim_core.learn.policies import ActorCritic
+from neurosim_core.learn.policies import ActorCritic, Critic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,47 +107,58 @@ class Ppo:
             )
             self._now = self._seen(observations)
         batch = {name: torch.stack(values) for name, values in rows.items()}
-        batch["advantage"] = self._advantages(batch)
-        batch["return"] = batch["advantage"] + batch["value"]
+        add_advantages(batch, policy.value(self._now[1]), config)
         episodes, successes, crashes = ended.tolist()
         log = {"reward": float(batch["reward"].mean()), "spread": float(spread.mean())}
         if episodes:
             log |= {"success": successes / episodes, "crash": crashes / episodes}
         return {name: value.flatten(0, 1) for name, value in batch.items()}, log
 
-    def _advantages(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
-        config, value = self.config, batch["value"]
-        later, following = self.policy.value(self._now[1]), torch.zeros_like(value[0])
-        advantages = torch.empty_like(value)
-        for step in reversed(range(len(value))):
-            go_on = 1.0 - batch["done"][step]
-            delta = batch["reward"][step] + config.discount * go_on * later - value[step]
-            following = delta + config.discount * config.trace * go_on * following
-            advantages[step], later = following, value[step]
-        return advantages
-
     def _learn(self, batch: dict[str, torch.Tensor], rate: float) -> None:
-        advantage = batch["advantage"]
-        batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         if not self._batch:
             self._batch = {name: torch.empty_like(value) for name, value in batch.items()}
         for name, value in batch.items():
             self._batch[name].copy_(value)
+        count = len(batch["advantage"])
         for _ in range(self.config.epochs):
-            order = torch.randperm(len(advantage), generator=self._generator, device=advantage.device)
+            order = torch.randperm(count, generator=self._generator, device=self.env.device)
             for rows in order.split(len(self._rows))[: self.config.minibatches]:
                 self._rows.copy_(rows)
                 self.descent.step(rate)
 
     def _loss(self) -> torch.Tensor:
         """Return the loss of the rows of the batch that `_rows` names."""
-        config, policy = self.config, self.policy
         part = {name: value.index_select(0, self._rows) for name, value in self._batch.items()}
-        log_p = policy.log_probability(policy(part["actor"]), part["action"])
-        ratio = torch.exp(log_p - part["log_p"])
-        gain = torch.minimum(
-            ratio * part["advantage"],
-            ratio.clamp(1.0 - config.clip, 1.0 + config.clip) * part["advantage"],
-        ).mean()
-        error = (policy.value(part["critic"]) - part["return"]).square().mean()
-        return 0.5 * error - gain - config.entropy_weight * policy.entropy()
+        return ppo_loss(self.policy, self.policy(part["actor"]), part, self.config)
+
+
+def add_advantages(batch: dict[str, torch.Tensor], later: torch.Tensor, config: PpoConfig) -> None:
+    """Add `return` and `advantage` (of mean 0 and variance 1) to a batch of steps, [T, N].
+
+    Args:
+        batch: `reward`, `value`, `done`.
+        later: Value of what is seen after the last step, [N].
+        config: Discount and trace.
+    """
+    value, following = batch["value"], torch.zeros_like(later)
+    advantages = torch.empty_like(value)
+    for step in reversed(range(len(value))):
+        go_on = 1.0 - batch["done"][step]
+        delta = batch["reward"][step] + config.discount * go_on * later - value[step]
+        following = delta + config.discount * config.trace * go_on * following
+        advantages[step], later = following, value[step]
+    batch["return"] = advantages + value
+    batch["advantage"] = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def ppo_loss(
+    critic: Critic, mean: torch.Tensor, part: dict[str, torch.Tensor], config: PpoConfig
+) -> torch.Tensor:
+    """Return the loss of steps: the clipped gain, the error of the value, and the entropy."""
+    ratio = torch.exp(critic.log_probability(mean, part["action"]) - part["log_p"])
+    gain = torch.minimum(
+        ratio * part["advantage"],
+        ratio.clamp(1.0 - config.clip, 1.0 + config.clip) * part["advantage"],
+    ).mean()
+    error = (critic.value(part["critic"]) - part["return"]).square().mean()
+    return 0.5 * error - gain - config.entropy_weight * critic.entropy()

@@ -89,6 +89,8 @@ class Task:
     """How events are shown."""
     threshold: float = 0.1
     """Of the event camera, both ways."""
+    pixel: Mapping[str, Any] = {}
+    """Settings of its pixels, such as {preset: davis346}, in place of `threshold`; {}: ideal pixels."""
     renders_per_step: int = 1
     """Pictures that events are made of."""
     rays_per_pixel: int = 4

@@ -14,22 +14,27 @@ import os
 import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neurosim_core.learn import need
+from neurosim_core.learn import need, ranks
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
+from neurosim_core.learn.episodes import Randomisation
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
+from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
 from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
+Trainer = Ppo | Dagger | RecurrentPpo
 
 _BLOCK = 60
+_RANDOMISE = ("training", "tests", "none")
 _SEEDS_APART = 1 << 20
 
 
@@ -41,14 +46,20 @@ class TrainConfig:
     device: str = "auto"
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
-    student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    student: DaggerConfig | RecurrentPpoConfig = dataclasses.field(default_factory=DaggerConfig)
+    """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
-    widely: bool = True
-    """Draw what `Task.training` says; else what tests draw: what few steps can learn."""
+    randomise: str = "training"
+    """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
+    learn, or nothing (`none`)."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
+
+    def __post_init__(self) -> None:
+        if self.randomise not in _RANDOMISE:
+            raise ValueError(f"unknown randomise {self.randomise!r}, known: {', '.join(_RANDOMISE)}")
 
 
 class Training:
@@ -81,7 +92,9 @@ class Training:
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
         drawn = find_task(config.task).training
-        randomise = drawn if drawn is not None and config.widely else True
+        randomise: bool | Randomisation = config.randomise != "none"
+        if config.randomise == "training" and drawn is not None:
+            randomise = drawn
         self.env = make_env(
             config.task,
             worlds=config.student.worlds,
@@ -92,32 +105,41 @@ class Training:
             seed=config.seed,
         )
         device = self.env.device
-        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        self._generator = torch.Generator(device=device).manual_seed(config.seed + ranks.rank())
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
-        teacher_env = make_env(
-            config.task,
-            worlds=config.teacher.worlds,
-            device=config.device,
-            observe=states,
-            models=self.env.sim.models,
-            randomise=randomise,
-            seed=config.seed,
-        )
-        self._teacher = Ppo(teacher_env, config.teacher, self._generator)
-        self._student = Dagger(self.env, self._teacher.policy, config.student, self._generator)
-        self._done = {"teacher": 0, "student": 0}
+        self._trainers: dict[str, Trainer] = {}
+        if isinstance(config.student, DaggerConfig):
+            teacher_env = make_env(
+                config.task,
+                worlds=config.teacher.worlds,
+                device=config.device,
+                observe=states,
+                models=self.env.sim.models,
+                randomise=randomise,
+                seed=config.seed,
+            )
+            teacher = Ppo(teacher_env, config.teacher, self._generator)
+            student = Dagger(self.env, teacher.policy, config.student, self._generator)
+            self._trainers |= {"teacher": teacher, "student": student}
+        else:
+            self._trainers["student"] = RecurrentPpo(self.env, config.student, self._generator)
+        self._done = dict.fromkeys(self._trainers, 0)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
+        if ranks.rank() == 0:
+            (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
 
     @property
-    def teacher(self) -> ActorCritic:
-        """The policy on states."""
-        return self._teacher.policy
+    def teacher(self) -> ActorCritic | None:
+        """The policy on states, if there is one."""
+        trainer = self._trainers.get("teacher")
+        return trainer.policy if isinstance(trainer, Ppo) else None
 
     @property
     def student(self) -> EventPolicy:
         """The policy on events."""
-        return self._student.policy
+        policy = self._trainers["student"].policy
+        assert isinstance(policy, EventPolicy)
+        return policy
 
     @property
     def models(self) -> Sequence[Model]:
@@ -131,9 +153,11 @@ class Training:
             FileNotFoundError: There is none.
         """
         state = torch.load(self.folder / "checkpoint.pt", map_location=self.env.device, weights_only=True)
-        self._teacher.descent.load_state_dict(state["teacher"])
-        self._student.descent.load_state_dict(state["student"])
+        for stage, trainer in self._trainers.items():
+            trainer.descent.load_state_dict(state[stage])
         self._generator.set_state(state["generator"].cpu())
+        if ranks.rank() > 0:
+            self._generator.manual_seed(ranks.rank() + sum(state["done"].values()))
         self._done = state["done"]
 
     def run(self, *, until: tuple[int, int] | None = None) -> None:
@@ -145,26 +169,29 @@ class Training:
         from torch.utils.tensorboard.writer import SummaryWriter
 
         config = self.config
-        limits = (config.teacher.iterations, config.student.iterations) if until is None else until
-        with SummaryWriter(str(self.folder)) as writer:
-            while self._done["teacher"] < min(limits[0], config.teacher.iterations):
-                self._train_block("teacher", self._teacher, config.teacher.iterations, writer)
-            while self._done["student"] < min(limits[1], config.student.iterations):
-                self._train_block("student", self._student, config.student.iterations, writer)
+        wholes = {"teacher": config.teacher.iterations, "student": config.student.iterations}
+        limits = wholes if until is None else dict(zip(wholes, until, strict=True))
+        with SummaryWriter(str(self.folder)) if ranks.rank() == 0 else nullcontext() as writer:
+            for stage, trainer in self._trainers.items():
+                while self._done[stage] < min(limits[stage], wholes[stage]):
+                    self._train_block(stage, trainer, wholes[stage], writer)
 
-    def _train_block(self, stage: str, trainer: Ppo | Dagger, whole: int, writer: Any) -> None:
+    def _train_block(self, stage: str, trainer: Trainer, whole: int, writer: Any) -> None:
         begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
-        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART)
+        apart = ranks.rank() * trainer.env.num_envs
+        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart)
         end = min(done + self.config.block, whole)
         sums: dict[str, list[float]] = {}
         for iteration in range(done, end):
             log = trainer.iterate(iteration / whole)
             for name, value in log.items():
-                writer.add_scalar(f"{stage}/{name}", value, iteration)
+                if writer is not None:
+                    writer.add_scalar(f"{stage}/{name}", value, iteration)
                 sums.setdefault(name, []).append(value)
         self._done[stage] = end
-        self._save()
+        if ranks.rank() == 0:
+            self._save()
         self.trained_s[stage] = self.trained_s.get(stage, 0.0) + time.monotonic() - begin_s
         self.processor_s += _processor_s() - processor_s
         means = ", ".join(f"{name} {sum(v) / len(v):.3g}" for name, v in sums.items())
@@ -176,9 +203,9 @@ class Training:
         partial = file.with_suffix(".part")
         torch.save(
             {
-                "teacher": self._teacher.descent.state_dict(),
-                "student": self._student.descent.state_dict(),
+                **{stage: trainer.descent.state_dict() for stage, trainer in self._trainers.items()},
                 "shape": self.student.shape,
+                "weights": self.student.state_dict(),
                 "generator": self._generator.get_state(),
                 "done": self._done,
             },
@@ -188,7 +215,8 @@ class Training:
 
     def evaluate_teacher(self) -> Evaluation:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
-        env = self._teacher.env
+        assert self.teacher is not None
+        env = self._trainers["teacher"].env
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
@@ -199,11 +227,25 @@ def prepare_torch() -> None:
     torch.set_float32_matmul_precision("high")
 
 
-def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
-    """Return how a task is trained: with more worlds on a GPU, and for longer."""
+def default_config(
+    task: str, *, device: str = "auto", seed: int = 0, algorithm: str = "dagger"
+) -> TrainConfig:
+    """Return how a task is trained: with more worlds on a GPU, and for longer.
+
+    Args:
+        task: Its name.
+        device: Where.
+        seed: Of everything.
+        algorithm: `dagger`: by imitation of a teacher; `ppo`: on events from scratch.
+    """
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
+    if algorithm == "ppo":
+        ppo = RecurrentPpoConfig()
+        if find_device(device).startswith("cuda"):
+            ppo = RecurrentPpoConfig(worlds=1024, iterations=300)
+        return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
     if not find_device(device).startswith("cuda"):
         few: dict[str, Any] = {
             "worlds": 64,
@@ -215,14 +257,14 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
-            config, teacher=small[0], student=small[1], pixels=24, widely=False, block=90
+            config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=90
         )
-    many = {"worlds": 1024, "iterations": 84, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=42,
+        block=45,
         evaluation_worlds=512,
     )
 
@@ -240,7 +282,8 @@ def read_config(folder: Path) -> TrainConfig:
         )
     values = json.loads(file.read_text())
     values["teacher"] = PpoConfig(**values["teacher"])
-    values["student"] = DaggerConfig(**values["student"])
+    imitates = "replay" in values["student"]
+    values["student"] = (DaggerConfig if imitates else RecurrentPpoConfig)(**values["student"])
     return TrainConfig(**values)
 
 
@@ -255,7 +298,7 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    policy.load_state_dict(state["student"]["policy"])
+    policy.load_state_dict(state["weights"])
     return policy
 
 
@@ -306,19 +349,26 @@ def train(
         say: Told what happens, line by line.
 
     Returns:
-        Evaluations in scenes that were not trained in: `events`, and `blind`.
+        Evaluations in scenes that were not trained in: `events`, and `blind`; of several processes (`ranks`)
+        by the first only.
     """
     from neurosim_core.learn.export import export_onnx
 
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
     prepare_torch()
-    training = Training(folder, None if resume else config, say=say)
+    config = dataclasses.replace(read_config(folder) if resume else config, device=ranks.join(config.device))
+    if ranks.rank() > 0:
+        say = _say_nothing
+    training = Training(folder, config, say=say)
     if resume:
         training.resume()
     say(f"set up in {time.monotonic() - begin_s:.0f} s")
     training.run()
-    say(f"teacher: {training.evaluate_teacher()}")
+    if ranks.rank() > 0:
+        return {}
+    if training.teacher is not None:
+        say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
     for name, evaluation in evaluate_run(folder):
@@ -347,6 +397,10 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "rate_max_rad_s": list(task.rate_max_rad_s),
         "vehicle": dict(task.vehicle),
     }
+
+
+def _say_nothing(line: str) -> None:
+    """Leave it to the first process."""
 
 
 def _processor_s() -> float:

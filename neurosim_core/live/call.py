@@ -92,19 +92,21 @@ def describe_status(
         rates_hz: Messages a second of simulated time [Hz], by vehicle and sensor, if known.
         lost: Messages that a viewer has not received, by vehicle and sensor, if known.
     """
-    wanted = f" of {status.real_time_factor_wanted:g}" if status.real_time_factor_wanted else ""
-    lines = [
-        f"**{status.phase}**{f': {status.reason}' if status.reason else ''}",
-        f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods, "
-        f"{status.real_time_factor:.2f}{wanted} x real time",
-        f"step {_ms(status.step_median_ns)} (p99 {_ms(status.step_p99_ns)}), "
-        f"late {_ms(status.late_median_ns)} (p99 {_ms(status.late_p99_ns)}), "
-        f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s",
-    ]
+    run = f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods"
+    counts = f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s"
+    if status.step_median_ns:  # else no period has been computed since the status before
+        wanted = f" of {status.real_time_factor_wanted:g}" if status.real_time_factor_wanted else ""
+        run += f", {status.real_time_factor:.2f}{wanted} x real time"
+        counts = (
+            f"step {_ms(status.step_median_ns)} (p99 {_ms(status.step_p99_ns)}), "
+            f"late {_ms(status.late_median_ns)} (p99 {_ms(status.late_p99_ns)}), {counts}"
+        )
+    lines = [f"**{status.phase}**{f': {status.reason}' if status.reason else ''}", run, counts]
     vehicles = [
         {
             "vehicle": vehicle.name,
             "mode": "**fail-safe**" if vehicle.fail_safe else vehicle.command_mode or "no command yet",
+            "from": vehicle.command_source or "-",
             "taken": vehicle.command_count,
             "age": _ms(vehicle.command_age_ns),
             "refused": vehicle.refused_count,

@@ -87,6 +87,9 @@ class CommandSubscriber:
         """
         policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
+        self._node = node
+        self._senders = ""
+        self._sequences: dict[int, int] = {}
         self.missed: Command | None = None
         self.refusal = self.clamping = ""
         self._ranges = ranges
@@ -111,11 +114,31 @@ class CommandSubscriber:
         """Return whether a publisher was connected since the last call."""
         found = False
         for mode, subscriber in self._subscribers.items():
-            sources = subscriber.sources()
+            sequences = subscriber.sources()
+            self._sequences = {**sequences, **self._sequences}
+            sources = set(sequences)
             if subscriber.publisher_count >= len(sources):  # else one of them is still connecting
                 found |= not sources <= self._sources[mode]
                 self._sources[mode] = sources
         return found
+
+    def senders(self, mode: CommandMode) -> str:
+        """Return the names of the nodes that have sent commands of a mode since the last call.
+
+        If none has, what was returned then.
+        """
+        sequences = self._subscribers[mode].sources()
+        active = {source for source, count in sequences.items() if count > self._sequences.get(source, count)}
+        if not active and not self._senders:  # it came before its sender was first looked at
+            active = {source for source, count in sequences.items() if count > 0}
+        self._sequences |= sequences
+        if active:
+            self._senders = ", ".join(
+                record.name
+                for record in self._node.nodes()
+                if any(publisher.source in active for publisher in record.publishers)
+            )
+        return self._senders
 
     @property
     def counts(self) -> CommandCounts:
@@ -127,6 +150,7 @@ class CommandSubscriber:
         while self._read():
             pass
         self.missed = None
+        self._senders = ""
         self._before = self._totals()
 
     def poll(self) -> Command | None:

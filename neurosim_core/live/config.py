@@ -10,8 +10,8 @@ from neurosim_core.settings import Settings
 
 LiveMode = Literal["lockstep", "streaming"]
 FailSafe = Literal["hover", "cut", "hold"]
-
-Seconds = Annotated[float, Field(ge=0.0, le=1e6)]
+Delay = Annotated[float, Field(ge=0.0, le=5.0)]
+"""A longer one was meant in milliseconds."""
 
 
 class LiveConfig(Settings):
@@ -49,9 +49,9 @@ class LinkConfig(Settings):
     A link keeps the order of its messages: a delayed message delays those behind it.
     """
 
-    latency_s: Seconds = 0.0
+    latency_s: Delay = 0.0
     """Delay of every message [s]."""
-    jitter_s: Seconds = 0.0
+    jitter_s: Delay = 0.0
     """Further delay, uniform in [0, jitter_s] [s]."""
     loss: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Share of messages that never arrive."""

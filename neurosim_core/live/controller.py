@@ -335,7 +335,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
                 fleet.start(config or announced, lockstep=simulation.mode == "lockstep")
                 said = (
                     f"flying {', '.join(fleet.vehicles)}: {fleet.mode}, {simulation.mode}, "
-                    f"{simulation.control_rate_hz:g} Hz"
+                    f"{simulation.control_rate_hz:g} Hz, of {_owner(node, source)}"
                 )
                 console.print(said)
             heard = _receive(statuses, _LOOK_S) if fleet.vehicles else None
@@ -353,6 +353,14 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
                 console.print(text)
             if text or heard is not None:
                 said = text
+
+
+def _owner(node: Node, source: int) -> str:
+    """Say whose publisher it is."""
+    for record in node.nodes():
+        if any(publisher.source == source for publisher in record.publishers):
+            return f"the {record.name} in process {record.pid}, domain {node.domain}"
+    return f"a simulator in domain {node.domain}"
 
 
 def _receive(subscriber: Subscriber[T], timeout_s: float) -> tuple[T, Info] | None:

@@ -58,6 +58,7 @@ class PacketTopic(Topic):
         loan: Memory for its next picture; None: pictures are copied.
         late_times: How late by the wall clock messages were published since the last status [ns].
         subscriber_count: As of the last `update`.
+        is_recorded: Whether packets count that nobody subscribes to.
         published_count: Messages since the last reset.
         delivered_ns: Stamp in the message that arrived last [ns]; None if there was none.
     """
@@ -80,6 +81,7 @@ class PacketTopic(Topic):
         self.loan: PictureLoan | None = None
         self.late_times = Timings()
         self.subscriber_count = 0
+        self.is_recorded = False
         self._convert = convert
         self._options = options
         self._latched = publisher.latch
@@ -108,6 +110,7 @@ class PacketTopic(Topic):
         config = self.link.config
         clocked = config.clock_offset_s or config.clock_drift_ppm
         self.delivered_ns = config.clock_ns(packet.stamp_ns)
+        self.published_count += self.is_recorded and packet is not self._kept
         if not (self.subscriber_count or at_once):
             self._kept = packet if self._latched else None
             return False
@@ -115,7 +118,7 @@ class PacketTopic(Topic):
         self._kept = None
         in_place = self.loan is not None and isinstance(packet, Image) and self.loan.holds(packet.data)
         self.publish(message, self.loan.publish if in_place and self.loan is not None else None)
-        self.published_count += 1
+        self.published_count += not self.is_recorded
         if self._latched:
             self._last = message
         return True
@@ -177,6 +180,7 @@ class PacketPublisher:
             publisher = node.publisher(topic, message, latch=latch, expected_bytes=size_bytes)
             queue = Link(link, seed=config.seed, name=name)
             self.topics[name] = PacketTopic(name, publisher, queue, convert, **options)
+            self.topics[name].is_recorded = record is not None
             if message is msg.Image:
                 self._image_names.append(name)
             if not link.delivers_at_once:

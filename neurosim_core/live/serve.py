@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import logging
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 from rich.markdown import Markdown
@@ -52,19 +54,25 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
     with Node("simulator") as node:
         require_single_instance(node)
         with console.status("preparing") as preparing:
+
+            def show(phase: str) -> None:
+                preparing.update(f"preparing: {phase}")
+                if not console.is_terminal:
+                    console.print(f"preparing: {phase}")
+
             simulator = Simulator(
                 config,
                 node,
                 record=record,
                 overwrite=overwrite,
-                on_phase=lambda phase: preparing.update(f"preparing: {phase}"),
+                on_phase=show,
             )
         gc.collect()
         gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second
         sys.setswitchinterval(_SWITCH_S)
         with stop_at_signals(stop, on_stop=node.stop_waiting), simulator:
             print_plan(console, simulator.vehicles, config)
-            with StatusLine(console) as line:
+            with StatusLine(console, is_over=lambda: simulator.is_over) as line:
                 simulator.status.on_status = line.show
                 code = simulator.run(stop)
             if line.last is not None:
@@ -128,26 +136,57 @@ class StatusLine:
         last: The newest status; None if there was none.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, *, is_over: Callable[[], bool]) -> None:
+        """Begin with an empty line.
+
+        Args:
+            console: Where to print.
+            is_over: Whether the simulator ends with the run.
+        """
         self.last: SimulatorStatus | None = None
-        self._slow_count = 0
+        self._slow_count = self._late_count = 0
+        self._senders: set[tuple[str, str]] = set()
+        self._is_over = is_over
         self._console = console
         self._line = Status("", console=console, refresh_per_second=5)
+        self._logs: list[logging.StreamHandler[TextIO]] = []
 
     def show(self, status: SimulatorStatus) -> None:
         """Update the line, and print what has changed."""
         before, self.last = self.last, status
         self._line.update(_summary(status))
-        for text in (*changes(before, status), *self._slowness(before, status)):
+        for text in (*self._news(before, status), *self._slowness(before, status)):
             self._console.print(f"[yellow]{text}[/]")
 
+    def _news(self, before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+        """Return what has changed, and once in a run each node that commands a vehicle."""
+        if before is None or status.step_count < before.step_count:
+            self._senders.clear()
+        senders = {(each.name, each.command_source) for each in status.vehicles if each.command_source}
+        new, self._senders = sorted(senders - self._senders), self._senders | senders
+        lines = [f"{vehicle}: {sender} commands it" for vehicle, sender in new]
+        return lines + changes(before, status, is_over=self._is_over())
+
     def _slowness(self, before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
-        """Return once in a run that it has been slower than wanted for a second."""
+        """Return once in a run that kernels are compiled, and that it was slower than wanted for a second.
+
+        A sensor that has not published yet is taken to be waiting for its kernels.
+        """
         wanted = status.real_time_factor_wanted
         if before is None or status.step_count < before.step_count:
-            self._slow_count = 0
+            self._slow_count = self._late_count = 0
             return []
+        new = [
+            f"{each.vehicle}/{each.name}"
+            for each in status.sensors
+            if each.active and not each.published_count
+        ]
         slow = before.phase == status.phase == "running" and status.real_time_factor < 0.9 * wanted
+        if slow and new:
+            self._late_count += 1
+            if self._late_count == _SLOW_STATUSES:
+                return [f"compiling what computes {', '.join(new)}; it is kept for the next time"]
+            return []
         self._slow_count = self._slow_count + 1 if slow or self._slow_count > _SLOW_STATUSES else 0
         if self._slow_count != _SLOW_STATUSES:
             return []
@@ -158,18 +197,28 @@ class StatusLine:
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:
+            console = sys.stderr
             self._line.start()
+            handlers = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
+            self._logs = [handler for handler in handlers if handler.stream is console]
+            self._log()  # to what clears the line first
         return self
 
     def __exit__(self, *_: object) -> None:
         self._line.stop()
+        self._log()
+
+    def _log(self) -> None:
+        """Let what is logged to the console go to what `sys.stderr` is now."""
+        for handler in self._logs:
+            handler.setStream(sys.stderr)
 
 
-def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+def changes(before: SimulatorStatus | None, status: SimulatorStatus, *, is_over: bool) -> list[str]:
     """Return what has changed between two statuses that a user wants to know, a line each."""
     lines = []
     if status.phase == "ended" and (before is None or before.phase != "ended"):
-        lines.append(f"ended: {status.reason}")
+        lines.append(f"ended: {status.reason}{'' if is_over else '; `neurosim call reset` begins again'}")
     if before is None or before.phase == "ended" or status.step_count < before.step_count:
         return lines
     if status.phase == "waiting" and status.reason and not before.reason and status.step_count:
@@ -178,7 +227,8 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str
         if now.fail_safe_count > was.fail_safe_count:
             lines.append(f"{now.name}: no command has come in time; the fail-safe flies")
         if was.fail_safe and not now.fail_safe:
-            lines.append(f"{now.name}: commands arrive again")
+            sender = f" (from {now.command_source})" if now.command_source else ""
+            lines.append(f"{now.name}: commands arrive again{sender}")
     return lines
 
 

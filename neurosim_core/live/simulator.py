@@ -149,6 +149,11 @@ class Simulator:
             return "for the first command"
         return self._reason
 
+    @property
+    def is_over(self) -> bool:
+        """Whether `run` returns with the end of the flight, or has."""
+        return self._exit is not None
+
     def run(self, stop: threading.Event) -> int:
         """Fly until told to stop.
 

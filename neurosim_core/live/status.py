@@ -243,6 +243,7 @@ def _vehicle(vehicle: VehicleNode, stamp_ns: int) -> VehicleStatus:
         refused_reason=vehicle.subscriber.refusal if counts.refused else "",
         clamped_count=counts.clamped,
         clamped_reason=vehicle.subscriber.clamping if counts.clamped else "",
+        command_source="" if hold.command is None else vehicle.subscriber.senders(hold.command.mode),
     )
 
 

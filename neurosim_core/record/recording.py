@@ -23,6 +23,7 @@ from neurosim_core.record.hdf5 import (
     read_constant,
 )
 from neurosim_core.record.header import Intrinsics, RecordingHeader, SensorDescription
+from neurosim_core.registry import load_plugins
 
 log = logging.getLogger(__name__)
 
@@ -171,12 +172,16 @@ class _Stream:
         self.group = group
         self.schema = PacketSchema.from_json(group.attrs["schema"])
         self.packet_class = packet_class(self.schema)
+        if issubclass(self.packet_class, GenericPacket):
+            load_plugins()  # one of them may define the class
+            self.packet_class = packet_class(self.schema)
         self.packet_count = int(group["packet_count"][()])
         self.note = ""
         if issubclass(self.packet_class, GenericPacket):
             self.note = (
                 f"sensor {name!r} sends packets of class {self.schema.name}, which is not known here as it "
-                "was recorded: its packets are read as generic ones (import the module that defines it first)"
+                "was recorded: its packets are read as generic ones (import the module that defines it "
+                "first, or install it as a plug-in)"
             )
         self._constants: dict[str, Any] = {}
         self._datasets: dict[str, Any] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,9 @@ def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> So
     files = _Files(path)
     options: dict[str, Any] = {"split_objects": True} if suffix == "obj" else {}
     data = _checked(path, suffix)
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL)  # it shows tracebacks of files that are missing, which are told below
     try:
         loaded = trimesh.load_scene(
             io.BytesIO(data), file_type=suffix, resolver=files, process=False, **options
@@ -84,6 +88,8 @@ def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> So
             f"{path}: cannot be read as {suffix.upper()}: {wrong}. It may be truncated, or of another "
             "format; export it again"
         ) from error
+    finally:
+        log.setLevel(level)
     source = Source(up_default="y" if suffix == "obj" else "z")
     source.up_reason = f"{suffix.upper()} files do not say which way is up"
     if files.missing:

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
-from neurosim_core.packets import Image, ImageEncoding, Packet
+from neurosim_core.packets import Image, ImageEncoding, Packet, schema_of
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
 from neurosim_core.render.ray_times import RayTimes, RayTiming, ShutterConfig
@@ -27,6 +27,7 @@ from neurosim_core.settings import Settings
 from neurosim_core.vehicle import Multirotor
 
 RateHz = Annotated[float, Field(gt=0.0, le=1e6)]
+"""Type of the rate of a sensor in its settings [Hz]: in (0, 1e6]."""
 
 
 class RenderRequest(NamedTuple):
@@ -53,6 +54,28 @@ class SensorConfig(Settings):
     if TYPE_CHECKING:
         kind: str
         """The kind under which it is registered; a field of every subclass."""
+
+    @classmethod
+    def check_class(cls) -> None:
+        """Check what all sensors have, when the class is registered.
+
+        Raises:
+            TypeError: Its packets are not said, or cannot be recorded or sent; or it has no rate.
+        """
+        packet = getattr(cls, "packet_type", None)
+        if not (isinstance(packet, type) and issubclass(packet, Packet)):
+            raise TypeError(
+                f"{cls.__qualname__} must say the class of its packets, a subclass of ns.Packet: "
+                f"packet_type = ..., got {packet!r}"
+            )
+        loose = [field.name for field in schema_of(packet).fields if "..." in field.shape]
+        if loose and packet is not Image:
+            raise TypeError(
+                f"{packet.__qualname__}.{loose[0]}: the array needs axes, such as "
+                "Annotated[NDArray[np.float32], FieldSpec(3)], or FieldSpec('n', 3) if their number varies"
+            )
+        if "rate_hz" not in cls.model_fields and cls.clock is SensorConfig.clock:
+            raise TypeError(f"{cls.__qualname__} needs a field `rate_hz: RateHz = 100.0`, or its own `clock`")
 
     @property
     def clock(self) -> Rate:

@@ -140,7 +140,7 @@ def _make_kernel(kind: str) -> Any:
         if not (v >= 0.0 and v < float(model.height)):
             return
         far = _NEAR_RATIO * float(wp.length(way))
-        if is_hidden(model.mesh[scene], model.body_mesh, here, view, p_WC, wp.normalize(way), far):
+        if is_hidden(model.mesh[scene], model.body_mesh, here, view, p_WC, wp.normalize(way), far, False):
             return
         label = int(0)
         for row in range(wp.max(int(v) - 1, 0), wp.min(int(v) + 2, model.height)):

@@ -8,6 +8,7 @@ Reference: Kalibr wiki, Supported models; Yaml formats.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ _MODELS = {
     ("pinhole", "none"): "pinhole",
     ("pinhole", "radtan"): "radtan",
     ("pinhole", "equi"): "equidistant",
+    ("pinhole", "equidistant"): "equidistant",
     ("ds", "none"): "double_sphere",
 }
 
@@ -44,7 +46,8 @@ def read_camchain(file: str | Path, *, imu: Mount | None = None) -> dict[str, di
         ValueError: The file is no camera chain, or a model is unknown; the message names it.
     """
     try:
-        chain = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        text = Path(file).read_text(encoding="utf-8")
+        chain = yaml.safe_load(re.sub(r"\A%YAML:.*", "", text))  # OpenCV's first line is none of YAML
     except (OSError, yaml.YAMLError) as error:
         raise ValueError(f"cannot read {file}: {error}") from None
     if not isinstance(chain, dict) or "cam0" not in chain:

@@ -1,13 +1,15 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-# ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
+# ruff: noqa: SIM102, UP018  (nested wp.static branches and typed literals have a meaning in kernels)
 """Optical flow: where in the picture what each pixel sees was, will be, or how fast it moves there.
 
 The point that the ray of a pixel hits is fixed to what it is a part of, the scene or a moving body, and
 projected with the poses of the other time, through the lens. So flow is exact whatever moves and turns. A
 pixel that sees nothing sees a direction: its flow is that of the rotation of the camera.
 
-A second ray, cast at the other time from the camera to the point, says whether something hides it.
+Whether something hides it at the other time is known for most pixels from their own picture: nothing is on
+the way from the other camera to the point where the picture shows only what is further than that way, and
+near the camera where no surface is as near. Elsewhere a second ray is cast, from there to the point.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -36,6 +38,12 @@ VISIBLE, HIDDEN, OUTSIDE = 0, 1, 2
 _FAR_M = wp.constant(1.0e9)
 _NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
 """What hides a point is nearer than it by this ratio: rays and points are float32."""
+_CLEARANCE_M = wp.constant(0.5)
+"""No surface is looked for that is further from a camera than this."""
+_HORIZON_M = wp.constant(1.0e5)
+"""Where a way to the sky ends [m]."""
+_WAY_PX = wp.constant(64.0)
+"""Longest way in a picture that is followed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,7 +94,8 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
     """backward: pixels are those of the later picture, and flow leads to where what they see was in the
     earlier one; forward: pixels are those of the earlier picture. Velocities have no direction."""
     occlusion: bool = True
-    """Cast a second ray for each pixel, that says what is hidden at the other time."""
+    """Find out what is hidden at the other time. Where the pixel's own picture does not tell, a second ray
+    does; what is thinner than a pixel may be overlooked."""
 
     packet_type = OpticalFlow
     output: ClassVar[str] = "range"
@@ -147,6 +156,7 @@ class _Model:
     scene_of_world: wp.array[int]
     motions: wp.array[Motion]
     body_mesh: wp.array[wp.uint64]
+    clearance: wp.array[float]
 
 
 @wp.struct
@@ -169,10 +179,15 @@ def is_hidden(
     p_W: wp.vec3d,
     ray_W: wp.vec3d,
     far: float,
+    free: bool,
 ) -> bool:
-    """Return whether something is on the ray from the camera, nearer than a distance [m]."""
-    if wp.mesh_query_ray_anyhit(mesh, wp.vec3(p_W), wp.vec3(ray_W), far):
-        return True
+    """Return whether something is on the ray from the camera, nearer than a distance [m].
+
+    Where it is `free`, the scene is not, and bodies may be.
+    """
+    if not free:
+        if wp.mesh_query_ray_anyhit(mesh, wp.vec3(p_W), wp.vec3(ray_W), far):
+            return True
     for body in range(bodies.shape[0]):
         q_WO = views.q_WO[view, body]
         p_O = wp.vec3(wp.quat_rotate_inv(q_WO, p_W - views.p_WO[view, body]))
@@ -180,6 +195,82 @@ def is_hidden(
         if wp.mesh_query_ray_anyhit(bodies[body], p_O, ray_O, far):
             return True
     return False
+
+
+@wp.kernel(enable_backward=False)
+def _measure_clearance(
+    # Model:
+    model: _Model,
+    # In:
+    instant_count: int,
+    here: Views,
+):
+    """Write the distance from the camera within which there is no surface of the scene [m]."""
+    world = wp.tid() // instant_count
+    view = world * model.stride + wp.tid() % instant_count
+    mesh = model.mesh[model.scene_of_world[world]]
+    clearance = _CLEARANCE_M
+    found = wp.mesh_query_point_no_sign(mesh, here.p_WC[view], _CLEARANCE_M)
+    if found.result:
+        nearest = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+        clearance = wp.length(nearest - here.p_WC[view])
+    model.clearance[view] = _NEAR_RATIO * clearance
+
+
+@wp.func
+def _is_way_free(
+    model: _Model,
+    lens: LensData,
+    ranges: wp.array2d[float],
+    other: wp.vec3,
+    point: wp.vec3,
+    clearance: float,
+) -> bool:
+    """Return whether the picture of a pinhole camera shows that a way is free, but for its last pixel.
+
+    Args:
+        model: Of the picture.
+        lens: Of the camera.
+        ranges: The picture [m].
+        other: Where the way begins, in C [m].
+        point: Where it ends, in C [m].
+        clearance: Distance from the camera within which there is no surface [m].
+    """
+    length = wp.length(point - other)
+    along = (point - other) / length
+    middle = wp.dot(other, along)
+    inside = middle * middle + clearance * clearance - wp.dot(other, other)
+    leaving = wp.sqrt(wp.max(inside, 0.0)) - middle
+    if wp.dot(other, other) >= clearance * clearance:
+        return False
+    if leaving >= length:
+        return True
+    begin = other + leaving * along
+    if begin[2] <= 0.0:
+        return False
+    scale = wp.vec2(float(lens.fx), float(lens.fy))
+    center = wp.vec2(float(lens.cx), float(lens.cy))
+    here = wp.vec3(point[0] / point[2], point[1] / point[2], 1.0)
+    step = wp.vec3(begin[0] / begin[2], begin[1] / begin[2], 1.0) - here
+    count = wp.max(wp.abs(step[0] * scale[0]), wp.abs(step[1] * scale[1]))
+    if count > _WAY_PX:
+        return False
+    nearness = 1.0 / point[2]
+    for k in range(1, int(wp.ceil(count))):
+        share = float(k) / count
+        toward = here + share * step
+        away = wp.length(toward) / (nearness + share * (1.0 / begin[2] - nearness))
+        left = int(wp.floor(toward[0] * scale[0] + center[0] - 0.5))
+        top = int(wp.floor(toward[1] * scale[1] + center[1] - 0.5))
+        if left < 0 or top < 0 or left + 1 >= model.width or top + 1 >= model.height:
+            return False
+        least = wp.min(
+            wp.min(ranges[top, left], ranges[top, left + 1]),
+            wp.min(ranges[top + 1, left], ranges[top + 1, left + 1]),
+        )
+        if _NEAR_RATIO * least <= away:
+            return False
+    return True
 
 
 def views_at(views: PictureViews, device: Any) -> Any:
@@ -299,8 +390,19 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
             far = _FAR_M
             if found:
                 far = _NEAR_RATIO * float(wp.length(d_W))
+            free = bool(False)
+            if wp.static(kind == "pinhole"):
+                if body < 0:
+                    free = _is_way_free(
+                        model,
+                        lens,
+                        ranges[slot],
+                        wp.vec3(wp.quat_rotate_inv(q_WC, p_WT - p_WC)),
+                        wp.min(ranges[slot, row, col], _HORIZON_M) * wp.vec3(ray_C),
+                        model.clearance[view],
+                    )
             mesh = model.mesh[model.scene_of_world[world]]
-            if is_hidden(mesh, model.body_mesh, there, view, p_WT, wp.normalize(d_W), far):
+            if is_hidden(mesh, model.body_mesh, there, view, p_WT, wp.normalize(d_W), far, free):
                 mask = 1.0
         flow_out[slot, row, col] = wp.vec3(u, v, mask)
 
@@ -334,7 +436,9 @@ class FlowProcess:
         model.rays = wp.array(rays, dtype=wp.vec3, device=device)
         self._lenses = [make_lens_data(lens, device) for lens in lenses]
         model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
-        model.lens_of_world = wp.array(list(context.lens_of_world), dtype=int, device=device)
+        lens_rows = list(context.lens_of_world)
+        model.lens_of_world = wp.array(lens_rows, dtype=int, device=device)
+        model.clearance = wp.zeros(len(lens_rows) * context.stride, dtype=float, device=device)
         mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
         model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
         model.scene_of_world = context.scene_of_world
@@ -348,6 +452,14 @@ class FlowProcess:
         """Make the flow of the pictures of a batch; launches only."""
         world_count = views.image_slot.shape[0] // self._context.stride
         sources = self._context.sources
+        here = views_at(views, self._device)
+        if "occlusion" in self.terms:
+            wp.launch(
+                _measure_clearance,
+                dim=world_count * views.instant_count,
+                inputs=[self._model, views.instant_count, here],
+                device=self._device,
+            )
         launch_split(
             self._kernel,
             dim=world_count * views.instant_count * self._model.pixel_count,
@@ -356,7 +468,7 @@ class FlowProcess:
                 views.instant_count,
                 views.image_slot,
                 views.active,
-                views_at(views, self._device),
+                here,
                 views_at(views.then or views, self._device),
                 views.twist,
                 sources["range"],

@@ -35,6 +35,7 @@ Axes = NonNegative | tuple[NonNegative, NonNegative, NonNegative]
 Probability = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 _DROPOUT = 1 << 20
+_MOTION = ("position", "velocity", "orientation", "body_rate", "air_velocity")
 
 
 class ErrorConfig(Settings):
@@ -165,6 +166,7 @@ class Motion:
     velocity: wp.array[wp.vec3d]
     orientation: wp.array[wp.quatd]
     body_rate: wp.array[wp.vec3d]
+    air_velocity: wp.array[wp.vec3d]
 
 
 @wp.kernel
@@ -188,6 +190,7 @@ def _delay(
         ring[world, at, axis] = motion.position[world][axis]
         ring[world, at, 3 + axis] = motion.velocity[world][axis]
         ring[world, at, 6 + axis] = motion.body_rate[world][axis]
+        ring[world, at, 13 + axis] = motion.air_velocity[world][axis]
     for part in range(4):
         ring[world, at, 9 + part] = motion.orientation[world][part]
     at = int(wp.max(k - length + wp.int64(1), wp.int64(0)) % length)
@@ -197,6 +200,7 @@ def _delay(
     delayed.orientation[world] = wp.quatd(
         ring[world, at, 9], ring[world, at, 10], ring[world, at, 11], ring[world, at, 12]
     )
+    delayed.air_velocity[world] = wp.vec3d(ring[world, at, 13], ring[world, at, 14], ring[world, at, 15])
 
 
 class StateSampler(Sampler):
@@ -241,13 +245,13 @@ class StateSampler(Sampler):
         self._sample = wp.zeros(count, dtype=wp.int64, device=device)
         memory = wp.zeros((count if terms else 0, 2 * group_count), dtype=wp.vec3d, device=device)
         motion = Motion()
-        for name in ("position", "velocity", "orientation", "body_rate"):
+        for name in _MOTION:
             setattr(motion, name, getattr(vehicle.arrays, name))
         self._delay: Any = None
         if delay_count:
-            ring = wp.zeros((count, delay_count + 1, 13), dtype=wp.float64, device=device)
+            ring = wp.zeros((count, delay_count + 1, 16), dtype=wp.float64, device=device)
             delayed = Motion()
-            for name in ("position", "velocity", "orientation", "body_rate"):
+            for name in _MOTION:
                 setattr(delayed, name, wp.zeros_like(getattr(motion, name)))
             self._delay = wp.launch(
                 _delay,

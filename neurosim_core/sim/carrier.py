@@ -23,7 +23,7 @@ import warp as wp
 from neurosim_core.frames import quaternion_exp
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle import MultirotorConfig, MultirotorState
-from neurosim_core.vehicle.host_vehicle import allocate_arrays
+from neurosim_core.vehicle.arrays import allocate_arrays
 
 wp.set_module_options({"enable_backward": False})
 

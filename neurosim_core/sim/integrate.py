@@ -17,6 +17,7 @@ from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
+from neurosim_core.sensors.sampler_checks import sample_packet
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
@@ -261,7 +262,8 @@ def _read_samplers(state: State, batch: Batch) -> list[Packet]:
         stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
         columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
         for sample, stamp_ns in enumerate(stamps):
-            packet = state.samplers[name].packet(
+            packet = sample_packet(
+                state.samplers[name],
                 {field: column[sample] for field, column in columns.items()},
                 stamp_ns=stamp_ns,
                 sequence=state.sequence[name],

@@ -21,6 +21,8 @@ class VehicleStates:
     """q_WB, xyzw, shape [N, 4]."""
     body_rate: wp.array[wp.vec3d]
     """w_WB in B [rad/s], shape [N, 3]."""
+    air_velocity: wp.array[wp.vec3d]
+    """Velocity of the air there, wind, gusts and turbulence together, in W [m/s], shape [N, 3]."""
     rotor_speed: wp.array2d[wp.float64]
     """[rad/s], shape [N, R]."""
     stamp_ns: wp.array[wp.int64]

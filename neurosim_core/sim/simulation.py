@@ -354,6 +354,7 @@ class Simulation:
                 velocity=arrays.velocity,
                 orientation=arrays.orientation,
                 body_rate=arrays.body_rate,
+                air_velocity=arrays.air_velocity,
                 rotor_speed=arrays.rotor_speed,
                 stamp_ns=arrays.stamp_ns,
             ),

@@ -28,6 +28,7 @@ from neurosim_core.sensors.base import (
     WorldFrameContext,
 )
 from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sensors.sampler_checks import make_sampler
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
@@ -267,7 +268,7 @@ def make_state(
         surfaces=surfaces,
     )
     samplers = {
-        name: sensor.make(context(name=name))
+        name: make_sampler(sensor, context(name=name))
         for name, sensor in config.sensors.items()
         if isinstance(sensor, StateSensorConfig)
     }

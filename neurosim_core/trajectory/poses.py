@@ -9,6 +9,7 @@ Reference: SciPy's `CubicSpline` (not-a-knot) and `RotationSpline`, whose coeffi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path as FilePath
@@ -21,10 +22,17 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from neurosim_core.clock import NS_PER_S
-from neurosim_core.frames import Q_FORWARD_OPTICAL, UNIT_TOLERANCE, Vector3
+from neurosim_core.frames import Q_FORWARD_OPTICAL, Vector3
 from neurosim_core.install import install_hint
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory.path import Attitude, Path
+
+_log = logging.getLogger(__name__)
+
+_LENGTH_TOLERANCE = 0.01
+"""Of a quaternion: files have few digits."""
+_REPEAT_SHARE = 0.01
+"""Of the median time between poses: what comes sooner is a repeat."""
 
 PoseFormat = Literal["tum", "euroc", "csv", "npy", "bag"]
 """Names of file formats."""
@@ -102,9 +110,11 @@ def pose_path(config: PosesConfig) -> Path:
         rotation = Rotation.from_euler("xyz", [frame.rpy_rad for frame in config.keyframes])
         times = np.array([frame.time_s for frame in config.keyframes])
         rows = [frame.position_m for frame in config.keyframes]
-        poses = check_poses(times, rows, rotation.as_quat(), name=lambda row: f"path.keyframes[{row}]")
+        where = "path.keyframes"
+        poses = check_poses(times, rows, rotation.as_quat(), where, name=lambda row: f"{where}[{row}]")
     else:
         assert config.file is not None
+        where = str(config.file)
         poses = read_poses(config.file, config.format, topic=config.topic)
     orientation = Rotation.from_quat(poses.orientation)
     if config.frame == "optical":
@@ -115,11 +125,20 @@ def pose_path(config: PosesConfig) -> Path:
             f"path.start_s must be before the last pose at {poses.stamps_ns[-1] / NS_PER_S:g} s, "
             f"got {config.start_s:g}"
         )
-    return spline_path(stamps_ns, poses.position, orientation)
+    try:
+        with np.errstate(over="raise", invalid="raise"):
+            return spline_path(stamps_ns, poses.position, orientation)
+    except (FloatingPointError, ValueError):  # SciPy's search for the rotations does not end
+        raise ValueError(
+            f"{where}: no smooth motion goes through these poses: some turn far in no time"
+        ) from None
 
 
 def read_poses(file: FilePath, kind: PoseFormat, *, topic: str | None = None) -> Poses:
     """Read a file of poses; stamps count from the first.
+
+    Poses with the time of the one before, or nearly so, are left out, and the log says it: published ground
+    truth has some.
 
     Args:
         file: Where they are.
@@ -150,8 +169,10 @@ def read_poses(file: FilePath, kind: PoseFormat, *, topic: str | None = None) ->
         times,
         values[:, 1:4].astype(np.float64),
         values[:, 4:].astype(np.float64),
+        str(file),
         name=lambda row: f"{file}, {what} {lines[row]}",
         unit_s=1e-9 if kind == "euroc" else 1.0,
+        repeats=True,
     )
     return poses
 
@@ -172,8 +193,8 @@ def _read_text(file: FilePath, kind: PoseFormat) -> tuple[NDArray[Any], list[int
             if not rows and kind != "tum":
                 continue  # names of columns
             raise ValueError(f"{file}, line {line}: no numbers, {text!r}: {description}") from None
-        if len(row) < 8:
-            raise ValueError(f"{file}, line {line}: {len(row)} numbers, not 8, {text!r}: {description}")
+        if len(row) < 8 or (kind == "tum" and len(words) == 12):  # KITTI's rows of a matrix have no time
+            raise ValueError(f"{file}, line {line}: {len(words)} numbers, not 8, {text!r}: {description}")
         rows.append(row)
         lines.append(line)
     return np.array(rows).reshape(len(rows), -1 if rows else 8), lines
@@ -216,7 +237,13 @@ def _read_bag(file: FilePath, topic: str | None) -> Poses:
     values = np.array(rows).reshape(-1, 7)
     stamps_ns = np.array(times, np.int64) - min(times, default=0)
     return check_poses(
-        stamps_ns, values[:, :3], values[:, 3:], name=lambda row: f"{file}, message {row}", unit_s=1e-9
+        stamps_ns,
+        values[:, :3],
+        values[:, 3:],
+        str(file),
+        name=lambda row: f"{file}, message {row}",
+        unit_s=1e-9,
+        repeats=True,
     )
 
 
@@ -224,36 +251,48 @@ def check_poses(
     times: NDArray[Any],
     position: ArrayLike,
     orientation: ArrayLike,
+    where: str,
     *,
     name: Callable[[int], str],
     unit_s: float = 1.0,
+    repeats: bool = False,
 ) -> Poses:
     """Return poses, with stamps from the first one on.
 
     Args:
         times: Strictly increasing, shape [n].
         position: p_WB [m], shape [n, 3].
-        orientation: q_WB, xyzw, of length 1 to 1e-3, shape [n, 4].
+        orientation: q_WB, xyzw, of length 1 to 1 %, shape [n, 4].
+        where: What a message calls all of them.
         name: What a message calls a row.
         unit_s: Unit of time [s].
+        repeats: Poses less than 1 % of the usual time after the one before are left out, not refused.
 
     Raises:
         ValueError: There are less than two, or a row is wrong.
     """
     p, q = np.asarray(position, np.float64), np.asarray(orientation, np.float64)
     if len(times) < 2:
-        raise ValueError(f"a motion needs at least two poses, got {len(times)}")
+        raise ValueError(f"{where}: a motion needs at least two poses, got {len(times)}")
     finite = np.isfinite(times.astype(np.float64)) & np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
     length = np.linalg.norm(q, axis=1)
     for row in np.flatnonzero(~finite)[:1]:
         raise ValueError(f"{name(row)}: not finite, got {[float(times[row]), *p[row], *q[row]]}")
-    for row in np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)[:1]:
+    for row in np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)[:1]:
         raise ValueError(f"{name(row)}: no unit quaternion, {q[row].tolist()} has length {length[row]:.6g}")
     stamps_ns = np.rint((times - times[0]) * (unit_s * NS_PER_S)).astype(np.int64)
-    for row in np.flatnonzero(np.diff(stamps_ns) <= 0)[:1] + 1:
+    gaps_ns = np.diff(stamps_ns)
+    for row in np.flatnonzero(gaps_ns < (0 if repeats else 1))[:1] + 1:
         before, after = float(times[row - 1]), float(times[row])
         raise ValueError(f"{name(row)}: time must increase, got {after!r} after {before!r}")
-    return Poses(stamps_ns, p, q / length[:, None])
+    repeated = np.flatnonzero(gaps_ns < _REPEAT_SHARE * np.median(gaps_ns) if repeats else gaps_ns < 0) + 1
+    if len(repeated):
+        told = len(repeated), name(repeated[0])
+        _log.warning(
+            "%d poses come with the time of the one before, and are left out: the first is %s", *told
+        )
+    rows = np.delete(np.arange(len(times)), repeated)
+    return Poses(stamps_ns[rows], p[rows], (q / length[:, None])[rows])
 
 
 def spline_path(stamps_ns: NDArray[np.int64], position: NDArray[np.float64], orientation: Rotation) -> Path:

@@ -1,6 +1,7 @@
 """Multirotor dynamics: `Multirotor(preset("hummingbird"))` is a vehicle to fly."""
 
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig
+from neurosim_core.vehicle.arrays import MultirotorArrays
 from neurosim_core.vehicle.ground import GroundConfig
 from neurosim_core.vehicle.multirotor import (
     Acceleration,
@@ -8,7 +9,6 @@ from neurosim_core.vehicle.multirotor import (
     Effort,
     Integrator,
     Multirotor,
-    MultirotorArrays,
     MultirotorState,
 )
 from neurosim_core.vehicle.presets import preset

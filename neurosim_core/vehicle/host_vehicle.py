@@ -9,19 +9,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.vehicle.arrays import MultirotorArrays, allocate_arrays
 from neurosim_core.vehicle.config import VehicleContext
 from neurosim_core.vehicle.multirotor import (
     Acceleration,
     DynamicsError,
-    MultirotorArrays,
     MultirotorConfig,
     MultirotorState,
 )
 from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_TERMS, STATUS_VELOCITY
-
-_VECTORS = ("position", "velocity", "body_rate", "acceleration", "angular_acceleration")
-_ROTORS = ("rotor_speed", "rotor_speed_command")
-_OTHERS = {"orientation": wp.quatd, "status": wp.int32}
 
 
 class Vehicle(Protocol):
@@ -55,20 +51,6 @@ class Vehicle(Protocol):
     @property
     def state(self) -> MultirotorState:
         """A copy of the state on the host, with a leading axis of worlds."""
-
-
-def allocate_arrays(count: int, rotor_count: int, device: Any) -> MultirotorArrays:
-    """Return the state of vehicles, all zero."""
-    dtypes = dict.fromkeys(_VECTORS, wp.vec3d) | _OTHERS
-    arrays: dict[str, Any] = {
-        name: wp.zeros(
-            (count, rotor_count) if name in _ROTORS else count,
-            dtype=wp.float64 if name in _ROTORS else dtypes.get(name, wp.int64),
-            device=device,
-        )
-        for name in MultirotorArrays.__annotations__
-    }
-    return MultirotorArrays(**arrays)
 
 
 class HostVehicle:

@@ -47,6 +47,7 @@ class Batch:
     rotor_speed_command: wp.array2d(dtype=wp.float64)
     acceleration: wp.array(dtype=wp.vec3d)
     angular_acceleration: wp.array(dtype=wp.vec3d)
+    air_velocity: wp.array(dtype=wp.vec3d)
     stamp_ns: wp.array(dtype=wp.int64)
     status: wp.array(dtype=wp.int32)
     redone_count: wp.array(dtype=wp.int64)
@@ -61,7 +62,7 @@ class Kernels(NamedTuple):
     accelerate: Any
     """Evaluates linear and angular acceleration at the current state."""
     begin: Any
-    """Draws the turbulence at time 0; None without."""
+    """Takes up the wind at time 0, and draws its turbulence; None without wind."""
 
 
 @wp.func
@@ -100,6 +101,7 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     equations = make_equations(terms)
     motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
     wind, changing_wind, turbulence = equations.wind, equations.changing_wind, equations.turbulence
+    windy = not terms.isdisjoint(("wind", "gusts", "turbulence"))
     near_ground = equations.ground or equations.ground_effect
     forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
     set_step = equations.rotors.set_step
@@ -183,6 +185,10 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
             else:
                 batch.rotor_speed[vehicle, rotor] = c
         batch.stamp_ns[vehicle] += interval.duration_ns
+        if wp.static(windy):
+            batch.air_velocity[vehicle] = wind_at(
+                airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0)
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -257,13 +263,19 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     def begin(
         # Model:
+        airframes: wp.array[Airframe],
         around: Surroundings,
         # In:
-        position: wp.array[wp.vec3d],
         mask: wp.array[wp.int32],
+        # In/out:
+        batch: Batch,
     ):
         vehicle = wp.tid()
         if mask.shape[0] == 0 or mask[vehicle] != 0:
-            start_turbulence(around.wind, vehicle, position[vehicle])
+            if wp.static(turbulence):
+                start_turbulence(around.wind, vehicle, batch.position[vehicle])
+            batch.air_velocity[vehicle] = wind_at(
+                airframes[vehicle], around.wind, vehicle, wp.int64(0), wp.float64(0.0)
+            )
 
-    return Kernels(advance, accelerate, begin if turbulence else None)
+    return Kernels(advance, accelerate, begin if windy else None)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.frames import as_rows
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
+from neurosim_core.vehicle.arrays import allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
 from neurosim_core.vehicle.motor import LagConstants, lag_constants
@@ -93,36 +93,6 @@ class DynamicsError(ArithmeticError):
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MultirotorArrays:
-    """What lives on the device of a batch. Write `rotor_speed_command`; the rest is read-only."""
-
-    position: wp.array[wp.vec3d]
-    """p_WB [m], [N]."""
-    velocity: wp.array[wp.vec3d]
-    """v_WB in W [m/s], [N]."""
-    orientation: wp.array[wp.quatd]
-    """q_WB, [N]."""
-    body_rate: wp.array[wp.vec3d]
-    """w_WB in B [rad/s], [N]."""
-    rotor_speed: wp.array2d[wp.float64]
-    """[rad/s], [N, R]."""
-    rotor_speed_command: wp.array2d[wp.float64]
-    """Held during `advance` [rad/s], [N, R]."""
-    acceleration: wp.array[wp.vec3d]
-    """dv/dt in W as of the last `accelerate` [m/s^2], [N]."""
-    angular_acceleration: wp.array[wp.vec3d]
-    """dw/dt in B as of the last `accelerate` [rad/s^2], [N]."""
-    stamp_ns: wp.array[wp.int64]
-    """Time of each vehicle's state [ns], [N]; stops where a vehicle is held."""
-    status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `status.STATUS_TERMS`, [N]."""
-    redone_count: wp.array[wp.int64]
-    """Intervals redone with adaptive steps since the reset, [N]."""
-    evaluation_count: wp.array[wp.int64]
-    """Evaluations of the right-hand side in adaptive steps since the reset, [N]."""
-
-
 class Multirotor:
     """A batch of equal multirotors, each with its own state.
 
@@ -196,25 +166,7 @@ class Multirotor:
         self.max_step_ns = max_step_ns
         self.terms = tuple(term for term in TERMS if term in chosen)
         """The terms that are compiled in."""
-        rotors = config.rotor_count
-
-        def zeros(shape: Any, dtype: Any) -> Any:
-            return wp.zeros(shape, dtype=dtype, device=self.device)
-
-        self.arrays = MultirotorArrays(
-            position=zeros(count, wp.vec3d),
-            velocity=zeros(count, wp.vec3d),
-            orientation=zeros(count, wp.quatd),
-            body_rate=zeros(count, wp.vec3d),
-            rotor_speed=zeros((count, rotors), wp.float64),
-            rotor_speed_command=zeros((count, rotors), wp.float64),
-            acceleration=zeros(count, wp.vec3d),
-            angular_acceleration=zeros(count, wp.vec3d),
-            stamp_ns=zeros(count, wp.int64),
-            status=zeros(count, wp.int32),
-            redone_count=zeros(count, wp.int64),
-            evaluation_count=zeros(count, wp.int64),
-        )
+        self.arrays = allocate_arrays(count, config.rotor_count, self.device)
         self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
         self._adaptive = (rtol, atol, evaluation_count_max)
         self._model = make_airframe(config, self.device)
@@ -235,7 +187,9 @@ class Multirotor:
         self._batch = _struct(Batch, **vars(self.arrays))
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
-            self._begin = self._record(self._kernels.begin, self._surroundings(), self.arrays.position, None)
+            self._begin = self._record(
+                self._kernels.begin, self.airframes, self._surroundings(), None, self._batch
+            )
         self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self._own_lags: wp.array2d[Any] | None = None
@@ -336,16 +290,16 @@ class Multirotor:
         self._stamp_ns += duration_ns
 
     def begin(self, mask: Any) -> None:
-        """Draw the turbulence at time 0 of some vehicles, whose state was set in `arrays`; device form.
+        """Take up the wind at time 0 for some vehicles, whose state was set in `arrays`; device form.
 
         Args:
-            mask: Not 0 where it is drawn, device array of int32, shape [N].
+            mask: Not 0 for those vehicles, device array of int32, shape [N].
         """
         if self._kernels.begin is not None:
             wp.launch(
                 self._kernels.begin,
                 dim=self.count,
-                inputs=[self._surroundings(), self.arrays.position, mask],
+                inputs=[self.airframes, self._surroundings(), mask, self._batch],
                 device=self.device,
                 block_dim=_BLOCK_DIM,
             )

@@ -20,7 +20,7 @@ from cortex import Node, message
 from cortex import messages as msg
 from cortex_ros2_bridge import bridge as bridge_module
 from cortex_ros2_bridge import incoming as incoming_module
-from cortex_ros2_bridge import links, neighbours
+from cortex_ros2_bridge import links, neighbours, tally
 from cortex_ros2_bridge import outgoing as outgoing_module
 from cortex_ros2_bridge.backend.base import BackendError, TopicInfo
 from cortex_ros2_bridge.config import ConfigError
@@ -755,6 +755,10 @@ def test_closing_gives_up_a_call_that_is_under_way():
 # Both
 
 
+def status_of(phase, reason, vehicle):
+    return msg.SimulatorStatus(1, 2, phase, reason, "streaming", 1, 1, 7, 1, 2, 3, 4, 5, 6, [], [vehicle])
+
+
 def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, caplog):
     """The classical mistake: a Twist where a TwistStamped is wanted."""
     monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
@@ -768,6 +772,10 @@ def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, capl
             TopicInfo("/drone/imu", "sensor_msgs/msg/Image", 0, 1),
             TopicInfo("/drone/cmd_vel", "geometry_msgs/msg/Twist", 1, 0),
             TopicInfo("/elsewhere", "geometry_msgs/msg/Twist", 1, 1),
+            TopicInfo("/drone/command_vel", "geometry_msgs/msg/TwistStamped", 1, 0),
+            TopicInfo("/drone/command_speed", "geometry_msgs/msg/TwistStamped", 1, 1),
+            TopicInfo("/drone/command_velocity_raw", "geometry_msgs/msg/Twist", 0, 1),
+            TopicInfo("/goal", "geometry_msgs/msg/TwistStamped", 1, 0),
         ]
         with rig.backend.listening("/diagnostics") as (diagnostics,):
             rig.update_until(lambda: diagnostics.sent)
@@ -781,7 +789,30 @@ def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, capl
         "/drone/command_velocity: a node publishes geometry_msgs/msg/Twist, wanted is "
         "geometry_msgs/msg/TwistStamped; for geometry_msgs/msg/Twist: /drone/cmd_vel",
         "/drone/imu: a node subscribes to it as sensor_msgs/msg/Image, it is sensor_msgs/msg/Imu",
+        "/drone/command_vel: a node publishes geometry_msgs/msg/TwistStamped, which nobody reads; did you "
+        "mean /drone/command_velocity?",
     ]
+
+
+def test_the_end_of_a_run_and_what_the_simulator_refuses_are_said(monkeypatch, caplog):
+    """Once, whoever asks for the status; another run may end again."""
+    monkeypatch.setattr(tally, "SAY_INTERVAL_S", 0.0)
+    quiet = msg.VehicleStatus("drone", "motor_speeds", 9, 0, 0, 0, 5, False, 0, 0)
+    refusing = dataclasses.replace(
+        quiet, refused_count=3, refused_reason="motor_speeds takes 4 numbers, got 3"
+    )
+    ended = status_of("ended", "drone collided at 2.748 s", refusing)
+    with rig_of({"namespace": "/sim"}) as rig:
+        sent = rig.simulator.publisher("/status", msg.SimulatorStatus)
+        rig.update_until(lambda: sent.subscriber_count == 1)
+        for status in (status_of("running", "", quiet), ended, ended, status_of("running", "", quiet), ended):
+            sent.publish(status)
+        wait_for(lambda: caplog.text.count("refused") >= 2)
+    assert (caplog.text.count("the run has ended"), caplog.text.count("refused")) == (2, 2)
+    assert (
+        "the run has ended: drone collided at 2.748 s; the service /sim/reset begins another" in caplog.text
+    )
+    assert "drone: the simulator: refused 3: motor_speeds takes 4 numbers, got 3" in caplog.text
 
 
 def test_another_bridge_is_said_and_named(monkeypatch, caplog):

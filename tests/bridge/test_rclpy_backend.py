@@ -344,7 +344,7 @@ def test_choice(fake: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert bag.name == "bag"
         bag.close()
     for bad in ("ros", "flight.bag", ""):
-        with pytest.raises(ValueError, match="backend must be 'auto', 'rclpy', 'dds' or a path"):
+        with pytest.raises(ValueError, match="a backend is auto, rclpy, dds or a path"):
             open_backend(bad)
 
 

@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import fake_rclpy
+import numpy as np
 import pytest
 from processes import ROOT
 
-from cortex_ros2_bridge.convert import RULES
+from cortex.messages import Events
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.convert import RULES, Context
 from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
 from cortex_ros2_bridge.typestore import definitions, service_types, typestore
 from neurosim_core.config import load_config
 
 TOUR = ROOT / "examples" / "ros2_tour"
+EVENTS = "event_camera_msgs/msg/EventPacket"
 
 
 @pytest.fixture
@@ -73,3 +77,20 @@ def test_the_container_has_what_the_package_depends_on() -> None:
     wanted = {each.text or "" for each in root.findall("exec_depend")}
     in_the_image = {"rclpy", "launch", "ros2launch", "rosidl_default_runtime", "rosgraph_msgs", "sensor_msgs"}
     assert {name.replace("_", "-") for name in wanted - in_the_image - {"std_srvs"}} <= apt
+
+
+def test_the_tutorial_decodes_the_events_of_the_bridge() -> None:
+    page = (ROOT / "docs" / "tutorials" / "ros2.md").read_text(encoding="utf-8")
+    (code,) = [
+        block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Evt3Decoder" in block
+    ]
+    namespace: dict[str, Any] = {}
+    exec(code, namespace)
+    t = np.arange(100, 200, dtype=np.int64)
+    events = Events(
+        200_000, (t % 5).astype(np.uint16), (t % 3).astype(np.uint16), t, (t % 2).astype(np.uint8), 5, 3
+    )
+    convert = next(rule.convert for rule in RULES if rule.ros_type == EVENTS)
+    seen = namespace["see"](cdr.decode(convert(events, Context(vehicle="drone")), EVENTS))
+    for mine, read in zip((t, events.x, events.y, events.polarity), seen, strict=True):
+        np.testing.assert_array_equal(read, mine)

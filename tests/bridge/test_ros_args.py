@@ -217,6 +217,12 @@ def test_the_command_does_what_launch_asks(dds_domain: int, runtime: Path) -> No
                 ros.subscription("/gyro", "sensor_msgs/msg/Imu", Qos(), got.append)
                 wait_for(lambda: sent.subscriber_count)
                 wait_for(lambda: sent.publish(imu(7)) and got)
+                with BridgeProcess("--backend", "run.bag", "--ros-args", *arguments) as wrong:
+                    assert wrong.process.wait(60.0) == 1
+                    wrong.hear()
+                    assert (
+                        "--backend: a backend is auto, rclpy, dds or a path that ends in .mcap" in wrong.said
+                    )
                 with BridgeProcess("--backend", "dds", "--ros-args", *arguments) as second:
                     assert second.process.wait(60.0) == 1
                     second.hear()

@@ -40,7 +40,6 @@ from cortex_ros2_bridge.typestore import (
     DISTROS,
     UnknownTypeError,
     check_type,
-    dds_type_name,
     definitions,
     type_hash,
     typestore,
@@ -78,10 +77,6 @@ def test_what_is_routed_is_the_same_in_all_distributions(type_name):
 
 
 def test_names_of_types():
-    assert dds_type_name("sensor_msgs/msg/Imu") == "sensor_msgs::msg::dds_::Imu_"
-    for wrong in ("sensor_msgs/Imu", "Imu", "", "sensor_msgs/msg/"):
-        with pytest.raises(ValueError, match="no message type"):
-            dds_type_name(wrong)
     with pytest.raises(UnknownTypeError, match="is it sensor_msgs/msg/Imu"):
         check_type("sensor_msgs/Imu")
     with pytest.raises(UnknownTypeError, match="unknown message type 'a/msg/B' in ROS humble"):
@@ -203,30 +198,30 @@ def test_attributes_that_do_not_exist_cannot_be_set():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda: Vector3(x=1), "'x' field must be of type 'float'"),
-        (lambda: Vector3(x="1"), "'x' field must be of type 'float'"),
-        (lambda: Image(height=-1), "'height' field must be an unsigned integer in"),
-        (lambda: Image(height=2**32), "'height' field must be an unsigned integer in"),
-        (lambda: Image(height=1.0), "'height' field must be of type 'int'"),
-        (lambda: Image(encoding=b"rgb8"), "'encoding' field must be of type 'str'"),
-        (lambda: Image(header=Vector3()), "'header' field must be a sub message of type 'Header'"),
+        (lambda: Vector3(x=1), "'x' field must be of type 'double', got 1"),
+        (lambda: Vector3(x="1"), "'x' field must be of type 'double', got '1'"),
+        (lambda: Image(height=-1), "'height' field must be of type 'uint32', got -1"),
+        (lambda: Image(height=2**32), "'height' field must be of type 'uint32'"),
+        (lambda: Image(height=1.0), "'height' field must be of type 'uint32'"),
+        (lambda: Image(encoding=b"rgb8"), "'encoding' field must be of type 'string'"),
+        (lambda: Image(header=Vector3()), "'header' field must be of type 'std_msgs/Header'"),
         (lambda: Image(data=[256]), "unsigned byte integer is greater than maximum"),
-        (lambda: setattr(Image(), "data", [0.5]), "data"),
-        (lambda: setattr(Image(), "data", array.array("f", [1.0])), "type code of 'B'"),
-        (
-            lambda: setattr(Imu(), "orientation_covariance", np.zeros(9, np.float32)),
-            "dtype of 'numpy.float64'",
-        ),
-        (lambda: setattr(Imu(), "orientation_covariance", np.zeros(8)), "size of 9"),
-        (lambda: setattr(Imu(), "orientation_covariance", [0.0] * 8), "length 9"),
-        (lambda: PointCloud2(is_bigendian=1), "'is_bigendian' field must be of type 'bool'"),
-        (lambda: PointCloud2(fields=[Vector3()]), "set or sequence and each value of type 'PointField'"),
-        (lambda: DiagnosticStatus(level=1), "'level' field must be of type 'bytes'"),
-        (lambda: AttitudeTarget(thrust=1e39), "'thrust' field must be a float in"),
+        (lambda: Image(data="ab"), "'data' field must be of type 'sequence<uint8>', got 'ab'"),
+        (lambda: setattr(Image(), "data", [0.5]), "float"),
+        (lambda: setattr(Image(), "data", array.array("f", [1.0])), "type code 'f' for one of 'B'"),
+        (lambda: setattr(Imu(), "orientation_covariance", np.zeros(9, np.float32)), "of float32 for one of"),
+        (lambda: setattr(Imu(), "orientation_covariance", np.zeros(8)), r"must be of type 'double\[9\]'"),
+        (lambda: setattr(Imu(), "orientation_covariance", [0.0] * 8), r"must be of type 'double\[9\]'"),
+        (lambda: PointCloud2(is_bigendian=1), "'is_bigendian' field must be of type 'boolean'"),
+        (lambda: PointCloud2(fields=[Vector3()]), "'fields' field must be of type 'sensor_msgs/PointField'"),
+        (lambda: DiagnosticStatus(level=1), "'level' field must be of type 'octet'"),
+        (lambda: DiagnosticStatus(level=b"12"), "'level' field must be of type 'octet'"),
+        (lambda: AttitudeTarget(thrust=1e39), "'thrust' field must be of type 'float'"),
     ],
 )
 def test_values_of_a_wrong_type_or_range_are_refused(change, reason):
-    with pytest.raises(WRONG, match=reason):
+    is_ours = issubclass(Imu, msgs.Message)
+    with pytest.raises(WRONG, match=reason if is_ours else None):  # rclpy has other words for each
         change()
 
 
@@ -244,8 +239,6 @@ def test_arrays_are_those_of_rclpy_whatever_they_are_made_of():
     assert imu.orientation_covariance is ours
     assert CameraInfo(k=[float(n) for n in range(9)]).k.shape == (9,)
     assert CameraInfo(k=list(range(9))).k.tolist() == [float(n) for n in range(9)]
-    with pytest.raises(AssertionError):
-        CameraInfo().k = list(range(9))  # only the constructor converts
     message = Actuators()
     message.velocity.extend([3.0, 4.0])
     assert message.velocity.tolist() == [3.0, 4.0]

@@ -105,10 +105,25 @@ def test_what_a_recording_does_not_show_is_left_out_and_said():
     said = " ".join(fit.notes)
     for part in ("thresholds are not told", "no leak", "no dead time", "never saturated"):
         assert part in said
+    assert "not still" not in said
     leak = {"leak.rate_hz": 0.3, "leak.spread_decades": 0.1}
     fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=record_still(leak), span_s=SPAN_S), repeats=2)
     assert not [key for key in fit.settings if key.startswith("shot_noise")]
     assert fit.settings["leak.rate_hz"] == pytest.approx(0.3, rel=0.02)
+
+
+def test_thresholds_of_pixels_that_are_alike_are_told_less_exactly():
+    """Every pixel has as many events in a step: a range of thresholds does, and the errors say so."""
+    alike = {"threshold_on": 0.18, "threshold_off": 0.24, "leak.rate_hz": 0.2}
+    stimulus = Stimulus(
+        width=WIDTH, height=HEIGHT, still=record_still(alike), span_s=SPAN_S, steps=record_steps(alike),
+        contrast=CONTRAST, rise_s=RISE_S,
+    )  # fmt: skip
+    fit = fit_sensor(stimulus, repeats=2)
+    for key in ("threshold_on", "threshold_off"):
+        assert 0.005 < fit.errors[key] < 0.02
+        assert fit.settings[key] == pytest.approx(alike[key], abs=3.0 * fit.errors[key]), key
+    assert "all pixels have the same whole number of events" in " ".join(fit.notes)
 
 
 def test_a_readout_by_rows_is_told_from_one_by_events():
@@ -119,6 +134,11 @@ def test_a_readout_by_rows_is_told_from_one_by_events():
     assert found["readout.bandwidth_hz"] == pytest.approx(4e5, rel=0.1)
     assert found["readout.row_s"] == pytest.approx(2e-6, rel=0.5)
     assert "readout.kind" not in measure_readout(record_steps(TRUTH, periods=2))
+
+
+def test_a_recording_that_is_not_still_is_said(recordings):
+    fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=recordings[1], span_s=5.0), repeats=2)
+    assert "the still recording is not still" in " ".join(fit.notes)
 
 
 def test_steps_are_found_where_they_are(recordings):

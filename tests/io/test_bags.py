@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from cortex_ros2_bridge.typestore import typestore
 from neurosim_core import cli
@@ -167,6 +169,50 @@ def test_dvs_msgs_of_others(tmp_path):
         (60, 47, 0),
         (0, 0, 1),
     ]
+
+
+def test_a_bag_of_ros_1(tmp_path):
+    """Events written byte by byte: ROS 1 has no gaps, and a number at the begin of each header."""
+    rows = [(3, 4, 7, 5000, 1), (60, 47, 7, 9999, 0), (0, 0, 8, 1000, 1)]
+    events_body = struct.pack("<IIII3sIII", 9, 8, 0, 3, b"cam", HEIGHT, WIDTH, len(rows))
+    events_body += b"".join(struct.pack("<HHIIB", *row) for row in rows)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    made = {
+        name.rpartition("/")[2]: kind for name, kind in store.types.items() if name != "std_msgs/msg/Time"
+    }
+    unknown = np.zeros(9)
+    imu = made["Imu"](
+        header=made["Header"](seq=1, stamp=made["Time"](sec=7, nanosec=2_000), frame_id="imu"),
+        orientation=made["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=made["Vector3"](x=1.0, y=2.0, z=3.0),
+        angular_velocity_covariance=unknown,
+        linear_acceleration=made["Vector3"](x=4.0, y=5.0, z=6.0),
+        linear_acceleration_covariance=unknown,
+    )
+    with Ros1Writer(tmp_path / "davis.bag") as writer:
+        text = "std_msgs/Header header\nuint32 height\nuint32 width\nEvent[] events\n" + "=" * 80
+        text += "\nMSG: dvs_msgs/Event\nuint16 x\nuint16 y\ntime ts\nbool polarity\n"
+        camera = writer.add_connection(
+            "/dvs/events", "dvs_msgs/msg/EventArray", msgdef=text, md5sum="5e8beee5"
+        )
+        inertial = writer.add_connection("/dvs/imu", "sensor_msgs/msg/Imu", typestore=store)
+        writer.write(camera, 8_000_000_000, events_body)
+        writer.write(inertial, 8_000_000_001, store.serialize_ros1(imu, "sensor_msgs/msg/Imu"))
+    reader = open_events(tmp_path / "davis.bag")
+    (events,) = reader.blocks()
+    (sample,) = reader.packets()
+    reader.close()
+    assert (reader.width, reader.height) == (WIDTH, HEIGHT)
+    assert events.t.tolist() == [7_000_005, 7_000_009, 8_000_001]
+    assert list(zip(events.x.tolist(), events.y.tolist(), events.polarity.tolist(), strict=True)) == [
+        (3, 4, 1),
+        (60, 47, 0),
+        (0, 0, 1),
+    ]
+    assert (sample.sensor, sample.stamp_ns) == ("imu", 7_000_002_000)
+    assert sample.specific_force.tolist() == [4.0, 5.0, 6.0]
+    assert sample.angular_rate.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_drivers_stamp_by_another_clock(tmp_path):

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +18,14 @@ from neurosim_core.registry import register
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
+import rank_process  # noqa: E402
+
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
+from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
 from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
+from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 from neurosim_core.learn.train import (  # noqa: E402
     TrainConfig,
@@ -37,38 +46,56 @@ class BriefHover(Hover):
     episode_s = 0.4
 
 
+CONDITIONS = (
+    "as in the tests",
+    "noise of a DAVIS346",
+    "thresholds 3 to 4 times",
+    "lens of 0.8 times the angle",
+    "mass 0.9 to 1.1 times, wind up to 1 m/s",
+    "clock 30 % slower",
+    "actions one step later",
+    "three tenths of the actions lost",
+)
+
+
 def small(**changes) -> TrainConfig:
     return TrainConfig(
         task="brief-hover",
         device="cpu",
         seed=2,
         teacher=PpoConfig(worlds=4, iterations=4, horizon=6, epochs=2, minibatches=2),
-        student=DaggerConfig(worlds=4, iterations=4, horizon=6),
-        block=2,
-        **changes,
+        **{"student": DaggerConfig(worlds=4, iterations=4, horizon=6), "block": 2, **changes},
     )
 
 
-def run(folder, hall, *, stops=()) -> Training:
+IMITATES = small().student
+FROM_SCRATCH = RecurrentPpoConfig(worlds=4, iterations=4, horizon=6, epochs=2, minibatches=2)
+
+
+def run(folder, hall, *, stops=(), student=IMITATES) -> Training:
     """Train, in a process of its own from each stop on, as it were."""
     pytest.importorskip("tensorboard")
     for until in (*stops, None):
         going_on = (folder / "checkpoint.pt").exists()
-        training = Training(folder, None if going_on else small(), say=lambda line: None, models=[hall])
+        training = Training(
+            folder, None if going_on else small(student=student), say=lambda line: None, models=[hall]
+        )
         if going_on:
             training.resume()
         training.run(until=until)
     return training
 
 
-def test_a_run_that_is_resumed_ends_where_it_would_have(tmp_path, hall):
-    whole = run(tmp_path / "whole", hall)
-    parts = run(tmp_path / "parts", hall, stops=[(2, 0), (4, 2)])
-    for policy in ("teacher", "student"):
+@pytest.mark.parametrize("student", [IMITATES, FROM_SCRATCH])
+def test_a_run_that_is_resumed_ends_where_it_would_have(tmp_path, hall, student):
+    whole = run(tmp_path / "whole", hall, student=student)
+    parts = run(tmp_path / "parts", hall, stops=[(2, 0), (4, 2)], student=student)
+    assert (whole.teacher is None) == (student is FROM_SCRATCH)
+    for policy in ("teacher", "student") if whole.teacher else ("student",):
         states = [getattr(training, policy).state_dict() for training in (whole, parts)]
         for name, value in states[0].items():
             assert torch.equal(value, states[1][name]), (policy, name)
-    fresh = Training(tmp_path / "fresh", small(), models=[hall])
+    fresh = Training(tmp_path / "fresh", small(student=student), models=[hall])
     moved = [
         (a - b).abs().max()
         for a, b in zip(whole.student.parameters(), fresh.student.parameters(), strict=True)
@@ -156,6 +183,48 @@ def test_ppo_learns_to_stop(hall):
     assert after.metrics["speed_m_s"] < before.metrics["speed_m_s"]
 
 
+class Recall:
+    """Episodes of five steps: which way to act is shown in the first of them only."""
+
+    num_envs, device, task = 32, torch.device("cpu"), SimpleNamespace(hint="velocity")
+
+    def reset(self, *, seed=0, spread=False):
+        self._generator, self._step = torch.Generator().manual_seed(seed), 0
+        return self._seen(), {}
+
+    def group(self, observations, name):
+        return observations["vector"] if name == "student" else observations["velocity"]
+
+    def step(self, action):
+        reward, end = (
+            (self._way * action.clamp(-1.0, 1.0)[:, :1]).squeeze(1),
+            torch.zeros(self.num_envs) > 0.0,
+        )
+        self._step = (self._step + 1) % 5
+        last = self._seen()
+        metrics = {"success": reward, "crash": torch.zeros(self.num_envs)}
+        return last, reward, end | (self._step == 0), end, {"final_obs": last, "metrics": metrics}
+
+    def _seen(self):
+        if self._step == 0:
+            self._way = torch.sign(torch.randn(self.num_envs, 1, generator=self._generator))
+        shown = self._way * (self._step == 0)
+        return {"events": torch.zeros(self.num_envs, 2, 8, 8), "vector": shown, "velocity": self._way}
+
+
+def test_ppo_learns_what_only_a_memory_can():
+    """Without one, half of the actions would go the wrong way but for the first of five: a reward of 0.2."""
+    torch.manual_seed(0)
+    config = RecurrentPpoConfig(
+        worlds=32, horizon=20, learning_rate=5e-3, reward_scale=1.0, widths=(4,), hidden=16
+    )
+    ppo = RecurrentPpo(Recall(), config, torch.Generator().manual_seed(0))
+    ppo.begin(1)
+    rewards = [ppo.iterate(0.0)["reward"] for _ in range(10)]
+    assert rewards[0] < 0.2
+    assert np.mean(rewards[-3:]) > 0.5
+
+
 def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     training = run(tmp_path, hall)
     env = ns.learn.make_env("brief-hover", worlds=6, device="cpu", models=[hall])
@@ -180,6 +249,27 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert slow.metrics["speed_m_s"] < 0.5 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
+
+
+def test_a_policy_is_evaluated_where_it_was_not_trained(tmp_path, hall, monkeypatch):
+    """Each condition changes what is flown; with none of them the evaluation is that of the tests."""
+    from neurosim_core.learn import transfer
+
+    run(tmp_path, hall)
+    file = hall.config.scene.file
+    changes = {name: transfer.CONDITIONS[name] for name in CONDITIONS}
+    monkeypatch.setattr(transfer, "CONDITIONS", changes)
+    found = dict(transfer.evaluate_transfer(tmp_path, scenes=[str(file)], worlds=3))
+    assert found["as in the tests"] == next(evaluate_run(tmp_path, scenes=str(file), worlds=3))[1]
+    assert len({evaluation.metrics["speed_m_s"] for evaluation in found.values()}) == len(CONDITIONS)
+
+
+def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):
+    training = Training(tmp_path, small(randomise="none"), models=[hall])
+    assert training.env.randomisation == NO_RANDOMISATION
+    assert Training(tmp_path, small(), models=[hall]).env.randomisation == Hover.training
+    with pytest.raises(ValueError, match="unknown randomise 'some', known: training, tests, none"):
+        small(randomise="some")
 
 
 def test_a_task_of_ones_own_is_learnt(monkeypatch):
@@ -244,3 +334,25 @@ def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
             torch.testing.assert_close(action, actions[step].clamp(-1.0, 1.0))
             torch.testing.assert_close(memory[:, policy.hidden :], estimates[step])
     assert estimates.std() > 0.0
+
+
+def test_two_processes_train_one_policy(tmp_path, hall):
+    """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
+    pytest.importorskip("tensorboard")
+    script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    done = subprocess.run(
+        [*torchrun, script, scene, str(tmp_path / "both")],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    first, second = sorted(found, key=lambda each: each["rank"])
+    alone = rank_process.train(tmp_path / "alone", hall)
+    assert first["digests"] == second["digests"]
+    assert first["position"] != second["position"]
+    assert not set(first["digests"]) & set(alone["digests"])
+    assert (tmp_path / "both" / "checkpoint.pt").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,7 +22,7 @@ from cortex.messages import (
     VehicleStatus,
 )
 from neurosim_core.cli import _parser
-from neurosim_core.live.call import call, parameters_of
+from neurosim_core.live.call import call, describe_status, parameters_of
 from neurosim_core.live.topics import SERVICES, STATUS
 
 STATUS_NOW = SimulatorStatus(
@@ -43,7 +44,7 @@ STATUS_NOW = SimulatorStatus(
         SensorStatus("red", "events", True, 2, 1357, 3, 1, 12, 98_500_000),
         SensorStatus("red", "rgb", False, 0, 0, 0, 0),
     ],
-    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13, "", 4)],
+    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13, "", 4, "", "fly")],
 )
 
 
@@ -144,7 +145,7 @@ def test_status(shared_runtime, capsys):
         "step 1.25 ms (p99 3.75 ms), late 0.06 ms (p99 0.21 ms), 17 overruns, delayed by 0.345 s",
     ]
     for row in (
-        "red fail-safe 4,321 8.00 ms 5 4 6 7 9 13",
+        "red fail-safe fly 4,321 8.00 ms 5 4 6 7 9 13",
         "red/events on 2 1,357 3 1 12 98.50 ms",
         "red/rgb off 0 0 0 0 0 0.00 ms",
     ):
@@ -177,3 +178,11 @@ def test_wrong_numbers_are_refused(shared_runtime):
     ):
         with pytest.raises(ValueError, match=text):
             call(_parser().parse_args(["call", *words]))
+
+
+def test_what_was_not_measured_is_left_out():
+    stopped = dataclasses.replace(STATUS_NOW, phase="ended", reason="done", step_median_ns=0)
+    first = describe_status(stopped).partition("\n\n")[0]
+    assert first == (
+        "**ended**: done  \nstreaming, 1.234 s, 2,468 control periods  \n17 overruns, delayed by 0.345 s"
+    )

@@ -956,6 +956,13 @@ def test_missing_files_can_be_ignored(tmp_path):
         assert all(material.texture is None for material in scene.materials)
 
 
+def test_a_picture_of_a_ply_that_is_missing_is_told_once(tmp_path, caplog):
+    data = ascii_of("ply").replace(b"1.0\n", b"1.0\ncomment TextureFile lost.jpg\n", 1)
+    with pytest.raises(SceneError, match=r"file 'lost.jpg' is missing .* set missing_texture to 'ignore'"):
+        load(tmp_path / "a.ply", data)
+    assert not caplog.records
+
+
 def test_no_file_directory_and_format(tmp_path):
     with pytest.raises(SceneError, match=r"gone\.glb: no such file"):
         load_mesh_scene(MeshSceneConfig(file=tmp_path / "gone.glb"))

@@ -94,3 +94,14 @@ def test_names_of_a_pair_must_be_free():
     sensors = {"eye": {"kind": "rgb", "stereo": {"baseline_m": 0.1}}, "eye_left": {"kind": "depth"}}
     with pytest.raises(ValueError, match="makes a camera 'eye_left'"):
         load_config({"sensors": sensors})
+
+
+def test_chains_as_others_write_them(tmp_path):
+    """OpenCV's first line, which YAML does not know, and another name of one model."""
+    camera = RgbSensorConfig(lens=LENSES[2])
+    text = write_camchain({"eye": camera})
+    assert "equi\n" in text
+    file = tmp_path / "kalibr_imucam_chain.yaml"
+    file.write_text("%YAML:1.0 # as OpenVINS has it\n\n" + text.replace("equi\n", "equidistant\n"))
+    again = RgbSensorConfig(**read_camchain(file)["cam0"])
+    assert again.lens.distortion == pytest.approx(camera.lens.distortion)

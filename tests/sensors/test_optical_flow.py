@@ -265,6 +265,46 @@ def test_the_mask_says_what_a_ball_hides(room, direction):
     assert hidden[here & ~near].mean() < 0.05
 
 
+@pytest.mark.parametrize("velocity", [(0.0, 3.0, 0.0), (2.0, 1.0, 0.5), (-3.0, 0.0, -1.0), (0.0, 0.0, 0.0)])
+def test_the_mask_says_what_rays_say_of_a_scene_at_rest(tmp_path, velocity):
+    """A pillar and a table before a wall: rays to all triangles tell what they hide, but for edges."""
+    boxes = [
+        ((0.3, 0.4, 4.0), (2.0, 0.3, 1.5)),
+        ((1.0, 2.0, 0.1), (3.0, -0.5, 1.0)),
+        ((0.2, 20, 20), (6, 0, 0)),
+    ]
+    parts = [
+        trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at)) for extents, at in boxes
+    ]
+    mesh = trimesh.util.concatenate(parts)
+    mesh.export(tmp_path / "pillar.ply")
+    scene = {"kind": "mesh", "file": str(tmp_path / "pillar.ply")}
+    sensors = {"flow": flow(window_s=0.1), "range": {**flow(), "kind": "range"}}
+    found = packets(settings(scene, sensors, sliding(velocity, (0.0, 0.0, 1.5))))
+    stamp_ns = 200_000_000
+    ranges, mask = found["range"][stamp_ns].data.astype(np.float64), found["flow"][stamp_ns].mask
+    rays = np.stack([(COLUMNS - W / 2) / F, (ROWS - H / 2) / F, np.ones((H, W))], axis=-1)
+    rays = R_BC.apply((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3))
+    way = 0.1 * np.array(velocity) + ranges.reshape(-1, 1) * rays  # from the earlier camera to the points
+    a, b, c = np.moveaxis(mesh.triangles - (np.array([0, 0, 1.5]) + 0.1 * np.array(velocity)), 1, 0)
+    inside = np.stack([way @ np.cross(p, q).T for p, q in ((a, b), (b, c), (c, a))])
+    volume = (a * np.cross(b, c)).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = volume / inside.sum(axis=0)  # of the way, up to the plane of a triangle
+    met = ((inside > 0).all(axis=0) | (inside < 0).all(axis=0)) & (share > 0) & (share < 0.999)
+    hidden = met.any(axis=1).reshape(H, W)
+    near = edges_within(hidden, 1)
+    nearness = 1.0 / ranges
+    for step in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        bend = (
+            np.roll(nearness, step, (0, 1)) + np.roll(nearness, (-step[0], -step[1]), (0, 1)) - 2.0 * nearness
+        )
+        near |= edges_within(np.abs(bend) > 0.05 * nearness, 1) | (np.abs(bend) > 0.05 * nearness)
+    inside_picture = mask != 2
+    np.testing.assert_array_equal((mask == 1)[inside_picture & ~near], hidden[inside_picture & ~near])
+    assert np.any(velocity) == ((mask == 1).sum() > 20)
+
+
 def edges_within(mask, px):
     """Return the pixels within so many of an edge of a mask."""
     found = np.zeros_like(mask)

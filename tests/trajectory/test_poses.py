@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 import neurosim_core as ns
 from neurosim_core.trajectory import PosesConfig, pose_path
+from neurosim_core.trajectory.poses import read_poses
 
 COUNT = 12
 TIMES_S = np.cumsum(np.random.default_rng(0).uniform(0.05, 0.15, COUNT)) + 1.7e9  # as of a clock
@@ -191,10 +192,25 @@ def test_worlds_follow_as_a_single_run_does(tmp_path):
         worlds.reset(position=[0.0, 0.0, 1.0])
 
 
+def test_what_published_ground_truth_has(tmp_path, caplog):
+    """Two poses of one time, or 40 us apart among others 20 ms apart, and quaternions of few digits."""
+    rows = [f"{k / 50} {k} 0 0 0 0 0 1.001" for k in range(20)]
+    (tmp_path / "clean.txt").write_text("\n".join(rows))
+    rows.insert(10, f"{9 / 50} 9.0 0 0 0 0 0.3 0.954")
+    rows.insert(16, f"{14 / 50 + 4e-5} 14.2 0 0 0 0 0 1")
+    (tmp_path / "found.txt").write_text("\n".join(rows))
+    clean, found = (read_poses(tmp_path / name, "tum") for name in ("clean.txt", "found.txt"))
+    assert "2 poses come with the time of the one before" in caplog.text
+    assert "line 11" in caplog.text
+    for ours, expected in zip(found, clean, strict=True):
+        assert np.array_equal(ours, expected)
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"], r"line 3: time must increase, got 1.0"),
+        (["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1", "0.9 0 0 0 0 0 0 1"], r"line 3: time must increase, got 0.9"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0", "1 0 0 1 0 1 0 0 0 0 1 0"], r"line 1: 12 numbers, not 8"),
         (["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1.1"], r"line 2: no unit quaternion, .* has length 1.1"),
         (["0 0 0 0 0 0 0 1", "1 0 0 nan 0 0 0 1"], r"line 2: not finite"),
         (["# t", "0 0 0 0 0 0 0 1", "1 0 0 0 0 0 1"], r"line 3: 7 numbers, not 8"),

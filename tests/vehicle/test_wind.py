@@ -374,6 +374,24 @@ def test_turbulence_is_linear_between_ticks(device):
             assert record[first + part] == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.parametrize("gusty", [False, True])
+@pytest.mark.parametrize("turbulence", [None, MODERATE])
+def test_the_velocity_of_the_air_is_what_the_vehicle_feels(gusty, turbulence, device):
+    """At time 0, between ticks and on them; steady wind, gusts and turbulence add up."""
+    gust = GustConfig(velocity_m_s=(0.0, 0.0, -4.0), start_s=0.01, rise_s=0.05)
+    vehicle = make_vane(
+        2, device=device, wind_m_s=(3.0, 1.0, 0.0), gusts=(gust,) if gusty else (), turbulence=turbulence
+    )
+    for _ in range(6):
+        np.testing.assert_allclose(vehicle.arrays.air_velocity.numpy(), felt(vehicle), atol=1e-11)
+        vehicle.step(np.full(4, 500.0), 7 * MS)
+    vehicle.reset(rotor_speed=np.full(4, 500.0))
+    np.testing.assert_allclose(vehicle.arrays.air_velocity.numpy(), felt(vehicle), atol=1e-11)
+    vehicle.step(np.full(4, 500.0), 20 * MS)
+    heard = vehicle.arrays.air_velocity.numpy()
+    assert (heard[0] != heard[1]).all() == (turbulence is not None)
+
+
 def test_reset_brings_the_same_wind_back(device):
     vehicle = make_vane(2, device=device, turbulence=MODERATE)
     first = listen(vehicle, 30 * MS, 12)

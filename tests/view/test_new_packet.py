@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import h5py
 import numpy as np
@@ -18,6 +18,7 @@ import trimesh
 from numpy.typing import NDArray
 from rerun_file import read, scalars
 from test_plan import make_scene
+from typing_extensions import TypeAliasType
 
 from neurosim_core import packets as packets_module
 from neurosim_core.packets import PACKET_CLASSES, FieldSpec, GenericPacket, Image, Packet, schema_of
@@ -204,6 +205,17 @@ def test_a_class_that_has_changed_is_read_by_its_schema(tmp_path, monkeypatch):
         note = next(recording.packets("log", start_s=0.01))
     assert isinstance(note, GenericPacket)
     assert note.text == "zwölf1"  # type: ignore[attr-defined]
+
+
+def test_an_array_whose_annotation_is_an_alias_of_the_language():
+    """NumPy 2.5, of Python 3.12 on, has such an NDArray."""
+    item = TypeVar("item")
+    alias = TypeAliasType("NDArray", np.ndarray[Any, np.dtype[item]], type_params=(item,))
+    annotations = [("plain", alias[np.float32]), ("any", Annotated[alias[Any], FieldSpec("H", "W")])]
+    kind = make_dataclass("Aliased", annotations, bases=(Packet,), frozen=True, kw_only=True, eq=False)
+    plain, anything = schema_of(kind).fields
+    assert (plain.dtype, plain.shape) == ("float32", ("...",))
+    assert (anything.dtype, anything.shape) == ("any", ("H", "W"))
 
 
 def test_what_cannot_be_recorded_is_refused(tmp_path):

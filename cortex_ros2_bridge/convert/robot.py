@@ -1,0 +1,102 @@
+"""A robot in ROS that a controller in Cortex flies: its sensors to Cortex, its commands to ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from cortex import messages
+from cortex.evt3 import EventCodecError, Evt3Decoder
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.convert.commands import recorded_rates, unit, xyz
+from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+from cortex_ros2_bridge.convert.registry import NEWEST, PACKETS, RULES, Direction, Rule, encoded
+from cortex_ros2_bridge.event_codec import decode_mono
+
+
+def odometry(message: Any, context: Context) -> messages.Odometry:
+    """Convert nav_msgs/Odometry: the velocity is turned from the body frame to that of the pose."""
+    pose, twist = message.pose.pose, message.twist.twist
+    position, velocity, rate = xyz(pose.position), xyz(twist.linear), xyz(twist.angular)
+    check_finite("odometry", position, velocity, rate)
+    orientation = unit(pose.orientation)
+    return messages.Odometry(
+        stamp_ns=_stamp_ns(message),
+        position=position,
+        orientation=orientation,
+        velocity=frames.rotate(orientation, velocity),
+        body_rate=rate,
+        sequence=context.sequence,
+    )
+
+
+def events(message: Any, context: Context) -> messages.Events:
+    """Convert event_camera_msgs/EventPacket, in evt3 or mono.
+
+    A packet tells the time of its first event. Its stamp in Cortex is the end of the window in which its last
+    one lies, where the option `packet_rate_hz` tells how windows follow each other; else the time of that.
+    """
+    data, stamp_ns = np.asarray(message.events, np.uint8), _stamp_ns(message)
+    if stamp_ns < context.memory.get("stamp_ns", 0):  # time has begun again
+        context.memory.clear()
+    context.memory["stamp_ns"] = stamp_ns
+    try:
+        if message.encoding == "evt3":
+            decoder = context.remembered("evt3", lambda: Evt3Decoder(start_us=stamp_ns // 1000))
+            columns = decoder.decode(data, width=message.width, height=message.height)
+            t = columns.t
+        elif message.encoding == "mono":
+            columns = decode_mono(data, base_ns=message.time_base)
+            t = columns.t // 1000
+        else:
+            raise ConvertError(f"EventPacket.encoding must be evt3 or mono, got {message.encoding!r}")
+    except EventCodecError as error:
+        raise ConvertError(str(error)) from error
+    end_ns = int(t[-1]) * 1000 if len(t) else stamp_ns
+    rate_hz = context.option("packet_rate_hz")
+    if rate_hz is not None:
+        period_ns = 1_000_000_000 / Fraction(str(rate_hz))
+        end_ns = int(-(-end_ns // period_ns) * period_ns)
+    return messages.Events(
+        stamp_ns=end_ns,
+        x=columns.x,
+        y=columns.y,
+        t=t,
+        polarity=columns.polarity,
+        width=message.width,
+        height=message.height,
+        start_ns=min(stamp_ns, end_ns),
+        sequence=message.seq,
+    )
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _decoded(convert: Callable[[Any, Context], Any], ros_type: str) -> Callable[[Any, Context], Any]:
+    return lambda data, context: convert(cdr.decode_record(data, ros_type), context)
+
+
+def _rule(kind: str, ros_type: str, direction: Direction, name: str, convert: Any, *options: str) -> Rule:
+    qos = PACKETS if direction == "in" else NEWEST
+    return Rule(kind, ros_type, direction, name, qos, convert, True, frozenset(options), robot=True)
+
+
+_ODOMETRY, _PACKET = "nav_msgs/msg/Odometry", "event_camera_msgs/msg/EventPacket"
+RULES += [
+    _rule("cortex/Odometry", _ODOMETRY, "in", "{topic}", _decoded(odometry, _ODOMETRY)),
+    _rule("cortex/Events", _PACKET, "in", "{topic}", _decoded(events, _PACKET), "packet_rate_hz"),
+    _rule(
+        "cortex/RateThrustCommand",
+        "mavros_msgs/msg/AttitudeTarget",
+        "out",
+        "{base}/attitude_target",
+        encoded(recorded_rates),
+        "max_thrust_n",
+    ),
+]

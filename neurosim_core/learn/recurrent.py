@@ -1,0 +1,171 @@
+"""PPO of a policy with a memory on events, from scratch: its critic sees the state, nobody teaches it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from neurosim_core.learn.descent import Descent, Replayed
+from neurosim_core.learn.env import Env
+from neurosim_core.learn.policies import Critic, EventPolicy
+from neurosim_core.learn.ppo import PpoConfig, add_advantages, ppo_loss
+from neurosim_core.learn.task import Observations
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecurrentPpoConfig(PpoConfig):
+    """How a policy with a memory is trained."""
+
+    horizon: int = 32
+    """Steps of each world in an iteration, and how far back gradients go."""
+    learning_rate: float = 6e-4
+    reward_scale: float = 0.1
+    gradient_max: float = 1.0
+    hint_weight: float = 1.0
+    """Of the error of the estimate (`Task.hint`), which the policy learns besides."""
+    hidden: int = 128
+    """Width of the GRU,"""
+    widths: tuple[int, ...] = (32, 48, 48, 48, 48)
+    """and channels of the convolutions."""
+
+
+class _EventActorCritic(Critic):
+    """A policy on events, and a critic on states."""
+
+    def __init__(self, policy: EventPolicy, critic_size: int) -> None:
+        super().__init__(critic_size)
+        self.policy = policy
+
+
+class RecurrentPpo:
+    """Trains a policy on events in an environment, iteration by iteration.
+
+    Args:
+        env: The policy sees its group `student`, of which `events` are pictures; the critic `critic`.
+            `Task.hint` is estimated besides.
+        config: How.
+        generator: Of all random numbers, on the device of the environment.
+    """
+
+    def __init__(self, env: Env, config: RecurrentPpoConfig, generator: torch.Generator) -> None:
+        self.env, self.config, self._generator = env, config, generator
+        self._now, _ = env.reset()
+        on_cuda = env.device.type == "cuda"
+        vector, told = (env.group(self._now, name) for name in ("student", "critic"))
+        channels, height, width = shape = self._now["events"].shape[1:]
+        hints = self._now[env.task.hint].shape[1]
+        sizes: dict[str, Any] = {"hint_count": hints, "hidden": config.hidden, "widths": config.widths}
+        self.policy = EventPolicy(channels, height, width, vector.shape[1], **sizes)
+        last = self.policy.head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.orthogonal_(last.weight, 0.05)  # at first it does next to nothing
+        self._module = _EventActorCritic(self.policy, told.shape[1]).to(env.device)
+        if on_cuda:
+            self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.descent = Descent(self._module, self._loss, gradient_max=config.gradient_max, eps=1e-5)
+        self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
+        sizes = {"vector": vector.shape[1], "hint": hints, "critic": told.shape[1], "action": 4}
+        steps = (config.horizon, env.num_envs)
+        self._kept = {name: torch.zeros((*steps, size), device=env.device) for name, size in sizes.items()}
+        for name in ("begun", "log_p", "value", "reward", "done", "advantage", "return"):
+            self._kept[name] = torch.zeros(steps, device=env.device)
+        self._kept["surface"] = torch.zeros((*steps, *shape), dtype=torch.float16, device=env.device)
+        self._first_memory = torch.zeros_like(self._memory)
+        self._seen = {
+            name: torch.zeros_like(self._kept[name][0])
+            for name in ("surface", "vector", "hint", "critic", "begun", "action", "log_p", "value")
+        }
+        self._noise = torch.zeros_like(self._seen["action"])
+        self._act = Replayed(self._decide, on_cuda=on_cuda)
+        self._rows = torch.zeros(env.num_envs // config.minibatches, dtype=torch.int64, device=env.device)
+        self._hint_error = torch.zeros((), device=env.device)
+        self._begun = torch.ones(env.num_envs, device=env.device)
+
+    def begin(self, seed: int) -> None:
+        """Begin anew in all worlds, at different times of their episodes."""
+        self._now, _ = self.env.reset(seed=seed, spread=True)
+        self._memory.zero_()
+        self._begun.fill_(1.0)
+
+    def iterate(self, done: float) -> dict[str, float]:
+        """Fly some steps and learn from them.
+
+        Args:
+            done: Share of the training that lies behind.
+
+        Returns:
+            What to log.
+        """
+        with torch.no_grad():
+            log = self._fly()
+        self._hint_error.zero_()
+        config, device = self.config, self.env.device
+        for _ in range(config.epochs):
+            order = torch.randperm(self.env.num_envs, generator=self._generator, device=device)
+            for rows in order.split(len(self._rows))[: config.minibatches]:
+                self._rows.copy_(rows)
+                self.descent.step(config.learning_rate * (1.0 - 0.9 * done))
+        return log | {"hint": float(self._hint_error) / (config.epochs * config.minibatches)}
+
+    def _fly(self) -> dict[str, float]:
+        config, env, kept = self.config, self.env, self._kept
+        self._first_memory.copy_(self._memory)
+        ended = torch.zeros(3, device=env.device)  # episodes, successes, crashes
+        for step in range(config.horizon):
+            self._look(self._now)
+            self._noise.normal_(generator=self._generator)
+            self._act()
+            for name, value in self._seen.items():
+                kept[name][step] = value
+            self._now, reward, terminated, truncated, info = env.step(self._seen["action"])
+            cut = self._module.value(env.group(info["final_obs"], "critic"))  # it would have gone on
+            kept["reward"][step] = config.reward_scale * reward + config.discount * cut * truncated
+            self._begun = kept["done"][step] = (terminated | truncated).float()
+            metrics = info["metrics"]
+            ended += torch.stack(
+                [
+                    (self._begun * value).sum()
+                    for value in (torch.ones_like(reward), metrics["success"], metrics["crash"])
+                ]
+            )
+        later = self._module.value(env.group(self._now, "critic"))
+        batch = {name: kept[name] for name in ("reward", "value", "done")}
+        add_advantages(batch, later, config)
+        for name in ("advantage", "return"):
+            kept[name].copy_(batch[name])
+        episodes, successes, crashes = ended.tolist()
+        spread = float(torch.exp(self._module.log_spread).mean())
+        log = {"reward": float(kept["reward"].mean()), "spread": spread}
+        return log | ({"success": successes / episodes, "crash": crashes / episodes} if episodes else {})
+
+    def _look(self, now: Observations) -> None:
+        """Copy what is seen to where `_decide` looks."""
+        seen, env = self._seen, self.env
+        seen["begun"].copy_(self._begun)
+        seen["surface"].copy_(now["events"])
+        seen["vector"].copy_(env.group(now, "student"))
+        seen["critic"].copy_(env.group(now, "critic"))
+        seen["hint"].copy_(now[env.task.hint])
+
+    def _decide(self) -> None:
+        """Act on what is in `_seen`, with `_noise`."""
+        seen, module = self._seen, self._module
+        memory = self._memory * (1.0 - seen["begun"])[:, None]
+        mean, memory = self.policy.act(seen["surface"], seen["vector"], memory)
+        self._memory.copy_(memory)
+        seen["action"].copy_(mean + torch.exp(module.log_spread) * self._noise)
+        seen["log_p"].copy_(module.log_probability(mean, seen["action"]))
+        seen["value"].copy_(module.value(seen["critic"]))
+
+    def _loss(self) -> torch.Tensor:
+        """Return the loss of the worlds that `_rows` names; adds to `_hint_error`."""
+        config = self.config
+        part = {name: value.index_select(1, self._rows) for name, value in self._kept.items()}
+        memory = self._first_memory.index_select(0, self._rows)
+        mean, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
+        error = (hint - part["hint"]).square().mean()
+        self._hint_error += error.detach()
+        return ppo_loss(self._module, mean, part, config) + config.hint_weight * error

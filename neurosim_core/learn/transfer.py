@@ -1,0 +1,98 @@
+"""How well a policy does under conditions that it was not trained for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neurosim_core.learn.env import Env, find_task, make_env
+from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate, student_actor
+from neurosim_core.learn.task import Observations, Task
+from neurosim_core.learn.train import load_student, read_config
+
+_NOISY_WORLDS = 128
+"""At most so many worlds with a noisy camera, whose noise is drawn on the host at each reset."""
+_DAVIS346 = {"preset": "davis346", "readout": None}
+_SAME_THRESHOLDS = {"threshold_factor": (1.0, 1.0)}
+
+CONDITIONS: Mapping[str, Mapping[str, Any]] = {
+    "as in the tests": {},
+    "noise of a DAVIS346": {"pixel": _DAVIS346, "drawn": _SAME_THRESHOLDS},
+    "thresholds 0.4 to 0.6 times": {"drawn": {"threshold_factor": (0.4, 0.6)}},
+    "thresholds 3 to 4 times": {"drawn": {"threshold_factor": (3.0, 4.0)}},
+    "lens of 0.8 times the angle": {"fov_factor": 0.8},
+    "lens of 1.2 times the angle": {"fov_factor": 1.2},
+    "thrust 0.9 to 1.1 times": {"drawn": {"thrust_factor": (0.9, 1.1)}},
+    "bias of the gyroscope up to 0.05 rad/s": {"drawn": {"gyro_bias_rad_s": 0.05}},
+    "latency up to 2 steps, lag up to 0.05 s": {"drawn": {"latency_steps": 2, "lag_s": (0.0, 0.05)}},
+    "mass 0.9 to 1.1 times, wind up to 1 m/s": {"drawn": {"mass_factor": (0.9, 1.1), "wind_m_s": 1.0}},
+    "clock 30 % slower": {"rate_factor": 0.7},
+    "clock 30 % faster": {"rate_factor": 1.3},
+    "actions one step later": {"late": 1.0},
+    "a tenth of the actions lost": {"late": 0.1},
+    "three tenths of the actions lost": {"late": 0.3},
+}
+"""What differs from the tests of a task, by name."""
+
+
+def evaluate_transfer(
+    folder: Path,
+    *,
+    scenes: Any = "unseen",
+    device: str | None = None,
+    worlds: int | None = None,
+) -> Iterator[tuple[str, Evaluation]]:
+    """Yield how the student of a run does under each of `CONDITIONS`.
+
+    Args:
+        folder: The run.
+        scenes: Where to fly, as for `make_env`.
+        device: None: as in the training.
+        worlds: Episodes; None: as configured.
+    """
+    config = read_config(folder)
+    where: dict[str, Any] = {"scenes": scenes}
+    for name, changes in CONDITIONS.items():
+        count = worlds or config.evaluation_worlds
+        task = _changed_task(config.task, changes)
+        env = make_env(
+            task,
+            worlds=min(count, _NOISY_WORLDS) if task.pixel else count,
+            device=device or config.device,
+            pixels=config.pixels,
+            **where,
+        )
+        where = {"models": env.sim.models}  # nothing is loaded twice
+        policy = load_student(folder, env.device)
+        yield name, evaluate(env, _late(student_actor(policy, env), env, changes.get("late", 0.0)))
+
+
+def _late(actor: Actor, env: Env, share: float) -> Actor:
+    """Return an actor of whose actions a share is replaced by the one before; 1: all come a step later."""
+    generator = torch.Generator(device=env.device).manual_seed(0)
+    last = torch.zeros((env.num_envs, env.action_count), device=env.device)
+
+    def act(observations: Observations, begun: torch.Tensor) -> torch.Tensor:
+        last.masked_fill_(begun[:, None], 0.0)
+        action = actor(observations, begun)
+        lost = torch.rand((env.num_envs, 1), generator=generator, device=env.device) < share
+        taken = torch.where(lost, last, action)
+        last.copy_(action if share == 1.0 else taken)
+        return taken
+
+    return act
+
+
+def _changed_task(name: str, changes: Mapping[str, Any]) -> Task:
+    """Return a task with the changes of a condition."""
+    task = find_task(name)
+    task.pixel = changes.get("pixel", {})
+    task.rate_hz *= changes.get("rate_factor", 1.0)
+    task.randomisation = dataclasses.replace(task.randomisation, **changes.get("drawn", {}))
+    angle_rad = task.camera["horizontal_fov_rad"] * changes.get("fov_factor", 1.0)
+    task.camera = {**task.camera, "horizontal_fov_rad": angle_rad}
+    return task
