@@ -191,8 +191,8 @@ class Publisher(Generic[T]):
             published when the block ends, and dropped if the block raises. Do not keep its arrays.
 
         Raises:
-            RuntimeError: All slots are out on loan. Reliable readers that have not come to them are waited for as
-                by `publish`.
+            RuntimeError: All slots are out on loan. Reliable readers that have not come to them are waited
+                for as by `publish`.
         """
         loan = self._lend(dtypes, dims, may_wait=True)
         if loan is None:
