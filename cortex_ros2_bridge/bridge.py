@@ -17,6 +17,7 @@ from cortex import Node
 from cortex_ros2_bridge import diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError
 from cortex_ros2_bridge.config import QOS, BridgeConfig
+from cortex_ros2_bridge.convert.records import status_record
 from cortex_ros2_bridge.lifecycle import ACTIVE, FINALIZED, INACTIVE, STATES, UNCONFIGURED
 from cortex_ros2_bridge.links import Connections, Link
 from cortex_ros2_bridge.neighbours import Neighbours
@@ -30,7 +31,6 @@ LOOK_INTERVAL_S = 0.05
 DIAGNOSTICS_INTERVAL_S = 1.0
 GONE_S = 10.0
 """For so long a route outlives its Cortex topic, so that a simulator that is restarted finds it open [s]."""
-GONE = "its Cortex topic has gone"
 RETRY_S = 1.0
 """When a route is tried again that the backend could not open [s]."""
 
@@ -263,7 +263,6 @@ class Bridge:
         failure, self._failure = self._failure, ""
         feeds = self._connections.feeds.values()
         wrong = self.problems + self._notes + ([self._backend.trouble] if self._backend.trouble else [])
-        gone = [link for link in self._links.values() if link.gone_s is not None]
         missing = "" if self._was_routed else "no Cortex topics: no simulator runs"
         if missing and self._had_routes:
             missing = "the Cortex side has gone"
@@ -272,42 +271,21 @@ class Bridge:
         level = diagnostics.WARN if wrong or (missing and self.state == ACTIVE) else diagnostics.OK
         if failure or (missing and self._had_routes):
             level = diagnostics.ERROR
+        values = {
+            "backend": self._backend.name,
+            "distro": self._backend.distro,
+            "routes": str(len(self._links)),
+            "cortex_subscriptions": str(sum(feed.active for feed in feeds)),
+        }
+        message = "; ".join(filter(None, [failure, missing, *wrong])) or f"{len(self._links)} routes"
+        node = self.config.node
         statuses = [
-            diagnostics.Status(
-                name="bridge",
-                level=level,
-                message="; ".join(filter(None, [failure, missing, *wrong])) or f"{len(self._links)} routes",
-                values=(
-                    ("backend", self._backend.name),
-                    ("distro", self._backend.distro),
-                    ("routes", str(len(self._links))),
-                    ("cortex_subscriptions", str(sum(feed.active for feed in feeds))),
-                ),
-            )
+            status_record(level, f"{node}: bridge", message, diagnostics.HARDWARE, values.items()),
+            *(diagnostics.route_status(link, node, elapsed_s) for link in self._links.values()),
         ]
-        for link in self._links.values():
-            now = link.tally.totals()
-            if link in gone:
-                stale = diagnostics.Status(name=str(link.route), level=diagnostics.STALE, message=GONE)
-                statuses.append(stale)
-                continue
-            statuses.append(
-                diagnostics.route_status(
-                    str(link.route),
-                    now,
-                    link.before,
-                    listeners=link.listeners(),
-                    elapsed_s=elapsed_s,
-                    reason=link.tally.reason,
-                    types=f"{link.route.cortex_type} and {link.route.ros_type}",
-                )
-            )
-            link.before = now
         if self._diagnostics.subscriber_count:
-            stamps = [feed.newest for feed in feeds]
-            array = diagnostics.diagnostic_array(
-                statuses, stamp_ns=max(stamps, default=(0.0, 0))[1], node=self.config.node
-            )
+            newest = max((feed.newest for feed in feeds), default=(0.0, 0))
+            array = diagnostics.diagnostic_array(statuses, newest[1])
             try:
                 self._diagnostics.publish(array)
             except BackendError as error:

@@ -207,21 +207,12 @@ def _maker(type_name: str) -> Callable[..., Any]:
     entries = [(name, _from_record_field(desc)) for name, desc in typestore().fielddefs[type_name][1]]
     if [name for name, _ in entries] == [_EMPTY]:
         return lambda _placeholder: kind()
-    if issubclass(kind, Message):
 
-        def make(*values: Any) -> Any:
-            message = kind.__new__(kind)
-            for (name, convert), value in zip(entries, values, strict=True):
-                object.__setattr__(message, f"_{name}", value if convert is None else convert(value))
-            return message
-
-        return make
-
-    def make_real(*values: Any) -> Any:
+    def make(*values: Any) -> Any:
         pairs = zip(entries, values, strict=True)
         return kind(**{name: v if convert is None else convert(v) for (name, convert), v in pairs})
 
-    return make_real
+    return make
 
 
 def _from_record_field(desc: Any) -> Callable[[Any], Any] | None:

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from cortex_ros2_bridge.backend.base import Qos
-from cortex_ros2_bridge.backend.names import NAME, check_node_name
+from cortex_ros2_bridge.backend.names import NAME, check_kind, check_node_name
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.options import OPTIONS, check_option
 from cortex_ros2_bridge.ros_args import RosArguments, nest
@@ -230,10 +230,10 @@ def _bridge_config(raw: object) -> BridgeConfig:
 
 def check_backend(key: str, value: object) -> str:
     """Return the name of a backend, or of a bag."""
-    text = _text(key, value)
-    if text not in ("auto", "rclpy", "dds") and not text.endswith(".mcap"):
-        raise ConfigError(f"{key} must be auto, rclpy, dds or a path that ends in .mcap, got {text!r}")
-    return text
+    try:
+        return check_kind(_text(key, value))
+    except ValueError as error:
+        raise ConfigError(f"{key}: {error}") from None
 
 
 def check_distro(key: str, value: object) -> str:
@@ -289,29 +289,32 @@ def _options(key: str, value: object) -> dict[str, Any]:
 
 def _route_change(key: str, value: object) -> RouteChange:
     given = _mapping(key, value)
-    _refuse_unknown(key, given, [f.name for f in fields(RouteChange)])
+    checks: dict[str, Callable[[str, object], Any]] = {
+        "cortex": _topic_pattern,
+        "type": to_ros_type,
+        "ros": _ros_pattern,
+        "qos": qos_changes,
+        "options": _options,
+        "enabled": _flag,
+        "label": _text,
+    }
+    _refuse_unknown(key, given, checks)
     if "cortex" not in given:
         raise ConfigError(f"{key}: `cortex` is missing: the topic, or a pattern such as '/*/imu'")
-    checked: dict[str, Any] = {"cortex": _topic_pattern(f"{key}.cortex", given["cortex"])}
-    if given.get("type") is not None:
-        checked["type"] = to_ros_type(f"{key}.type", given["type"])
-    if given.get("ros") is not None:
-        name = _text(f"{key}.ros", given["ros"])
-        _ros_name(f"{key}.ros", name.replace("{topic}", "/topic"))
-        if "{topic}" not in name and any(c in checked["cortex"] for c in "*?["):
-            raise ConfigError(
-                f"{key}.ros: a pattern fits several topics, so the name must contain {{topic}}, got {name!r}"
-            )
-        checked["ros"] = name
-    if given.get("qos") is not None:
-        checked["qos"] = qos_changes(f"{key}.qos", given["qos"])
-    if given.get("options") is not None:
-        checked["options"] = _options(f"{key}.options", given["options"])
-    if given.get("label") is not None:
-        checked["label"] = _text(f"{key}.label", given["label"])
-    if given.get("enabled") is not None:
-        checked["enabled"] = _flag(f"{key}.enabled", given["enabled"])
-    return RouteChange(**checked)
+    change = RouteChange(
+        **{name: checks[name](f"{key}.{name}", each) for name, each in given.items() if each is not None}
+    )
+    if change.ros and "{topic}" not in change.ros and any(c in change.cortex for c in "*?["):
+        raise ConfigError(
+            f"{key}.ros: a pattern fits several topics: the name must contain {{topic}}, got {change.ros!r}"
+        )
+    return change
+
+
+def _ros_pattern(key: str, value: object) -> str:
+    text = _text(key, value)
+    _ros_name(key, text.replace("{topic}", "/topic"))
+    return text
 
 
 def _refuse_unknown(key: str, given: Mapping[str, Any], known: Iterable[str]) -> None:

@@ -27,7 +27,6 @@ from cortex.evt3 import (
 )
 
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
-_DVS_SPAN_US = 2**32 - 10**6
 
 
 def encode_mono(
@@ -100,49 +99,6 @@ DVS_RECORD_ROS1 = np.dtype(
 """The same as ROS 1 serialises it: without gaps."""
 
 
-def dvs_size(count: int) -> int:
-    """Return how many bytes the records of so many events take in an array, in CDR."""
-    return 16 * count - 3 if count else 0
-
-
-def write_dvs(out: Bytes, events: EventColumns, *, width: int, height: int) -> None:
-    """Write events as the records of a dvs_msgs/EventArray.
-
-    Args:
-        out: Bytes to write to, `dvs_size` of them and 3 more, from a multiple of 4 on in the message.
-        events: What to write, with times in microseconds.
-        width: Of the sensor [px].
-        height: Of the sensor [px].
-
-    Raises:
-        EventCodecError: An event is outside of the sensor or has another polarity; times decrease, reach over
-            more than 71 minutes, or have seconds of more than 32 bits.
-    """
-    t_us, x, y, polarity = events
-    check_events(events, width, height)
-    out[:] = 0
-    if not len(t_us):
-        return
-    first, last = int(t_us[0]), int(t_us[-1])
-    if not -(2**31) <= first // 1_000_000 <= last // 1_000_000 < 2**31 or last - first >= _DVS_SPAN_US:
-        raise EventCodecError(f"dvs_msgs cannot hold times from {first} to {last} us")
-    begin = first // 1_000_000
-    nanosecond = _after(t_us, begin * 1_000_000)
-    second = nanosecond // np.uint32(1_000_000)
-    nanosecond -= second * np.uint32(1_000_000)
-    nanosecond *= np.uint32(1000)
-    second += np.uint32(begin & 0xFFFFFFFF)
-    # The first record lacks 2 bytes before its time; the others lie 16 apart.
-    records = np.frombuffer(out.data, DVS_RECORD, count=len(t_us) - 1, offset=14)
-    records["x"], records["y"] = x[1:], y[1:]
-    records["sec"], records["nanosec"] = second[1:].view(np.int32), nanosecond[1:]
-    records["polarity"] = polarity[1:]
-    head = np.frombuffer(
-        out.data, [("x", "<u2"), ("y", "<u2"), ("sec", "<i4"), ("ns", "<u4"), ("p", "u1")], 1
-    )
-    head[0] = (x[0], y[0], begin, nanosecond[0], polarity[0])
-
-
 def read_dvs(data: Buffer, *, ros1: bool = False) -> tuple[tuple[int, int], EventColumns]:
     """Return width and height of the sensor, and the events of a dvs_msgs/EventArray.
 
@@ -172,12 +128,10 @@ def _ros1_records(view: memoryview, count: int) -> NDArray[Any]:
 
 
 def _records(view: memoryview, count: int) -> NDArray[Any]:
-    if len(view) < dvs_size(count):
-        raise ValueError(f"{count} events need more")
     records = np.zeros(count, DVS_RECORD)
     if count:
         records[0] = struct.unpack_from("<HHiIB", view)
-        padded = bytes(view[14 : dvs_size(count)]) + bytes(3)
+        padded = bytes(view[14 : 16 * count - 3]) + bytes(3)
         records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
     return records
 

@@ -142,7 +142,6 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
     problems = _adopt(seen, config)
     routes: list[Route] = []
     images: dict[str, str] = {}
-    unused = {(n, name): set[str]() for n, change in enumerate(config.routes) for name in change.options}
     for route, rule in _candidates(seen, config):
         if not _wanted(route.cortex_topic, config):
             continue
@@ -151,8 +150,7 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
         there = asked or (rule.default and (config.defaults or bool(fitting)))
         if there and (not fitting or fitting[-1].enabled):
             routes.append(_changed(route, fitting, config, images))
-            _note_options(route, config, unused)
-    problems += _useless(seen, config) + _useless_options(config, unused)
+    problems += _useless(seen, config) + _useless_options(routes, config)
     return _without_conflicts(routes, problems, shared_topics(config)), problems
 
 
@@ -269,26 +267,18 @@ def _wanted(topic: str, config: BridgeConfig) -> bool:
     )
 
 
-def _note_options(route: Route, config: BridgeConfig, unused: dict[tuple[int, str], set[str]]) -> None:
-    """Cross out the options of the settings that a route knows; note what it knows for the others."""
-    known = known_options(route)
-    for number, change in enumerate(config.routes):
-        if _fits(change, route):
-            for name in change.options:
-                if name in known:
-                    unused.pop((number, name), None)
-                elif (number, name) in unused:
-                    unused[number, name] |= known
-
-
-def _useless_options(config: BridgeConfig, unused: Mapping[tuple[int, str], set[str]]) -> list[str]:
+def _useless_options(routes: Sequence[Route], config: BridgeConfig) -> list[str]:
     """Say which options no route has that their entry fits."""
-    return [
-        f"routes[{number}].options: no route of {config.routes[number].cortex} has the option {name!r}, "
-        f"known: {', '.join(sorted(known))}"
-        for (number, name), known in unused.items()
-        if known  # else there is no such route now
-    ]
+    problems = []
+    for number, change in enumerate(config.routes):
+        known = {name for route in routes if _fits(change, route) for name in known_options(route)}
+        problems += [
+            f"routes[{number}].options: no route of {change.cortex} has the option {name!r}, "
+            f"known: {', '.join(sorted(known))}"
+            for name in change.options
+            if known and name not in known  # without any, there is no such route now
+        ]
+    return problems
 
 
 def _fits(change: RouteChange, route: Route) -> bool:

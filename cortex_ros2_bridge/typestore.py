@@ -133,19 +133,6 @@ def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:
     raise UnknownTypeError(f"unknown message type {type_name!r} in ROS {distro}{hint}")
 
 
-def dds_type_name(type_name: str) -> str:
-    """Return what DDS calls a message type: sensor_msgs/msg/Imu is sensor_msgs::msg::dds_::Imu_.
-
-    Raises:
-        ValueError: It is no name of a message type.
-    """
-    parts = type_name.split("/")
-    if len(parts) != 3 or not all(parts):
-        raise ValueError(f"{type_name!r} is no message type; names are written such as sensor_msgs/msg/Imu")
-    package, kind, name = parts
-    return f"{package}::{kind}::dds_::{name}_"
-
-
 @functools.cache
 def type_hash(type_name: str, distro: str = DEFAULT_DISTRO) -> str:
     """Return the hash by which nodes since Iron recognise a message type, such as "RIHS01_7d9a...".

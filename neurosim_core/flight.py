@@ -137,7 +137,7 @@ def fly(
                         break
                     files.write(packet)
                     summary.log(packet)
-                    report.note(model, packet)
+                    report.note(packet)
                     report.flight_s = time.perf_counter() - begin
                     if packet.stamp_ns > report.simulated_ns:
                         report.simulated_ns = packet.stamp_ns
@@ -158,7 +158,7 @@ def fly(
     report.event_count = summary.event_count
     begin = time.perf_counter()
     if _has("matplotlib", console, "overview.png"):
-        track = None if report.tracking_errors_m else _planned_track(model, state.stamp_ns)
+        track = None if report.positions else _planned_track(model, state.stamp_ns)
         factor = report.real_time_factor
         try:
             save_overview(
@@ -345,7 +345,7 @@ class _Files:
         self._checked_s = time.monotonic()
         why = ""
         try:
-            self._rerun.flush()
+            self._rerun.check()
         except OSError as error:
             why = str(error)
         if shutil.disk_usage(self._folder).free < _ROOM_BYTES:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -44,8 +45,8 @@ class FlightReport:
     lost_counts: dict[str, int] = field(default_factory=dict)
     """How many of each sensor are lost between its packets."""
     collisions: list[Collision] = field(default_factory=list)
-    tracking_errors_m: list[float] = field(default_factory=list)
-    """Distance from the path at every odometry packet [m]."""
+    positions: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
+    """Stamp [ns] and p_WB [m] of every odometry packet."""
     interrupted: bool = False
     failure: DynamicsError | OSError | None = None
     """What ended the flight early."""
@@ -55,7 +56,7 @@ class FlightReport:
         """Simulated time over wall-clock time."""
         return self.simulated_ns / NS_PER_S / self.flight_s if self.flight_s > 0.0 else 0.0
 
-    def note(self, model: Model, packet: Packet) -> None:
+    def note(self, packet: Packet) -> None:
         """Take one packet."""
         count = self.packet_counts.get(packet.sensor, 0) + 1
         self.packet_counts[packet.sensor] = count
@@ -63,8 +64,7 @@ class FlightReport:
         if isinstance(packet, Collision):
             self.collisions.append(packet)
         elif isinstance(packet, Odometry):
-            wanted = model.path.evaluate([packet.stamp_ns]).position[0]
-            self.tracking_errors_m.append(float(np.linalg.norm(packet.position - wanted)))
+            self.positions.append((packet.stamp_ns, packet.position.copy()))
 
 
 def print_plan(console: Console, model: Model) -> None:
@@ -120,8 +120,9 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")
-    if report.tracking_errors_m:
-        errors_cm = 100.0 * np.array(report.tracking_errors_m)
+    if report.positions:
+        stamp_ns, position = map(np.array, zip(*report.positions, strict=True))
+        errors_cm = 100.0 * np.linalg.norm(position - model.path.evaluate(stamp_ns).position, axis=1)
         rms_cm = np.sqrt((errors_cm**2).mean())
         facts.add_row("path", f"followed to {rms_cm:.1f} cm RMS, {errors_cm.max():.1f} cm at most")
     ending = "; the run ended there" if state.ended else ""

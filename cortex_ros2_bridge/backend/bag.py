@@ -50,15 +50,9 @@ class BagBackend:
     failure = trouble = ""
 
     def __init__(self, path: str | Path, *, distro: str | None = None, storage: str = "mcap") -> None:
-        """Begin a bag.
-
-        Args:
-            path: The directory to make, or `flight.mcap` for the directory `flight`.
-            distro: Distribution whose message definitions are written; None: ROS_DISTRO, else a recent one.
-            storage: "mcap" or "sqlite3".
+        """Begin a bag; see `choose.open_backend`. The storage is "mcap" or "sqlite3".
 
         Raises:
-            ValueError: The distribution is unknown.
             BackendError: There is something at the path already, or it cannot be written.
         """
         self.distro = chosen_distro(distro) or DEFAULT_DISTRO

@@ -8,7 +8,7 @@ import logging
 from pathlib import Path
 
 from cortex_ros2_bridge.backend.base import Backend, BackendError
-from cortex_ros2_bridge.config import check_backend
+from cortex_ros2_bridge.backend.names import check_kind
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ def open_backend(
         from cortex_ros2_bridge.backend.bag import BagBackend
 
         return BagBackend(kind, distro=distro)
-    check_backend("backend", kind)
+    check_kind(kind)
     if kind == "rclpy" or (kind == "auto" and _has_rclpy()):
         if not _has_rclpy():
             raise BackendError(

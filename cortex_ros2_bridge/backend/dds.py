@@ -103,18 +103,7 @@ class DdsBackend:
         distro: str | None = None,
         domain: int | None = None,
     ) -> None:
-        """Join a domain.
-
-        Args:
-            node_name: Name of the node.
-            namespace: Its namespace; "" or "/" for none.
-            distro: Distribution of the other nodes; None: ROS_DISTRO, else as the first node that is seen.
-            domain: DDS domain; None: ROS_DOMAIN_ID, else 0.
-
-        Raises:
-            ValueError: A name is not valid, or the environment asks for what ROS does not know.
-            BackendError: DDS does not start.
-        """
+        """Join a domain; see `choose.open_backend`. Without a distribution, that of the first node counts."""
         node_name, namespace = check_node_name(node_name, namespace)
         known = chosen_distro(distro)
         self.distro = known or DEFAULT_DISTRO

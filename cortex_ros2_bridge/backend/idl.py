@@ -8,7 +8,8 @@ from typing import Any
 from cyclonedds import idl
 from rosbags.interfaces import Nodetype
 
-from cortex_ros2_bridge.typestore import check_type, dds_type_name, typestore
+from cortex_ros2_bridge.backend.names import dds_type_of
+from cortex_ros2_bridge.typestore import check_type, typestore
 
 types: Any = idl.types
 """Types of fields; mypy does not see that they take parameters."""
@@ -31,13 +32,11 @@ def idl_struct(type_name: str, distro: str, header: Mapping[str, Any] | None = N
         check_type(type_name, distro)
         definition = typestore(distro).fielddefs[type_name][1]
         fields = {name: _field(description, distro) for name, description in definition}
-        _structs[key] = make_struct(dds_type_name(type_name), {**(header or {}), **fields})
+        name = dds_type_of(type_name)
+        _structs[key] = idl.make_idl_struct(
+            name.rpartition("::")[2], name.replace("::", "."), {**(header or {}), **fields}
+        )
     return _structs[key]
-
-
-def make_struct(dds_name: str, fields: dict[str, Any]) -> Any:
-    """Return a class of cyclonedds with a name such as "std_srvs::srv::dds_::Trigger_Request_"."""
-    return idl.make_idl_struct(dds_name.rpartition("::")[2], dds_name.replace("::", "."), fields)
 
 
 def _field(description: Any, distro: str) -> Any:

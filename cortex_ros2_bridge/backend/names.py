@@ -27,6 +27,17 @@ def check_name(name: str) -> str:
     return name
 
 
+def check_kind(backend: str) -> str:
+    """Return the name of a backend, or that of a bag.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if backend not in ("auto", "rclpy", "dds") and not backend.endswith(".mcap"):
+        raise ValueError(f"a backend is auto, rclpy, dds or a path that ends in .mcap, got {backend!r}")
+    return backend
+
+
 def check_node_name(name: str, namespace: str) -> tuple[str, str]:
     """Return a node's name and its namespace, which is "/" for an empty one.
 
@@ -60,6 +71,12 @@ def ros_type(dds_type: str) -> str:
     """Return the ROS name of a DDS type; other types keep their name."""
     match = _DDS_TYPE.fullmatch(dds_type)
     return "/".join(match.groups()) if match else dds_type
+
+
+def dds_type_of(type_name: str) -> str:
+    """Return what DDS calls a ROS type: sensor_msgs/msg/Imu is sensor_msgs::msg::dds_::Imu_."""
+    package, kind, name = split_type(type_name)
+    return f"{package}::{kind}::dds_::{name}_"
 
 
 def service_path(name: str) -> str:

@@ -214,17 +214,7 @@ class RclpyBackend:
     def __init__(
         self, *, node_name: str = "cortex_bridge", namespace: str = "", domain: int | None = None
     ) -> None:
-        """Start a node.
-
-        Args:
-            node_name: Name of the node.
-            namespace: Its namespace; "" or "/" for none.
-            domain: DDS domain; None: ROS_DOMAIN_ID, else 0.
-
-        Raises:
-            ValueError: A name is not valid.
-            BackendError: rclpy does not start.
-        """
+        """Start a node; see `choose.open_backend`."""
         import rclpy
         from rclpy.context import Context
         from rclpy.signals import SignalHandlerOptions

@@ -14,7 +14,7 @@ from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
-from cortex_ros2_bridge.event_codec import EventPicture, dvs_size, encode_mono, write_dvs
+from cortex_ros2_bridge.event_codec import EventPicture, encode_mono
 
 _NO_BYTES: Bytes = np.empty(0, np.uint8)
 
@@ -55,31 +55,6 @@ def event_packet(message: messages.Events, context: Context) -> Any:
             encoder.encode(
                 columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
             )
-    except EventCodecError as error:
-        raise ConvertError(str(error)) from error
-    return room.message()
-
-
-@standard(messages.Events, "dvs_msgs/EventArray", "{topic}/event_array", PACKETS, default=False)
-def event_array(message: messages.Events, context: Context) -> Any:
-    """Convert to dvs_msgs/EventArray, which older programs use; stamped as an event packet is."""
-    prefix = cdr.encode(
-        record("dvs_msgs/msg/EventArray")(
-            header(_events_stamp_ns(message), message.frame_id or context.frame_id, context),
-            message.height,
-            message.width,
-            [],
-        )
-    )
-    room = _Room(prefix)
-    count = len(message.t)
-    try:
-        write_dvs(
-            room.make(dvs_size(count), count=count),
-            _columns(message),
-            width=message.width,
-            height=message.height,
-        )
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
     return room.message()
@@ -155,12 +130,12 @@ class _Room:
         self._prefix = prefix
         self._buffer = _NO_BYTES
 
-    def make(self, size: int, *, count: int | None = None) -> Bytes:
-        """Return so many bytes to write to, and up to 3 more; `count` elements, None: of one byte."""
+    def make(self, size: int) -> Bytes:
+        """Return so many bytes to write to, and up to 3 more."""
         begin = len(self._prefix)
         self._buffer = np.empty(begin + (size + 3 & -4), np.uint8)
         self._buffer[:begin] = self._prefix
-        self._buffer[begin - 4 : begin].view("<u4")[0] = size if count is None else count
+        self._buffer[begin - 4 : begin].view("<u4")[0] = size
         self._buffer[begin + size :] = 0
         return self._buffer[begin:]
 

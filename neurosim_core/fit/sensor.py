@@ -41,6 +41,8 @@ _GAIN = 1.3
 _SIMULATED_EVENTS = 2_000_000
 """Events of a simulation at most, about: it has fewer pixels than the recording where there are more."""
 _PERIODS_MAX = 12
+_ALIKE = 0.25
+"""Pixels are alike whose thresholds spread by less than this share of what one event more or less makes."""
 _DEFAULT_THRESHOLD = 0.2
 
 Numbers = dict[str, float]
@@ -162,10 +164,34 @@ def fit_sensor(
     share = settings.get("hot_pixels.fraction", 0.0)
     if share:
         errors["hot_pixels.fraction"] = math.sqrt(share * (1.0 - share) / (stimulus.width * stimulus.height))
+    _tell_alike(centred, errors, real.numbers, notes)
     for key in ("readout.bandwidth_hz", "readout.row_s"):
         if key in settings and all(key in twin.numbers for twin in twins):
             errors[key] = float(np.std([twin.numbers[key] for twin in twins], ddof=1))
     return SensorFit(settings=centred, errors=errors, real=real, simulated=twins[0], notes=notes)
+
+
+def _tell_alike(
+    settings: Mapping[str, Any], errors: Numbers, numbers: Mapping[str, Any], notes: list[str]
+) -> None:
+    """Widen the errors of thresholds where all pixels have the same whole number of events in a step.
+
+    Thresholds within C / (n + 1) have n events then. Where pixels differ by more, their mean tells it better.
+    """
+    widened = False
+    for name, counted in (("on", "ON events a rise"), ("off", "OFF events a fall")):
+        key = f"threshold_{name}"
+        if counted not in numbers:
+            continue
+        alike = settings[key] / (numbers[counted] + 1.0)
+        if settings.get(f"threshold_spread.sigma_{name}", 0.0) < _ALIKE * alike:
+            errors[key] = math.hypot(errors.get(key, 0.0), alike / math.sqrt(12.0))
+            widened = True
+    if widened:
+        notes.append(
+            "all pixels have the same whole number of events in a step, which tells thresholds less exactly "
+            "than steps of a higher contrast would"
+        )
 
 
 def observe(stimulus: Stimulus) -> Observation:

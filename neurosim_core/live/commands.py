@@ -114,7 +114,9 @@ class CommandSubscriber:
         """Return whether a publisher was connected since the last call."""
         found = False
         for mode, subscriber in self._subscribers.items():
-            sources = set(subscriber.sources())
+            sequences = subscriber.sources()
+            self._sequences = {**sequences, **self._sequences}
+            sources = set(sequences)
             if subscriber.publisher_count >= len(sources):  # else one of them is still connecting
                 found |= not sources <= self._sources[mode]
                 self._sources[mode] = sources
@@ -126,8 +128,10 @@ class CommandSubscriber:
         If none has, what was returned then.
         """
         sequences = self._subscribers[mode].sources()
-        active = {source for source, next in sequences.items() if next > self._sequences.get(source, 0)}
-        self._sequences = sequences
+        active = {source for source, count in sequences.items() if count > self._sequences.get(source, count)}
+        if not active and not self._senders:  # it came before its sender was first looked at
+            active = {source for source, count in sequences.items() if count > 0}
+        self._sequences |= sequences
         if active:
             self._senders = ", ".join(
                 record.name

@@ -21,7 +21,7 @@ from cortex.messages import Reset, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.live.call import ask
 from neurosim_core.live.topics import STATUS
-from neurosim_core.view.rerun_viewer import HOST
+from neurosim_core.view.rerun_viewer import HOST, naming_port
 
 ANSWER_S = 10.0
 """How long a request may take [s]."""
@@ -49,10 +49,8 @@ class ControlPage:
         self._statuses = node.subscriber(STATUS, SimulatorStatus, policy=latest())
         self._status: SimulatorStatus | None = None
         self._lock = threading.Lock()
-        try:
+        with naming_port(port):
             self._server = ThreadingHTTPServer((HOST, port), self._handler())
-        except OSError as error:
-            raise OSError(f"port {port} cannot be used: {error.strerror}") from None
         self._server.daemon_threads = True
         self.url = f"http://{HOST}:{self._server.server_port}/"
         """Address of the page."""

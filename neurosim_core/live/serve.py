@@ -54,12 +54,18 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
     with Node("simulator") as node:
         require_single_instance(node)
         with console.status("preparing") as preparing:
+
+            def show(phase: str) -> None:
+                preparing.update(f"preparing: {phase}")
+                if not console.is_terminal:
+                    console.print(f"preparing: {phase}")
+
             simulator = Simulator(
                 config,
                 node,
                 record=record,
                 overwrite=overwrite,
-                on_phase=lambda phase: preparing.update(f"preparing: {phase}"),
+                on_phase=show,
             )
         gc.collect()
         gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second
@@ -221,7 +227,8 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus, *, is_over:
         if now.fail_safe_count > was.fail_safe_count:
             lines.append(f"{now.name}: no command has come in time; the fail-safe flies")
         if was.fail_safe and not now.fail_safe:
-            lines.append(f"{now.name}: commands arrive again (from {now.command_source})")
+            sender = f" (from {now.command_source})" if now.command_source else ""
+            lines.append(f"{now.name}: commands arrive again{sender}")
     return lines
 
 

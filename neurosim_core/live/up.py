@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
 from pathlib import Path
@@ -13,6 +12,7 @@ from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.live.supervisor import Part, run_together
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.view.rerun_targets import check_new_file
+from neurosim_core.view.rerun_viewer import has_display
 
 
 def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite: bool) -> int:
@@ -70,15 +70,14 @@ def viewer_options(viewer: str) -> list[str] | None:
     Raises:
         ValueError: There is no such viewer.
     """
-    has_display = sys.platform == "darwin" or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
     if viewer == "auto":
-        viewer = "native" if has_display else "web"
+        viewer = "native" if has_display() else "web"
     if viewer == "none":
         return None
     if viewer == "native":
         return []
     if viewer == "web":
-        return ["--web"] if has_display else ["--web", "--no-browser"]
+        return ["--web"] if has_display() else ["--web", "--no-browser"]
     if viewer.endswith(".rrd"):
         return ["--save", viewer]
     raise ValueError(f"--viewer must be auto, native, web, none or a file that ends in .rrd, got {viewer!r}")

@@ -9,8 +9,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import os
-import sys
 import threading
 import time
 import webbrowser
@@ -30,7 +28,7 @@ from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_sdk import import_rerun
 from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
-from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
+from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded, has_display
 
 POLL_S = 0.01
 SEND_S = 0.1
@@ -86,7 +84,7 @@ def view(
         raise ValueError(f"the image rate must be > 0 and <= 1000 Hz, got {image_rate_hz}")
     if not 0 <= port <= 65535:
         raise ValueError(f"a port is 0 to 65535, got {port}")
-    if how == "native" and _has_no_display():
+    if how == "native" and not has_display():
         raise ValueError(f"there is no display to open a window on: {_WITHOUT_WINDOW}")
     import_rerun()
     console = Console(highlight=False, soft_wrap=True)
@@ -107,7 +105,7 @@ def view(
         if how == "web":
             page = stack.enter_context(ControlPage(node, viewer.page_url, port=port))
             say(f"open {page.url}")
-            if open_browser and not _has_no_display():
+            if open_browser and has_display():
                 webbrowser.open(page.url)
         try:
             status = watch(node, outlet, options, stop=stop, say=say, to_the_end=save is not None)
@@ -202,7 +200,3 @@ def _receive(
         say(f"a simulator of another version, which cannot be shown:\n{error}")
         return None
     return simulation, info.source
-
-
-def _has_no_display() -> bool:
-    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

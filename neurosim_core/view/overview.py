@@ -184,8 +184,9 @@ class FlightSummary:
                 elif kind == "depth":
                     depth_m = min(depth_m, float(np.median(data)))
         for view in snapshot.events.values():
-            pixels = view.events.y.astype(np.int64) * view.width + view.events.x
-            covered = max(covered, len(np.unique(pixels)) / max(1, view.width * view.height))
+            seen = np.zeros((view.height, view.width), dtype=np.bool_)
+            seen[view.events.y, view.events.x] = True
+            covered = max(covered, float(seen.mean()))
         # most at a third: more is a thicket
         interest = (1.0 + contrast) * (0.01 + covered * (1.0 - covered) ** 2) * (0.1 + depth_m)
         if self._best is None or interest >= self._best[0]:

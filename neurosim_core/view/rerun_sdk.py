@@ -49,13 +49,12 @@ class RerunStream:
         self.recording = recording
         self._file = file
 
-    def flush(self) -> None:
-        """Wait until what was logged has left.
+    def check(self) -> None:
+        """See whether all that has left so far could be written; wait for nothing.
 
         Raises:
             OSError: The file cannot be written, such as on a full disk.
         """
-        self.recording.flush()
         if self._file is not None:
             self._file.check()
 
@@ -63,12 +62,12 @@ class RerunStream:
         """Disconnect from the file or viewer.
 
         Raises:
-            OSError: As `flush`.
+            OSError: As `check`.
         """
         self.recording.disconnect()
         if self._file is not None:
             self._file.join()
-            self._file.check()
+            self.check()
 
 
 class _FileWriter:

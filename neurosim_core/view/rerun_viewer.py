@@ -18,7 +18,7 @@ import threading
 import time
 import urllib.parse
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -157,6 +157,24 @@ class RerunViewer:
         return "\n".join(lines[-5:])
 
 
+def has_display() -> bool:
+    """Return whether a window can be opened. Only Linux can be without a display; an empty name is none."""
+    return sys.platform != "linux" or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+@contextlib.contextmanager
+def naming_port(port: int) -> Iterator[None]:
+    """Name the port in the error of a block that cannot listen on it.
+
+    Raises:
+        OSError: The port is taken, or not allowed.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"port {port} cannot be used: {error.strerror}") from None
+
+
 def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True) -> int:
     """Show a Rerun file until the window is closed or this process is interrupted.
 
@@ -173,8 +191,7 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
         ValueError: There is no display to open a window on.
         OSError, ImportError, ViewerEnded: As `RerunViewer`.
     """
-    has_display = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
-    if not web and not has_display:
+    if not web and not has_display():
         raise ValueError("there is no display to open a window on: `neurosim view FILE --web` serves a page")
     stop = threading.Event()
     with (
@@ -183,7 +200,7 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
     ):
         if web:
             print(f"open {viewer.page_url}", flush=True)
-            if open_browser and has_display:
+            if open_browser and has_display():
                 webbrowser.open(viewer.page_url)
         while not stop.wait(_POLL_S) and not viewer.ended:
             pass
@@ -211,10 +228,8 @@ def _free_ports(*wanted: int) -> list[int]:
         for port in wanted:
             probe = held.enter_context(socket.socket())
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
+            with naming_port(port):
                 probe.bind((HOST, port))
-            except OSError as error:
-                raise OSError(f"port {port} cannot be used: {error.strerror}") from None
             ports.append(int(probe.getsockname()[1]))
     return ports
 

@@ -31,7 +31,7 @@ SETTINGS = {
     "exclude": ["*/path"],
     "routes": [
         {"cortex": "/drone/events", "type": "event_camera_msgs/EventPacket", "options": {"encoding": "mono"}},
-        {"cortex": "*", "type": "dvs_msgs/EventArray"},
+        {"cortex": "*", "type": "sensor_msgs/CompressedImage"},
         {"cortex": "/drone/imu", "qos": "sensor_data"},
     ],
 }

@@ -354,22 +354,6 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
             np.frombuffer(np.array(MONO, "<u8").tobytes(), U8),
         ),
     ),
-    "event_array": (
-        convert.event_array,
-        EVENTS,
-        context(),
-        "dvs_msgs/EventArray",
-        record(
-            "dvs_msgs/EventArray",
-            header("drone/events_optical_frame", 2, 999_999_000),
-            5,
-            8,
-            [
-                record("dvs_msgs/Event", 7, 3, record("builtin_interfaces/Time", 2, 999_999_000), True),
-                record("dvs_msgs/Event", 2, 4, record("builtin_interfaces/Time", 3, 0), False),
-            ],
-        ),
-    ),
     "point_cloud": (
         convert.point_cloud,
         messages.PointCloud(
@@ -876,17 +860,6 @@ def test_event_packets_are_decoded_again(encoding):
         assert np.array_equal(decoded.y, events.y)
         assert np.array_equal(decoded.polarity, events.polarity)
         assert stamp_ns == (t_ns[0] if count else events.stamp_ns)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 500])
-def test_event_arrays_are_decoded_again(count):
-    events = many_events(count, begin_us=2_999_000)
-    sent = cdr.decode(convert.event_array(events, context()), "dvs_msgs/msg/EventArray")
-    assert [
-        (e.x, e.y, e.ts.sec * 10**6 + e.ts.nanosec // 1000, int(e.polarity)) for e in sent.events
-    ] == list(
-        zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.polarity.tolist(), strict=True)
-    )
 
 
 def test_events_that_cannot_be_encoded_are_refused():

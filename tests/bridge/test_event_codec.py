@@ -10,7 +10,7 @@ import pytest
 
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.event_codec import EventPicture, decode_mono, dvs_size, encode_mono, write_dvs
+from cortex_ros2_bridge.event_codec import EventPicture, decode_mono, encode_mono, read_dvs
 
 WIDTH, HEIGHT = 640, 480
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -285,7 +285,7 @@ def test_evt3_that_is_none_is_refused():
         Evt3Decoder().decode(word(0x9, 0) + word(0x8, 0) + word(0xB, 0), **SIZE)
 
 
-@pytest.mark.parametrize("encoding", ["evt3", "mono", "dvs"])
+@pytest.mark.parametrize("encoding", ["evt3", "mono"])
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -303,7 +303,6 @@ def test_events_that_do_not_fit_are_refused(encoding, change, reason):
     encode_it = {
         "evt3": lambda: Evt3Encoder().encode(EventColumns(*wrong), **SIZE, end_us=0),
         "mono": lambda: encode_mono(EventColumns(*wrong), **SIZE, base_us=0),
-        "dvs": lambda: write_dvs(np.zeros(32, np.uint8), EventColumns(*wrong), **SIZE),
     }[encoding]
     with pytest.raises(EventCodecError, match=reason):
         encode_it()
@@ -361,25 +360,19 @@ def test_mono_times_that_are_too_far_apart_are_refused():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1000])
-def test_dvs_records_are_those_of_an_event_array(count):
-    """Against the encoding of the messages, one by one."""
+def test_arrays_of_dvs_msgs_are_read(count):
+    """Against messages that were encoded one by one."""
     events = packet(1_500_000, 3_500_000, count)
-    out = np.full(16 * count, 0xEE, np.uint8)
-    write_dvs(out, EventColumns(*events), **SIZE)
     record, time = cdr.record_class("dvs_msgs/msg/Event"), cdr.record_class("builtin_interfaces/msg/Time")
-    header = cdr.record_class("std_msgs/msg/Header")(time(0, 0), "")
+    header = cdr.record_class("std_msgs/msg/Header")(time(0, 0), "dvs")
     messages = [record(x, y, time(t // 10**6, t % 10**6 * 1000), bool(p)) for t, x, y, p in rows(events)]
     array = cdr.encode(cdr.record_class("dvs_msgs/msg/EventArray")(header, HEIGHT, WIDTH, messages))
-    assert bytes(array)[-16 * count :] == bytes(out) if count else len(array) % 4 == 0
-    assert dvs_size(count) == max(16 * count - 3, 0)
-
-
-@pytest.mark.parametrize(("first", "last"), [(0, 2**32), (0, 10**15), (2**31 * 10**6, 2**31 * 10**6)])
-def test_dvs_times_that_are_too_far_apart_or_too_late_are_refused(first, last):
-    ones = np.ones(2, np.uint16)
-    columns = EventColumns(np.array([first, last]), ones, ones, ones.astype(np.uint8))
-    with pytest.raises(EventCodecError, match="dvs_msgs cannot hold"):
-        write_dvs(np.zeros(32, np.uint8), columns, **SIZE)
+    size, found = read_dvs(array)
+    assert size == (WIDTH, HEIGHT)
+    assert rows(found) == rows(events)
+    if count:
+        with pytest.raises(EventCodecError, match="are no dvs_msgs/EventArray"):
+            read_dvs(array[:-8])
 
 
 def test_picture_shows_the_last_event_of_each_pixel():

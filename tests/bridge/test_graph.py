@@ -16,7 +16,14 @@ from cortex_ros2_bridge.backend import environment
 from cortex_ros2_bridge.backend.base import Qos, TopicInfo
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
-from cortex_ros2_bridge.backend.names import check_name, check_node_name, ros_topic, ros_type, split_type
+from cortex_ros2_bridge.backend.names import (
+    check_name,
+    check_node_name,
+    dds_type_of,
+    ros_topic,
+    ros_type,
+    split_type,
+)
 
 IMU = "sensor_msgs/msg/Imu"
 STRING = "std_msgs/msg/String"
@@ -181,8 +188,10 @@ def test_names() -> None:
     assert check_node_name("a", "/") == ("a", "/")
     assert check_node_name("a", "b/c") == ("a", "/b/c")
     assert split_type(IMU) == ("sensor_msgs", "msg", "Imu")
-    with pytest.raises(ValueError, match="invalid ROS type 'Imu'"):
-        split_type("Imu")
+    assert dds_type_of(IMU) == "sensor_msgs::msg::dds_::Imu_"
+    for wrong in ("sensor_msgs/Imu", "Imu", "", "sensor_msgs/msg/"):
+        with pytest.raises(ValueError, match=f"invalid ROS type '{wrong}'"):
+            dds_type_of(wrong)
     with pytest.raises(ValueError, match="invalid ROS name '/a b'"):
         check_node_name("a", "a b")
     assert ros_topic("rt/drone/imu") == "/drone/imu"

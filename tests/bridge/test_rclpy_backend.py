@@ -343,8 +343,8 @@ def test_choice(fake: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         bag = open_backend(tmp_path / path)
         assert bag.name == "bag"
         bag.close()
-    for bad in ("ros", "flight.bag"):
-        with pytest.raises(ValueError, match="backend must be auto, rclpy, dds or a path"):
+    for bad in ("ros", "flight.bag", ""):
+        with pytest.raises(ValueError, match="a backend is auto, rclpy, dds or a path"):
             open_backend(bad)
 
 

@@ -209,9 +209,9 @@ def test_select():
 
 
 def test_a_type_that_is_no_default_comes_on_request():
-    routes = routed({"routes": [{"cortex": "*/events", "type": "dvs_msgs/EventArray"}]})
-    assert routes["/drone/events", "EventArray"].ros_topic == "/drone/events/event_array"
-    assert ("/drone/events", "EventPacket") in routes
+    routes = routed({"routes": [{"cortex": "*/rgb", "type": "sensor_msgs/CompressedImage"}]})
+    assert routes["/drone/rgb", "CompressedImage"].ros_topic == "/drone/rgb/image_raw/compressed"
+    assert ("/drone/rgb", "Image") in routes
 
 
 def test_what_cannot_be_is_said_and_the_rest_goes_on():
@@ -408,7 +408,7 @@ def test_settings_of_the_readme():
     assert routes["/drone/imu", "Imu"].ros_topic == "/neurosim/imu/data_raw"
     assert routes["/drone/imu", "Imu"].qos == config.QOS["sensor_data"]
     assert routes["/drone/events", "EventPacket"].options == {"encoding": "mono"}
-    assert ("/drone/events", "EventArray") in routes
+    assert ("/drone/rgb", "CompressedImage") in routes
     assert routes["/drone/command/rates", "AttitudeTarget"].options["max_thrust_n"] == 20.0
     assert ("/drone/odometry", "TFMessage") not in routes
 

@@ -112,6 +112,20 @@ def test_what_a_recording_does_not_show_is_left_out_and_said():
     assert fit.settings["leak.rate_hz"] == pytest.approx(0.3, rel=0.02)
 
 
+def test_thresholds_of_pixels_that_are_alike_are_told_less_exactly():
+    """Every pixel has as many events in a step: a range of thresholds does, and the errors say so."""
+    alike = {"threshold_on": 0.18, "threshold_off": 0.24, "leak.rate_hz": 0.2}
+    stimulus = Stimulus(
+        width=WIDTH, height=HEIGHT, still=record_still(alike), span_s=SPAN_S, steps=record_steps(alike),
+        contrast=CONTRAST, rise_s=RISE_S,
+    )  # fmt: skip
+    fit = fit_sensor(stimulus, repeats=2)
+    for key in ("threshold_on", "threshold_off"):
+        assert 0.005 < fit.errors[key] < 0.02
+        assert fit.settings[key] == pytest.approx(alike[key], abs=3.0 * fit.errors[key]), key
+    assert "all pixels have the same whole number of events" in " ".join(fit.notes)
+
+
 def test_a_readout_by_rows_is_told_from_one_by_events():
     """A window of w rows and n events takes w row_s + n / bandwidth."""
     rows = {"readout.kind": "row", "readout.bandwidth_hz": 4e5, "readout.row_s": 2e-6}

@@ -109,15 +109,21 @@ def test_what_is_logged_goes_above_the_line(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_who_has_sent_the_commands_is_known_beside_others_that_could():
-    with LiveRig(make_config(sensors={})) as rig, Node("idle") as idle, Node("pilot") as pilot:
-        for node, speed in ((idle, None), (pilot, rig.hover())):
-            publisher = node.publisher("/drone/command/motor_speeds", MotorCommand)
-            assert publisher.wait_for_subscribers(1, SOON_S)
-            if speed is not None:
-                publisher.publish(MotorCommand(stamp_ns=0, speed=speed))
-        status = rig.wait_for_status(lambda s: s.vehicles[0].command_count)
-        later = rig.wait_for_status(lambda s: s.step_count > status.step_count)
-    assert [s.vehicles[0].command_source for s in (status, later)] == ["pilot", "pilot"]
+    """One of them has sent commands before there was a simulator."""
+
+    def publisher_of(node: Node) -> Any:
+        return node.publisher("/drone/command/motor_speeds", MotorCommand)
+
+    with Node("veteran") as veteran, Node("pilot") as pilot:
+        earlier, now = publisher_of(veteran), publisher_of(pilot)
+        earlier.publish(MotorCommand(stamp_ns=0, speed=np.zeros(4)))
+        with LiveRig(make_config(sensors={})) as rig:
+            assert earlier.wait_for_subscribers(1, SOON_S)
+            assert now.wait_for_subscribers(1, SOON_S)
+            for count in (1, 2, 3):
+                now.publish(MotorCommand(stamp_ns=0, speed=rig.hover()))
+                status = rig.wait_for_status(lambda s, n=count: s.vehicles[0].command_count >= n)
+    assert status.vehicles[0].command_source == "pilot"
 
 
 def test_what_is_only_recorded_counts_as_published(tmp_path: Path):
@@ -220,6 +226,7 @@ def test_serve_prints_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture
         serving.join(SOON_S)
     assert codes == [0]
     printed = " ".join(capsys.readouterr().out.split())
+    assert "preparing: kernels" in printed
     assert "/drone/: imu, odometry, rotor_speeds" in printed
     assert "waiting for the first command on /drone/command/*: `neurosim fly` sends them" in printed
     assert "ended: the 1 s are over" in printed

@@ -90,6 +90,7 @@ def test_all_end_with_the_simulator_and_a_flight_in_lockstep_with_its_controller
         ("auto", "DISPLAY", "linux", []),
         ("auto", "WAYLAND_DISPLAY", "linux", []),
         ("auto", None, "darwin", []),
+        ("auto", None, "win32", []),
         ("auto", None, "linux", ["--web", "--no-browser"]),
         ("native", None, "linux", []),
         ("web", "DISPLAY", "linux", ["--web"]),
@@ -99,9 +100,9 @@ def test_all_end_with_the_simulator_and_a_flight_in_lockstep_with_its_controller
     ],
 )
 def test_the_viewer_suits_the_display(monkeypatch, viewer, display, platform, wanted):
-    """Without a display no browser is opened: what would open might be one for the terminal."""
+    """Without a display, or with an empty name, no browser is opened: it might be one for the terminal."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")
     if display is not None:
         monkeypatch.setenv(display, ":0")
     monkeypatch.setattr(sys, "platform", platform)
