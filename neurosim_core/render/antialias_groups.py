@@ -225,7 +225,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     radiance_beyond = pixel_shader(terms, beyond=True)
     write_radiance = radiance_writer(outputs, supersampled=False)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=PIXEL_BOUNDS)
     def shade_even_blocks(
         first: int,
         # In:
@@ -285,7 +285,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=_COVER_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
         first: int,
         # In:
