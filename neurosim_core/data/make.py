@@ -30,6 +30,7 @@ from neurosim_core.data.sources import numbered
 from neurosim_core.flight import header_of
 from neurosim_core.packets import Collision, Events, Image, Odometry, Packet
 from neurosim_core.record import RecordingWriter
+from neurosim_core.render.launch import core_count, limit_cores
 from neurosim_core.sim.model import Model, make_model, refit
 from neurosim_core.sim.rollout import run_model
 from neurosim_core.sim.state import make_state
@@ -170,7 +171,8 @@ def make_flights(
         return
     count = min(workers, max(1, len(missing)))
     stretches = [(plan, numbers) for numbers in stretches_of(plan, workers)]
-    with multiprocessing.get_context("spawn").Pool(count, _begin_worker, (os.getpid(),)) as pool:
+    cores = core_count() // count
+    with multiprocessing.get_context("spawn").Pool(count, _begin_worker, (os.getpid(), cores)) as pool:
         known = {process.pid for process in pool._pool}  # type: ignore[attr-defined]
         result = pool.map_async(_fly_stretch, stretches, chunksize=1)
         while missing:
@@ -198,13 +200,14 @@ _scene: tuple[str, Model] | None = None
 """The last scene of this worker, by its settings: the next flight may be in it."""
 
 
-def _begin_worker(parent: int) -> None:
+def _begin_worker(parent: int, cores: int) -> None:
     import signal
 
     from neurosim_core.warp_start import start_warp
 
     global _parent
     _parent = parent
+    limit_cores(cores)  # more threads than cores would wait for each other
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     start_warp()
 

@@ -21,6 +21,7 @@ from neurosim_core.data.make import DatasetPlan, fly, stretches_of, write_whole
 from neurosim_core.data.sources import RunSource, fields_of, numbered
 from neurosim_core.data.windows import WindowConfig, choose_sensors
 from neurosim_core.install import install_hint
+from neurosim_core.render.launch import limit_cores
 
 SEEDS_APART = 10_000
 """Between the first flights of two simulators that fly side by side."""
@@ -113,6 +114,7 @@ class _Simulator:
     """What an actor is."""
 
     def __init__(self, config: SimulationConfig, first: int, flights: int | None) -> None:
+        limit_cores(1)
         self._config = config
         self._numbers = itertools.count(first) if flights is None else range(first, first + flights)
 
@@ -174,6 +176,7 @@ def make_flights_on_ray(
 
 def _fly_there(plan: DatasetPlan, numbers: list[int]) -> Iterator[tuple[int, dict[str, bytes]]]:
     """Yield flights as the bytes of their files."""
+    limit_cores(1)
     for number in numbers:
         with tempfile.TemporaryDirectory() as folder:
             there = replace(plan, folder=Path(folder))

@@ -1,7 +1,7 @@
 """Processes that fly and stream over Cortex what networks learn from, each scene after scene.
 
-`python -m neurosim_core.learn.dense_live NAMESPACE SETTINGS SEED` is one of them: flight k has the seeds
-SEED + k of scene, path and noise. It flies as fast as its readers take what it sends.
+`python -m neurosim_core.learn.dense_live NAMESPACE SETTINGS SEED CORES` is one of them: flight k has the
+seeds SEED + k of scene, path and noise. It flies as fast as its readers take what it sends.
 """
 
 from __future__ import annotations
@@ -47,9 +47,12 @@ def flight_settings(
 @contextlib.contextmanager
 def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> Iterator[list[str]]:
     """Run processes that stream flights, and end them; yield their namespaces, for `ns.data.LiveSource`."""
+    from neurosim_core.render.launch import core_count
+
     names = [f"/flight{index}" for index in range(count)]
+    program, cores = [sys.executable, "-m", __name__], str(core_count() // count)
     commands = [
-        [sys.executable, "-m", __name__, name, json.dumps(settings), str(seed + _SEEDS_APART * index)]
+        [*program, name, json.dumps(settings), str(seed + _SEEDS_APART * index), cores]
         for index, name in enumerate(names)
     ]
     with contextlib.ExitStack() as stack:
@@ -60,8 +63,8 @@ def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> I
         yield names
 
 
-def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> None:
-    """Fly and publish until the process is ended."""
+def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int, cores: int) -> None:
+    """Fly and publish until the process is ended, on so many cores."""
     from cortex import Node
     from cortex.messages import Simulation
     from neurosim_core import __version__
@@ -69,8 +72,10 @@ def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> No
     from neurosim_core.data.sources import numbered
     from neurosim_core.live.messages import message_type, to_message
     from neurosim_core.live.topics import SIMULATION, stream_topic
+    from neurosim_core.render.launch import limit_cores
     from neurosim_core.sim.rollout import run
 
+    limit_cores(cores)
     config = load_config(dict(settings))
     (vehicle,) = config.vehicles
     with Node(f"flights{namespace.replace('/', '_')}") as node:
@@ -96,4 +101,4 @@ def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> No
 
 
 if __name__ == "__main__":
-    stream_flights(sys.argv[1], json.loads(sys.argv[2]), int(sys.argv[3]))
+    stream_flights(sys.argv[1], json.loads(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

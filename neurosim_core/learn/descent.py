@@ -1,4 +1,4 @@
-"""Steps that are replayed as one CUDA graph: small networks wait for launches otherwise."""
+"""Steps that are replayed as CUDA graphs: small networks wait for launches otherwise."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import torch
 from torch import nn
+
+from neurosim_core.learn import ranks
 
 _EAGER_STEPS = 3
 """Steps before one is captured: PyTorch sets things up in them."""
@@ -46,7 +48,7 @@ class Replayed:
 
 
 class Descent:
-    """Minimises a loss by Adam.
+    """Minimises a loss by Adam; with several processes (`ranks`), the mean of their losses.
 
     Args:
         module: Its parameters are changed.
@@ -73,7 +75,10 @@ class Descent:
         self.optimizer = torch.optim.Adam(
             module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
         )
-        self._replayed = Replayed(self._descend, on_cuda=self._on_cuda)
+        self._differentiate = Replayed(self._backward, on_cuda=self._on_cuda)
+        self._improve = Replayed(self._step, on_cuda=self._on_cuda)
+        size = sum(parameter.numel() for parameter in module.parameters()) if ranks.count() > 1 else 0
+        self._gradient = torch.zeros(size, device=device)
 
     def step(self, rate: float) -> None:
         """Take a gradient step.
@@ -86,7 +91,10 @@ class Descent:
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        self._replayed()
+        self._differentiate()
+        if len(self._gradient):
+            ranks.average(self._gradient)
+        self._improve()
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training goes on from."""
@@ -97,9 +105,22 @@ class Descent:
         self._module.load_state_dict(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
 
-    def _descend(self) -> None:
+    def _backward(self) -> None:
         loss = self._loss()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        if len(self._gradient):
+            torch.cat([gradient.flatten() for gradient in self._gradients()], out=self._gradient)
+
+    def _step(self) -> None:
+        if len(self._gradient):
+            gradients = self._gradients()
+            parts = self._gradient.split([gradient.numel() for gradient in gradients])
+            for gradient, part in zip(gradients, parts, strict=True):
+                gradient.copy_(part.view_as(gradient))
         torch.nn.utils.clip_grad_norm_(self._module.parameters(), self._gradient_max)
         self.optimizer.step()
+
+    def _gradients(self) -> list[torch.Tensor]:
+        found = [parameter.grad for parameter in self._module.parameters()]
+        return [gradient for gradient in found if gradient is not None]

@@ -14,12 +14,13 @@ import os
 import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neurosim_core.learn import need
+from neurosim_core.learn import need, ranks
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.episodes import Randomisation
@@ -104,7 +105,7 @@ class Training:
             seed=config.seed,
         )
         device = self.env.device
-        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        self._generator = torch.Generator(device=device).manual_seed(config.seed + ranks.rank())
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
@@ -124,7 +125,8 @@ class Training:
             self._trainers["student"] = RecurrentPpo(self.env, config.student, self._generator)
         self._done = dict.fromkeys(self._trainers, 0)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
+        if ranks.rank() == 0:
+            (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
 
     @property
     def teacher(self) -> ActorCritic | None:
@@ -154,6 +156,8 @@ class Training:
         for stage, trainer in self._trainers.items():
             trainer.descent.load_state_dict(state[stage])
         self._generator.set_state(state["generator"].cpu())
+        if ranks.rank() > 0:
+            self._generator.manual_seed(ranks.rank() + sum(state["done"].values()))
         self._done = state["done"]
 
     def run(self, *, until: tuple[int, int] | None = None) -> None:
@@ -167,7 +171,7 @@ class Training:
         config = self.config
         wholes = {"teacher": config.teacher.iterations, "student": config.student.iterations}
         limits = wholes if until is None else dict(zip(wholes, until, strict=True))
-        with SummaryWriter(str(self.folder)) as writer:
+        with SummaryWriter(str(self.folder)) if ranks.rank() == 0 else nullcontext() as writer:
             for stage, trainer in self._trainers.items():
                 while self._done[stage] < min(limits[stage], wholes[stage]):
                     self._train_block(stage, trainer, wholes[stage], writer)
@@ -175,16 +179,19 @@ class Training:
     def _train_block(self, stage: str, trainer: Trainer, whole: int, writer: Any) -> None:
         begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
-        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART)
+        apart = ranks.rank() * trainer.env.num_envs
+        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart)
         end = min(done + self.config.block, whole)
         sums: dict[str, list[float]] = {}
         for iteration in range(done, end):
             log = trainer.iterate(iteration / whole)
             for name, value in log.items():
-                writer.add_scalar(f"{stage}/{name}", value, iteration)
+                if writer is not None:
+                    writer.add_scalar(f"{stage}/{name}", value, iteration)
                 sums.setdefault(name, []).append(value)
         self._done[stage] = end
-        self._save()
+        if ranks.rank() == 0:
+            self._save()
         self.trained_s[stage] = self.trained_s.get(stage, 0.0) + time.monotonic() - begin_s
         self.processor_s += _processor_s() - processor_s
         means = ", ".join(f"{name} {sum(v) / len(v):.3g}" for name, v in sums.items())
@@ -237,7 +244,7 @@ def default_config(
     if algorithm == "ppo":
         ppo = RecurrentPpoConfig()
         if find_device(device).startswith("cuda"):
-            ppo = RecurrentPpoConfig(worlds=1024, iterations=600)
+            ppo = RecurrentPpoConfig(worlds=1024, iterations=300)
         return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
     if not find_device(device).startswith("cuda"):
         few: dict[str, Any] = {
@@ -342,18 +349,24 @@ def train(
         say: Told what happens, line by line.
 
     Returns:
-        Evaluations in scenes that were not trained in: `events`, and `blind`.
+        Evaluations in scenes that were not trained in: `events`, and `blind`; of several processes (`ranks`)
+        by the first only.
     """
     from neurosim_core.learn.export import export_onnx
 
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
     prepare_torch()
-    training = Training(folder, None if resume else config, say=say)
+    config = dataclasses.replace(read_config(folder) if resume else config, device=ranks.join(config.device))
+    if ranks.rank() > 0:
+        say = _say_nothing
+    training = Training(folder, config, say=say)
     if resume:
         training.resume()
     say(f"set up in {time.monotonic() - begin_s:.0f} s")
     training.run()
+    if ranks.rank() > 0:
+        return {}
     if training.teacher is not None:
         say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
@@ -384,6 +397,10 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "rate_max_rad_s": list(task.rate_max_rad_s),
         "vehicle": dict(task.vehicle),
     }
+
+
+def _say_nothing(line: str) -> None:
+    """Leave it to the first process."""
 
 
 def _processor_s() -> float:

@@ -17,10 +17,19 @@ import warp as wp
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
 
-@cache
+_most: int | None = None
+
+
 def core_count() -> int:
     """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return here if _most is None else min(here, _most)
+
+
+def limit_cores(count: int) -> None:
+    """Use at most so many cores in this process, which works beside others of its kind."""
+    global _most
+    _most = max(1, count)
 
 
 @cache

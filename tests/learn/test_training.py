@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +17,8 @@ import neurosim_core as ns
 from neurosim_core.registry import register
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
+
+import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
@@ -328,3 +334,25 @@ def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
             torch.testing.assert_close(action, actions[step].clamp(-1.0, 1.0))
             torch.testing.assert_close(memory[:, policy.hidden :], estimates[step])
     assert estimates.std() > 0.0
+
+
+def test_two_processes_train_one_policy(tmp_path, hall):
+    """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
+    pytest.importorskip("tensorboard")
+    script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    done = subprocess.run(
+        [*torchrun, script, scene, str(tmp_path / "both")],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    first, second = sorted(found, key=lambda each: each["rank"])
+    alone = rank_process.train(tmp_path / "alone", hall)
+    assert first["digests"] == second["digests"]
+    assert first["position"] != second["position"]
+    assert not set(first["digests"]) & set(alone["digests"])
+    assert (tmp_path / "both" / "checkpoint.pt").exists()

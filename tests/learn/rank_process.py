@@ -1,0 +1,54 @@
+"""One of several processes that train a policy: arguments are a scene and a folder; prints a line of JSON."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import neurosim_core as ns
+from neurosim_core.learn import ranks
+from neurosim_core.learn.dagger import DaggerConfig
+from neurosim_core.learn.ppo import PpoConfig
+from neurosim_core.learn.train import TrainConfig, Training
+
+
+def train(folder: Path, model: ns.Model) -> dict[str, Any]:
+    """Train a little, and return what tells weights and flights apart."""
+    torch.set_num_threads(1)
+    config = TrainConfig(
+        task="hover",
+        device=ranks.join("cpu"),
+        teacher=PpoConfig(worlds=4, iterations=2, horizon=6, epochs=2, minibatches=2),
+        student=DaggerConfig(worlds=4, iterations=2, horizon=6),
+        pixels=8,
+        block=2,
+    )
+    training = Training(folder, config, say=lambda line: None, models=[model])
+    training.run()
+    digests = [
+        hashlib.sha256(torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()).hexdigest()
+        for policy in (training.teacher, training.student)
+        if policy is not None
+    ]
+    position = training.env.view.position.sum().item()
+    return {"rank": ranks.rank(), "digests": digests, "position": position}
+
+
+def main(scene: str, folder: str) -> None:
+    mesh = {"kind": "mesh", "file": scene, "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 2.0]}
+    settings = {
+        "device": "cpu",
+        "render": {"samples_per_pixel": 4},
+        "scene": mesh,
+        "path": {"kind": "hover"},
+    }
+    print(json.dumps(train(Path(folder), ns.make_model(ns.load_config(settings)))), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
