@@ -17,9 +17,15 @@ if TYPE_CHECKING:
 def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain, or `eval`")
     learn.add_argument(
-        "run", nargs="?", type=Path, metavar="RUN", help="for `eval`: folder of a run, or depth.pt, ..."
+        "what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain; `eval` or `rate`"
+    )
+    learn.add_argument(
+        "run",
+        nargs="?",
+        type=Path,
+        metavar="RUN",
+        help="eval: folder of a run, or depth.pt, ...; rate: a task",
     )
     learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
     learn.add_argument(
@@ -124,6 +130,8 @@ def _learn(arguments: argparse.Namespace) -> int:
     need("torch")
     if arguments.what == "eval":
         return _evaluate(arguments)
+    if arguments.what == "rate":
+        return _measure_rate(arguments)
     if arguments.what in ("depth", "flow", "pretrain"):
         return _learn_dense(arguments)
     if arguments.run is not None:
@@ -153,6 +161,33 @@ def _learn(arguments: argparse.Namespace) -> int:
     config = dataclasses.replace(config, student=student, teacher=teacher)
     if train(folder, config, resume=arguments.resume):
         print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    return 0
+
+
+def _measure_rate(arguments: argparse.Namespace) -> int:
+    """Print steps a second of a task, with one and two renders in each, and what endings cost."""
+    from neurosim_core.learn.env import find_task, make_env
+    from neurosim_core.learn.rate import measure_steps
+
+    where: dict[str, Any] = {}
+    for renders in (1, 2):
+        task = find_task(str(arguments.run or "hover"))
+        task.renders_per_step = renders
+        where = where or {"scenes": task.scenes(unseen=False)[:4]}
+        env = make_env(
+            task,
+            worlds=arguments.worlds or 64,
+            device=arguments.device or "auto",
+            pixels=arguments.pixels,
+            **where,
+        )
+        where = {"models": env.sim.models}
+        rate, least, most = measure_steps(env)
+        ended, _, _ = measure_steps(env, ending=max(env.num_envs // 100, 1))
+        print(
+            f"steps_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f}; {renders} renders a step, {env.device})"
+        )
+        print(f"step_with_endings {rate / ended:.3f} (1 % of the worlds, or one, in each step)", flush=True)
     return 0
 
 

@@ -244,7 +244,7 @@ def default_config(
     if algorithm == "ppo":
         ppo = RecurrentPpoConfig()
         if find_device(device).startswith("cuda"):
-            ppo = RecurrentPpoConfig(worlds=1024, iterations=480)
+            ppo = RecurrentPpoConfig(worlds=1024, iterations=300)
         return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
     if not find_device(device).startswith("cuda"):
         few: dict[str, Any] = {

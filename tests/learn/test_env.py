@@ -256,3 +256,25 @@ def test_a_fast_turn_loses_no_events(make):
         assert not info["dropped"].any()
         events = torch.maximum(events, observations["events"][:, :2].sum((1, 2, 3)).max())
     assert events > 2 * 8 * 8  # more than worlds have room for by default
+
+
+def test_the_rate_counts_steps_of_all_worlds(hall):
+    """Episodes are cut where that is asked for only, and as many as that in each step."""
+    from neurosim_core.learn.rate import measure_steps
+
+    env = ns.learn.make_env("hover", worlds=8, device="cpu", pixels=8, models=[hall])
+    cut = 0
+    step = env.step
+
+    def counted(actions):
+        nonlocal cut
+        result = step(actions)
+        cut += int(result[3].sum())
+        return result
+
+    env.step = counted
+    rate, least, most = measure_steps(env, seconds=0.1)
+    assert 0.0 < least <= rate <= most
+    assert cut == 0
+    measure_steps(env, ending=2, seconds=0.1)
+    assert cut >= 2 * (5 + 3 + 5)
