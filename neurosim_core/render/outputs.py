@@ -140,7 +140,7 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
             found = wp.vec3(wp.inf, 0.0, 0.0)
             if hit.face >= 0:
                 facing = wp.dot(ray, hit.normal)
-                albedo = surface_albedo(scene, spread_rad, facing, hit)
+                albedo = surface_albedo(scene, spread_rad, facing, hit, wp.vec2(0.0))
                 luma = 0.2126 * albedo[0] + 0.7152 * albedo[1] + 0.0722 * albedo[2]
                 found = wp.vec3(hit.t, wp.abs(facing), luma)
             out.returns[slot, row, col] = found
