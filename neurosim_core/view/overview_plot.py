@@ -33,6 +33,7 @@ _PANEL_W, _PANEL_H = 416, 312
 _ROW_H = _PANEL_H + 72
 _COLUMN_X = (_MARGIN, _MARGIN + _PANEL_W + 64)
 _PLAN_X = _COLUMN_X[1] + _PANEL_W + 60
+_LEGEND_Y = HEIGHT_PX - 78
 _STRIPS_MAX = 4
 
 
@@ -284,7 +285,7 @@ def _draw_strips(
 def _draw_plan(page: _Page, scene: Scene, track: Track, snapshot: Snapshot) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    width, height = WIDTH_PX - _PLAN_X - _MARGIN, HEIGHT_PX - _TOP - 84
+    width, height = WIDTH_PX - _PLAN_X - _MARGIN, _LEGEND_Y - _TOP - 22
     bounds = scene.bounds_m
     height_m = float(np.median(track.position[:, 2])) if len(track.position) else float(bounds[:, 2].mean())
     plan = cut_plan(scene, height_m=height_m)
@@ -374,11 +375,11 @@ def _draw_path(page: _Page, axes: Any, track: Track, snapshot: Snapshot, place: 
             zorder=8,
             bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
         )
-    bar = page.axes(WIDTH_PX - _MARGIN - 180, HEIGHT_PX - 62, 180, 10)
+    bar = page.axes(WIDTH_PX - _MARGIN - 180, _LEGEND_Y, 180, 10)
     page.figure.colorbar(line, cax=bar, orientation="horizontal").outline.set_visible(False)
     bar.tick_params(length=3, labelsize=9.5, pad=2)
     options = {"fontsize": 10.5, "color": _FAINT, "va": "center"}
-    page.text(WIDTH_PX - _MARGIN - 190, HEIGHT_PX - 57, "speed [m/s]", ha="right", **options)
+    page.text(WIDTH_PX - _MARGIN - 190, _LEGEND_Y + 5, "speed [m/s]", ha="right", **options)
 
 
 def _draw_scale_bar(page: _Page, axes: Any, size_m: float) -> None:
@@ -387,9 +388,9 @@ def _draw_scale_bar(page: _Page, axes: Any, size_m: float) -> None:
     length_m = max((m for m in lengths if m <= size_m / 5), default=lengths[0])
     axes.apply_aspect()
     shown = axes.get_window_extent().width / (axes.get_xlim()[1] - axes.get_xlim()[0])  # pixels a metre
-    bar = page.axes(_PLAN_X, HEIGHT_PX - 60, length_m * shown, 6)
+    bar = page.axes(_PLAN_X, _LEGEND_Y + 2, length_m * shown, 6)
     bar.set_xticks([])
     bar.set_yticks([])
     bar.set_facecolor(_INK)
     options = {"fontsize": 10.5, "color": _FAINT, "va": "center"}
-    page.text(_PLAN_X + length_m * shown + 10, HEIGHT_PX - 57, f"{length_m:g} m", **options)
+    page.text(_PLAN_X + length_m * shown + 10, _LEGEND_Y + 5, f"{length_m:g} m", **options)

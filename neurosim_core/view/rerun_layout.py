@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.packets import FieldSchema, PacketSchema
+from neurosim_core.record.header import SensorDescription
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
 
 ROLLING_PLOT_S = 10.0
@@ -38,6 +39,8 @@ class Panel(NamedTuple):
     """Entities that it shows, if not those."""
     rank: int = 0
     """Pictures are laid out by rising rank."""
+    beside: tuple[Panel, ...] = ()
+    """Views of the same in tabs beside it."""
     legend: bool = False
     """A plot has a legend, which hides a part of it: only if neither its title nor the colours of x, y, z
     (red, green, blue) name the lines."""
@@ -48,13 +51,42 @@ def body(vehicle: str) -> str:
     return f"world/vehicles/{vehicle}"
 
 
-def picture_panel(vehicle: str, sensor: str, kind: str = "") -> Panel:
-    """Return the panel of a camera; `kind` is what it shows, a key of `PICTURES`, if that is known."""
+def overlays(sensors: Sequence[SensorDescription]) -> dict[str, str]:
+    """Return the cameras whose pictures are drawn over those of a colour camera, and which that is.
+
+    They measure labels or flow where the other one is, through the same lens.
+    """
+
+    def view(camera: SensorDescription) -> tuple[Any, ...]:
+        return (*camera.position, *camera.orientation, camera.intrinsics)
+
+    below = {view(s): s.name for s in sensors if s.kind in ("rgb", "frame_camera")}
+    above = [s for s in sensors if s.kind in ("instance", "semantic", "optical_flow")]
+    return {s.name: below[view(s)] for s in above if view(s) in below}
+
+
+def picture_panel(vehicle: str, sensor: str, kind: str = "", *, below: str = "") -> Panel:
+    """Return the panel of a camera.
+
+    Args:
+        vehicle: Name of the vehicle.
+        sensor: Name of the camera.
+        kind: What it shows, a key of `PICTURES`; empty: not yet known.
+        below: The camera over whose picture it is drawn.
+    """
     rank = PICTURES.index(kind) if kind else len(PICTURES)
-    return Panel("picture", sensor, f"{body(vehicle)}/{sensor}", ("$origin/image", "$origin/arrows"), rank)
+    if below:
+        contents = ("$origin/image", f"$origin/{sensor}/**")
+        return Panel("picture", f"{sensor} over {below}", f"{body(vehicle)}/{below}", contents, rank)
+    at = f"{body(vehicle)}/{sensor}"
+    surface = Panel("picture", "surface", at, ("$origin/surface",))
+    beside = (surface,) if kind == "events" else ()
+    return Panel("picture", sensor, at, ("$origin/image", "$origin/arrows"), rank, beside)
 
 
-def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *, live: bool) -> list[Panel]:
+def sensor_panels(
+    vehicle: str, sensor: str, schema: PacketSchema, kind: str, *, live: bool, below: str = ""
+) -> list[Panel]:
     """Return the panels in which the packets of a sensor are shown.
 
     Args:
@@ -63,6 +95,7 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
         schema: Schema of its packets.
         kind: The display, or what a picture shows.
         live: The clearance, which only a flight in this process knows, is not plotted.
+        below: The camera over whose picture that of the sensor is drawn.
     """
     at = f"plots/{vehicle}/{sensor}"
     numbers = [field for field in schema.fields if field.is_number]
@@ -71,7 +104,7 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
         rate = Panel("plot", f"{sensor} [M events/s]", f"{at}/rate")
         return [picture_panel(vehicle, sensor, kind), rate, *cloud]
     if kind in PICTURES:
-        return [picture_panel(vehicle, sensor, kind)]
+        return [picture_panel(vehicle, sensor, kind, below=below)]
     if kind == "time series":
         return [Panel("plot", f"{sensor}: {title(field)}", f"{at}/{field.name}") for field in numbers]
     if kind == "bars":
@@ -179,7 +212,9 @@ def _view(panel: Panel, *, rolling: bool) -> Any:
     }
     options: dict[str, Any] = {"origin": panel.origin, "contents": list(panel.contents), "name": panel.name}
     if panel.kind != "plot":
-        return kinds[panel.kind](**options)
+        view = kinds[panel.kind](**options)
+        beside = [_view(other, rolling=rolling) for other in panel.beside]
+        return rrb.Tabs(view, *beside, name=panel.name) if beside else view
     return rrb.TimeSeriesView(
         **options,
         time_ranges=_last_seconds(ROLLING_PLOT_S) if rolling else None,
@@ -198,7 +233,12 @@ def _space(
         eye = rrb.EyeControls3D(position=position, look_target=center, eye_up=(0.0, 0.0, 1.0))
     until_now = _last_seconds(ROLLING_TRAIL_S if rolling else None)
     # One frustum is enough where cameras share a place; the others' pictures are at the right.
-    hidden = [f"- /{camera.origin}/**" for shown in cameras.values() for camera in list(shown)[1:]]
+    hidden = []
+    for shown in cameras.values():
+        parts = [panel for camera in shown for panel in (camera, *camera.beside)]
+        for part in parts[1:]:
+            entities = part.contents[-1] if part.origin == parts[0].origin else "$origin/**"
+            hidden.append(entities.replace("$origin", f"- /{part.origin}"))
     return rrb.Spatial3DView(
         origin="world",
         name="scene",

@@ -9,7 +9,9 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
     world/vehicles/<vehicle>[/<sensor>]     its pose; where a sensor sits; frustum, picture, points
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
+    world/vehicles/<vehicle>/<camera>/<sensor>  labels or flow, over the picture of a colour camera
     world/vehicles/<vehicle>/<sensor>/arrows    flow, on a grid of pixels
+    world/vehicles/<vehicle>/<sensor>/surface   the last events of all pixels, which fade
     world/collisions/<vehicle>              where it touched the scene
     plots/<vehicle>/collisions              the same as a list: a click on a line goes to its time
     events/<vehicle>/<sensor>               events of the last 0.1 s as points in x, y and time; not live
@@ -24,21 +26,19 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
-from neurosim_core.view.event_cloud import EventCloud
-from neurosim_core.view.pictures import EventWindow, picture_of
+from neurosim_core.view.event_views import EventViews
+from neurosim_core.view.pictures import picture_of
 from neurosim_core.view.rerun_batches import RateLimit, Table
 from neurosim_core.view.rerun_layout import (
     PICTURES,
@@ -46,6 +46,7 @@ from neurosim_core.view.rerun_layout import (
     body,
     cloud_entity,
     make_blueprint,
+    overlays,
     picture_panel,
     sensor_panels,
 )
@@ -53,15 +54,14 @@ from neurosim_core.view.rerun_sdk import TIMELINE, RerunStream, import_rerun
 from neurosim_core.view.rerun_shapes import (
     SceneShapes,
     body_entity,
-    encode_events,
     encode_picture,
-    event_colors,
     flow_arrows,
 )
 
 _BATCH_NS = 50_000_000
 _EVENT_PERIOD_NS = 20_000_000
 _EVENT_BURST_NS = 500_000_000
+_OVERLAY_OPACITY = 0.5
 _XYZ_COLORS = ((224, 49, 49), (47, 158, 68), (28, 126, 214))
 _SERIES_COLORS = (
     *_XYZ_COLORS,
@@ -142,8 +142,8 @@ class RerunLogger:
         self._live = live
         self._keep_layout = keep_layout
         self._clock_ns = clock_ns
-        self._windows: dict[str, EventWindow] = {}
-        self._clouds: dict[str, EventCloud] = {}
+        self._events: dict[str, EventViews] = {}
+        self._below = {name: overlays(sensors) for name, sensors in self._vehicles.items()}
         self._tables: dict[str, Table] = {}
         self._trail_end: dict[str, NDArray[np.float64]] = {}
         self._pose_of: dict[str, str] = {}
@@ -301,9 +301,10 @@ class RerunLogger:
             kind = picture_of(packet)[0]
         self._kind_of[vehicle, packet.sensor] = kind
         panels = self._panels.setdefault(vehicle, {})
-        if panels.pop(picture_panel(vehicle, packet.sensor), 0) is None:
+        below = self._below.get(vehicle, {}).get(packet.sensor, "")
+        if panels.pop(picture_panel(vehicle, packet.sensor, below=below), 0) is None:
             self._layout_is_old = True  # it has another rank now
-        for panel in sensor_panels(vehicle, packet.sensor, schema, kind, live=self._live):
+        for panel in sensor_panels(vehicle, packet.sensor, schema, kind, live=self._live, below=below):
             self._layout_is_old |= panel not in panels
             panels[panel] = None
 
@@ -319,6 +320,9 @@ class RerunLogger:
 
     def _log_description(self, vehicle: str, sensor: SensorDescription) -> None:
         rr, lens = self._rr, sensor.intrinsics
+        if below := self._below[vehicle].get(sensor.name):
+            self._panels[vehicle][picture_panel(vehicle, sensor.name, below=below)] = None
+            return
         parts = [rr.Transform3D(translation=sensor.position, quaternion=sensor.orientation)]
         if lens is not None:
             self._panels[vehicle][picture_panel(vehicle, sensor.name)] = None
@@ -388,9 +392,6 @@ class RerunLogger:
         cloud = self._rr.Points3D(as_numpy(getattr(packet, points)), radii=self._rr.Radius.ui_points(2.0))
         self._recording.log(f"{body(vehicle)}/{packet.sensor}", cloud)
 
-    def _log_nothing(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
-        """Show nothing, as a packet class declares by "none"."""
-
     def _log_pose(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         if self._pose_of.setdefault(vehicle, packet.sensor) == packet.sensor:
             self._table(body(vehicle), self._send_poses).append(
@@ -424,37 +425,36 @@ class RerunLogger:
         self._recording.log(f"world/trails/{vehicle}", line)
 
     def _log_picture(self, vehicle: str, packet: Packet, _schema: PacketSchema) -> None:
-        entity = f"{body(vehicle)}/{packet.sensor}/image"
+        below = self._below.get(vehicle, {}).get(packet.sensor)
+        at = f"{body(vehicle)}/{below}/{packet.sensor}" if below else f"{body(vehicle)}/{packet.sensor}"
         now_ns = self._clock_ns() if self._live else packet.stamp_ns
-        if self._image_limit.passes(entity, now_ns):
+        if self._image_limit.passes(at, now_ns):
             self._set_time(packet.stamp_ns)
-            self._recording.log(entity, encode_picture(packet, compress=self._compress))
+            opacity = _OVERLAY_OPACITY if below else 1.0
+            self._recording.log(
+                f"{at}/image", encode_picture(packet, compress=self._compress, opacity=opacity)
+            )
             if self._kind_of[vehicle, packet.sensor] == "flow":
-                arrows = flow_arrows(picture_of(packet)[1])
-                self._recording.log(f"{body(vehicle)}/{packet.sensor}/arrows", arrows)
+                self._recording.log(f"{at}/arrows", flow_arrows(picture_of(packet)[1]))
 
     def _log_events(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
-        entity = f"{body(vehicle)}/{packet.sensor}/image"
-        if entity not in self._windows:
-            self._windows[entity] = EventWindow(length_ns=self._event_window_ns)
-            if not self._compress:
-                self._recording.log(entity, event_colors(), static=True)
-        window = self._windows[entity]
-        arrays = packet.numpy()
-        for end_ns, events in window.add(arrays, start_ns=packet.start_ns, stamp_ns=packet.stamp_ns):
-            if not self._live or self._event_limit.passes(entity, self._clock_ns()):
+        at, length_ns = f"{body(vehicle)}/{packet.sensor}", self._event_window_ns
+        if at not in self._events:
+            self._events[at] = EventViews(
+                width=packet.width, height=packet.height, window_ns=length_ns, compress=self._compress
+            )
+            for name, colors in self._events[at].colors().items():
+                self._recording.log(f"{at}/{name}", colors, static=True)
+        views = self._events[at]
+        for end_ns, events, surface in views.add(packet):
+            if not self._live or self._event_limit.passes(at, self._clock_ns()):
                 self._set_time(end_ns)
-                picture = encode_events(
-                    events, width=packet.width, height=packet.height, compress=self._compress
-                )
-                self._recording.log(entity, picture)
-                rate_m_s = 1e3 * len(events.t) / self._event_window_ns
+                for name, picture in views.pictures(events, surface).items():
+                    self._recording.log(f"{at}/{name}", picture)
+                rate_m_s = 1e3 * len(events.t) / length_ns
                 self._plot(f"plots/{vehicle}/{packet.sensor}/rate", end_ns, rate_m_s, ("events",))
                 if not self._live:
-                    made = EventCloud(width=packet.width, window_ns=self._event_window_ns)
-                    points, colors = self._clouds.setdefault(entity, made).add(events, end_ns)
-                    cloud = self._rr.Points3D(points, colors=colors)
-                    self._recording.log(cloud_entity(vehicle, packet.sensor), cloud)
+                    self._recording.log(cloud_entity(vehicle, packet.sensor), views.points(events, end_ns))
 
     def _log_contact(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         self._set_time(packet.stamp_ns)
@@ -480,7 +480,7 @@ DISPLAYS: dict[str, Callable[[RerunLogger, str, Packet, PacketSchema], None]] = 
     "pose": RerunLogger._log_pose,
     "contact": RerunLogger._log_contact,
     "delay": RerunLogger._log_delay,
-    "none": RerunLogger._log_nothing,
+    "none": lambda *_: None,
 }
 """How packets are logged, by the `display` of their class."""
 
@@ -491,9 +491,8 @@ def _rotors(count: int) -> tuple[str, ...]:
 
 def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles of q = yaw about z, then pitch about y, then roll about x [rad]; nan for no rotation at all."""
-    if not np.linalg.norm(quaternion) > 0.0:
-        return np.full(3, np.nan)
-    with warnings.catch_warnings():  # at a pitch of 90 degrees yaw is taken as 0
-        warnings.simplefilter("ignore", UserWarning)
-        angles: NDArray[np.float64] = Rotation.from_quat(quaternion).as_euler("ZYX")
-    return angles[::-1]
+    length = np.linalg.norm(quaternion)
+    x, y, z, w = quaternion / length if length > 0.0 else np.full(4, np.nan)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.array([roll, np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)), yaw])

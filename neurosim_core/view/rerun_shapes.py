@@ -11,12 +11,12 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays, Packet
+from neurosim_core.packets import Packet
 from neurosim_core.scene.bodies import Body, BodyConfig
 from neurosim_core.scene.body_shapes import Solid
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import linear_to_srgb8
-from neurosim_core.view.pictures import PALETTE, color_picture, event_classes, picture_of
+from neurosim_core.view.pictures import color_picture, picture_of
 from neurosim_core.view.rerun_sdk import import_rerun
 
 _TEXTURE_MAX_PX = 256
@@ -46,7 +46,7 @@ def flow_arrows(flow: NDArray[np.float32]) -> Any:
     )
 
 
-def encode_picture(packet: Packet, *, compress: bool = True) -> Any:
+def encode_picture(packet: Packet, *, compress: bool = True, opacity: float = 1.0) -> Any:
     """Return the picture of a packet as Rerun shows it.
 
     Colours and greys become JPEG. Depth becomes a depth image in millimetres up to 65 m, 0 where nothing is
@@ -56,6 +56,7 @@ def encode_picture(packet: Packet, *, compress: bool = True) -> Any:
     Args:
         packet: A packet that `picture_of` finds a picture in.
         compress: Make it small. What is not, a viewer shows without delay.
+        opacity: Of labels, normals and flow, which are drawn over other pictures if they can be seen through.
 
     Raises:
         ValueError: There is no picture, or one of an unknown encoding.
@@ -75,38 +76,37 @@ def encode_picture(packet: Packet, *, compress: bool = True) -> Any:
     if kind == "colour":
         picture = rr.Image(data)
         return picture.compress(jpeg_quality=90) if compress else picture
+    over: dict[str, Any] = {"opacity": opacity, "draw_order": 10.0 if opacity < 1.0 else None}
     if compress:
         png = _png(PIL.Image.fromarray(color_picture(kind, data)))
-        return rr.EncodedImage(contents=png, media_type="image/png")
+        return rr.EncodedImage(contents=png, media_type="image/png", **over)
     if kind == "segmentation":
-        return rr.SegmentationImage(np.where(data < 0, 0, data + 1).astype(np.uint16), opacity=1.0)
-    return rr.Image(color_picture(kind, data))
+        return rr.SegmentationImage(np.where(data < 0, 0, data + 1).astype(np.uint16), **over)
+    return rr.Image(color_picture(kind, data), **over)
 
 
-def encode_events(events: EventArrays, *, width: int, height: int, compress: bool = True) -> Any:
-    """Return events as the picture of `event_picture`, without loss.
+def encode_classes(classes: NDArray[np.uint8], palette: NDArray[np.uint8], *, compress: bool = True) -> Any:
+    """Return class numbers, shape [H, W], in the colours of a palette, without loss.
 
-    What is not compressed needs `event_colors` at its entity.
+    What is not compressed needs `class_colors` at its entity.
     """
-    classes = event_classes(events, width=width, height=height)
     if not compress:
         return import_rerun().SegmentationImage(classes, opacity=1.0)
     picture = PIL.Image.fromarray(classes, mode="L")
-    picture.putpalette(PALETTE.tobytes())
+    picture.putpalette(palette.tobytes())
     return import_rerun().EncodedImage(contents=_png(picture), media_type="image/png")
 
 
-def event_colors() -> Any:
-    """Return names and colours of the classes of events."""
-    names = ["no event"]
-    for polarity in ("darker", "brighter"):
-        names += [f"{polarity}, {count} events" for count in ("1", "2", "3", "4 or more")]
-    return import_rerun().AnnotationContext(
-        [
-            (k, name, (*map(int, color), 255))
-            for k, (name, color) in enumerate(zip(names, PALETTE, strict=True))
-        ]
-    )
+def class_colors(palette: NDArray[np.uint8], shades: Sequence[str]) -> Any:
+    """Return names and colours of the classes of events.
+
+    Args:
+        palette: Colours: of no event, then of the shades of darker pixels, then of brighter ones.
+        shades: Names of the shades.
+    """
+    names = ["no event", *(f"{way}, {shade}" for way in ("darker", "brighter") for shade in shades)]
+    classes = zip(names, palette.tolist(), strict=True)
+    return import_rerun().AnnotationContext([(k, name, (*rgb, 255)) for k, (name, rgb) in enumerate(classes)])
 
 
 def _png(picture: PIL.Image.Image) -> bytes:

@@ -64,9 +64,7 @@ def own_directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield base
         _end_registries(base)
         wait_for(lambda: not _threads() - threads)
-        if shared_mappings():
-            gc.collect()  # of all that the process has imported: a tenth of a second and more
-        wait_for(lambda: not shared_mappings())
+        wait_for(lambda: not shared_mappings() or (gc.collect() and not shared_mappings()), every_s=0.1)
         wait_for(lambda: not _shared_files() - files)
         for domain in base.iterdir():
             wait_for(lambda domain=domain: not _left(domain))

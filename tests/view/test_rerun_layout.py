@@ -69,7 +69,9 @@ def test_the_whole_scene_is_seen_at_first(size, middle):
 def test_nothing_has_an_empty_place():
     """A file has what sensors measure, a stream also commands, timing and status; links if there are any."""
     file = origins(make_blueprint({"drone": rig()}))
-    pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
+    pictures = [
+        f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "dvs", "z")
+    ]  # events: a surface, too
     plots = [
         "plots/drone/dvs/rate",
         "plots/drone/imu/specific_force",
@@ -87,10 +89,25 @@ def test_nothing_has_an_empty_place():
     assert origins(make_blueprint({"drone": ()}, live=True))[-1] == "status"
 
 
+def test_an_overlay_has_a_panel_with_the_picture_below_and_is_not_in_the_scene():
+    image, events = schema_of(PACKET_CLASSES["Image"]), schema_of(PACKET_CLASSES["Events"])
+    panels = [
+        *sensor_panels("drone", "rgb", image, "colour", live=False),
+        *sensor_panels("drone", "ids", image, "segmentation", live=False, below="rgb"),
+        *sensor_panels("drone", "dvs", events, "events", live=False),
+    ]
+    shown = {str(view.name): view for view in views(make_blueprint({"drone": panels}).root_container)}
+    assert shown["ids over rgb"].origin == "world/vehicles/drone/rgb"
+    assert shown["ids over rgb"].contents == ["$origin/image", "$origin/ids/**"]
+    assert shown["surface"].contents == ["$origin/surface"]
+    hidden = {rule for rule in shown["scene"].contents if rule.startswith("- ")}
+    assert hidden == {"- /world/vehicles/drone/rgb/ids/**", "- /world/vehicles/drone/dvs/**"}
+
+
 def test_several_vehicles_have_tabs():
     blueprint = make_blueprint({name: rig(name, live=True) for name in ("alpha", "beta")}, live=True)
     found = origins(blueprint)
-    assert len([o for o in found if o.startswith("world/vehicles/beta/")]) == 3
+    assert len([o for o in found if o.startswith("world/vehicles/beta/")]) == 4
     assert len([o for o in found if o.startswith("plots/alpha/")]) == 6
     left, right = blueprint.root_container.contents
     for tabs, names in (

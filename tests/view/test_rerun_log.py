@@ -23,10 +23,10 @@ from neurosim_core.record import Intrinsics, SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, MotionConfig, make_bodies
 from neurosim_core.scene.body_shapes import CheckerSurface, SphereShape
 from neurosim_core.scene.scene import Material, Texture
-from neurosim_core.view.pictures import event_picture
+from neurosim_core.view.pictures import PALETTE, event_classes, event_picture
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import open_rerun
-from neurosim_core.view.rerun_shapes import encode_events, encode_picture, event_colors, scene_shapes
+from neurosim_core.view.rerun_shapes import class_colors, encode_classes, encode_picture, scene_shapes
 
 MS = 1_000_000
 LENS = Intrinsics(width=32, height=24, fx=30.0, fy=31.0, cx=16.0, cy=12.0)
@@ -138,6 +138,32 @@ def test_events_become_one_picture_per_window(tmp_path):
             assert (np.asarray(found.convert("RGB")) == event_picture(joined, width=32, height=24)).all()
 
 
+def test_labels_and_flow_lie_over_a_colour_camera_with_the_same_view(tmp_path):
+    """Each is logged once: below that camera, half transparent; other lenses stay cameras of their own."""
+    wide = dataclasses.replace(LENS, fx=20.0)
+    kinds = {"ids": "instance", "flow": "optical_flow", "z": "depth"}
+    sensors = [describe("rgb", "rgb", lens=LENS), *(describe(n, k, lens=LENS) for n, k in kinds.items())]
+    sensors.append(describe("wide", "instance", lens=wide))
+    labels = np.ones((24, 32), dtype=np.int32)
+    flow = np.ones((24, 32, 2), dtype=np.float32)
+    packets = [make_image(0)]
+    packets += [Image(sensor=name, data=labels, encoding="32SC1") for name in ("ids", "wide")]
+    packets.append(Image(sensor="flow", data=flow, encoding="32FC2"))
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": tuple(sensors)}) as logger:
+        for packet in packets:
+            logger.log(packet)
+    rows = read(tmp_path / "f.rrd")
+    at = "/world/vehicles/drone"
+    pictures = {entity.removeprefix(f"{at}/"): found for entity, found in rows.items() if "image" in entity}
+    assert sorted(pictures) == ["rgb/flow/image", "rgb/ids/image", "rgb/image", "wide/image"]
+    opacity = {name: found[0][1].get("opacity") for name, found in pictures.items()}
+    assert opacity["rgb/ids/image"] == opacity["rgb/flow/image"] == [0.5]
+    assert opacity["wide/image"] == [1.0]
+    assert f"{at}/rgb/flow/arrows" in rows
+    cameras = [e for e, found in rows.items() if any("image_from_camera" in values for _, values in found)]
+    assert sorted(cameras) == [f"{at}/rgb", f"{at}/wide", f"{at}/z"]
+
+
 def test_cameras_are_described(tmp_path):
     rows = record(tmp_path / "f.rrd", [])
     for name in ("dvs", "rgb", "z"):
@@ -213,8 +239,10 @@ def test_pictures_for_a_viewer_are_not_compressed():
     assert np.frombuffer(found, np.uint16).tolist() == [500, 0, 1000, 65535]
 
     events = make_events(0).numpy()
-    classes = encode_events(events, width=32, height=24, compress=False).buffer.as_arrow_array()[0].as_py()
-    infos = [item["class_description"]["info"] for item in event_colors().context.as_arrow_array()[0].as_py()]
+    drawn = encode_classes(event_classes(events, width=32, height=24), PALETTE, compress=False)
+    classes = drawn.buffer.as_arrow_array()[0].as_py()
+    context = class_colors(PALETTE, ("1", "2", "3", "4 or more events")).context
+    infos = [item["class_description"]["info"] for item in context.as_arrow_array()[0].as_py()]
     palette = {info["id"]: tuple(info["color"].to_bytes(4, "big")[:3]) for info in infos}
     picture = np.array([palette[k] for k in classes], dtype=np.uint8).reshape(24, 32, 3)
     assert (picture == event_picture(events, width=32, height=24)).all()
@@ -397,7 +425,7 @@ def test_wrong_input_is_refused(tmp_path):
 
 def test_missing_rerun_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for call in (open_rerun, lambda: encode_events(make_events(0).numpy(), width=32, height=24)):
+    for call in (open_rerun, lambda: class_colors(PALETTE, "1234")):
         with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
             call()
 

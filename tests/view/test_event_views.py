@@ -1,11 +1,11 @@
-"""Events in x, y and time."""
+"""Events in x, y and time, and as a surface."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from neurosim_core.packets import EventArrays
-from neurosim_core.view.event_cloud import EventCloud
+from neurosim_core.view.event_views import SURFACE_PALETTE, EventCloud, EventSurface
 
 
 def events(t: np.ndarray) -> EventArrays:
@@ -30,3 +30,18 @@ def test_the_number_of_points_is_bounded():
         points, _ = cloud.add(events(np.linspace(k * 20_000, (k + 1) * 20_000, 9_999)), (k + 1) * 20_000_000)
     assert 3_000 < len(points) <= 4_000
     assert points[:, 1].min() >= -64.0
+
+
+def test_the_last_event_of_a_pixel_fades():
+    """An age of tau leaves 1 / e of the brightness, in steps of an eighth; a later event makes it new."""
+    surface = EventSurface(width=64, height=8, tau_ns=50_000_000)
+    drawn = surface.add(events(np.array([10_000, 60_000])), 60_000_000)
+    old, new = SURFACE_PALETTE[drawn[7, :2]].astype(int)
+    assert old.argmax() == 2  # darker: blue
+    assert new.argmax() == 0  # brighter: orange
+    assert abs(old.max() / 255 - np.exp(-1.0)) <= 1 / 16
+    assert new.max() == 255
+    assert np.count_nonzero(drawn) == 2
+    again = surface.add(events(np.array([110_000])), 110_000_000)
+    assert (again[7, 0], again[7, 1]) == (drawn[7, 0] + 5, drawn[7, 1] - 5)  # 3 of 8, and 8
+    assert not surface.add(events(np.zeros(0)), 5_000_000).any()  # time has begun again
