@@ -16,11 +16,11 @@ SUBJECTS = [
     "items",
     "native",
     "pack",
-    "ring",
+    "ring_reader",
     "socket",
     "unpack",
 ]
-HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy", "ring")
+HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy")
 
 setup(
     ext_modules=[

@@ -8,7 +8,7 @@
    The layout is that of WIRE.md, section 5.1; all numbers are little-endian, as is every machine we build for. */
 
 #include "_coder.h"
-#include "_ring.h"
+#include "_broadcast.h"
 
 #include <string.h>
 #include <structmember.h>
@@ -112,18 +112,15 @@ PyDoc_STRVAR(read_doc,
 /* The message in the slot that a descriptor names; NULL without error if it is not as usual. */
 static PyObject *read_slot(const Coder *coder, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
     const char *bytes = PyBytes_AS_STRING(frame), *body;
-    if (PyBytes_GET_SIZE(frame) != SLOT_FRAME_SIZE || memcmp(bytes, coder->head, 3)
+    if (PyBytes_GET_SIZE(frame) != HEADER_SIZE || memcmp(bytes, coder->head, 3)
         || memcmp(bytes + 4, coder->head + 4, HEAD_SIZE - 4))
         return NULL;
     Py_ssize_t size;
-    PyObject *lease = take_lease(coder->slots, bytes, &body, &size);
-    if (lease == NULL) return NULL;
-    PyObject *message = read_body(coder, lease, body, size);
-    if (message == NULL) {
-        cancel_lease(lease);
-        return NULL;
-    }
-    Py_DECREF(lease);
+    PyObject *owner = reader_body(coder->slots, &body, &size);
+    if (owner == NULL) return NULL;
+    PyObject *message = read_body(coder, owner, body, size);
+    if (message == NULL) return NULL;
+    reader_body_taken(coder->slots);
     memcpy(sequence, bytes + HEAD_SIZE, 8);
     memcpy(publish_ns, bytes + HEAD_SIZE + 16, 8);
     return message;
@@ -440,7 +437,7 @@ static PyMethodDef coder_methods[] = {
 };
 
 static PyMemberDef coder_members[] = {
-    {"slots", T_OBJECT, offsetof(Coder, slots), 0, "A `SlotView`: descriptors of its ring are read as messages; None: none are."},
+    {"slots", T_OBJECT, offsetof(Coder, slots), 0, "A `RingReader`, which has the bodies that are in slots; None: they are not read."},
     {NULL, 0, 0, 0, NULL},
 };
 

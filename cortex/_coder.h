@@ -13,7 +13,7 @@ typedef struct {
     Py_ssize_t stamp; /* field that is the stamp, -1: none */
     int has_head;
     char head[HEAD_SIZE];
-    PyObject *slots; /* a SlotView whose messages are read here, too; NULL or None: none */
+    PyObject *slots; /* a RingReader, which has the bodies that are in slots; NULL or None: they are not read here */
 } Coder;
 
 extern PyTypeObject CoderType;

@@ -1,9 +1,7 @@
-/* The way of a message out; see `gate.py`. A large one is written into a slot of shared memory, whose account
-   `_ring.c` keeps. */
+/* The way of a message out; see `gate.py`. A large one is written into a slot of the ring, see `_broadcast.c`. */
 
 #include "_broadcast.h"
 #include "_coder.h"
-#include "_ring.h"
 #include "cpp/include/cortex/broadcast.h"
 
 #include <structmember.h>
@@ -22,8 +20,7 @@ typedef struct {
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
-    /* Where larger bodies go; NULL or None: the long way. */
-    PyObject *ledger;
+    PyObject *ring; /* a Broadcast, into whose slots larger bodies go; NULL or None: the long way */
     PyObject *prepare, *large_acquire, *large_release, *finish;
     /* A batch that is being collected: its first record is put in by Python, which starts the clock. */
     PyObject *records; /* a list; NULL or None: messages are not collected */
@@ -133,47 +130,43 @@ static int gate_copy(Gate *gate, const Pack *pack) {
 }
 
 /* Write a message into a slot, without the lock while much is copied; 0 if it is not as usual, or with an error set. */
-static int gate_write(
-    Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t slot, Py_ssize_t size, int unlocked, int64_t *stamp_ns) {
+static int gate_write(Gate *gate, PyObject *message, char *memory, Py_ssize_t size, int unlocked, int64_t *stamp_ns) {
     Pack pack;
-    if (!write_body(gate->coder, message, &pack, ledger_memory(ledger, slot), size, 1)) return 0;
+    if (!write_body(gate->coder, message, &pack, memory, size, 1)) return 0;
     *stamp_ns = pack.stamp_ns;
-    int written = 1;
-    ledger_use(ledger, 1);
-    if (unlocked) written = gate_copy(gate, &pack);
-    else copy_deferred(&pack);
-    ledger_use(ledger, -1);
-    return written;
+    if (unlocked) return gate_copy(gate, &pack);
+    copy_deferred(&pack);
+    return 1;
 }
 
-/* Lease a written slot to all and send its descriptor; NULL as for `gate_send`, and the slot is given up. */
-static PyObject *gate_commit(
-    Gate *gate, Ledger *ledger, Py_ssize_t slot, Py_ssize_t size, int64_t stamp_ns, int64_t now_ns) {
-    PyObject *frame = ledger_commit(ledger, slot, gate->sequence, stamp_ns, now_ns, size);
-    if (frame == NULL) {
-        ledger_abandon(ledger, slot);
-        return NULL;
-    }
+/* Send the header of a written slot; NULL without error if somebody has no room for it. */
+static PyObject *gate_commit(Gate *gate, PyObject *slot, Py_ssize_t size, int64_t stamp_ns, int64_t now_ns) {
+    char frame[HEADER_SIZE];
+    const int number = slot_number(slot);
+    const uint64_t rest[5] = {gate->sequence, (uint64_t)stamp_ns, (uint64_t)now_ns, (uint64_t)size, (uint64_t)number};
+    memcpy(frame, gate->coder->head, HEAD_SIZE);
+    frame[3] = 'S';
+    memcpy(frame + HEAD_SIZE, rest, sizeof rest);
+    if (broadcast_commit(slot, frame, 1) != CORTEX_WRITTEN) return NULL;
     gate->sequence += 1;
     gate->bytes += size;
-    PyObject *sent = gate_send_frame(gate, frame);
-    Py_DECREF(frame);
-    return sent;
+    Py_RETURN_TRUE;
 }
 
 /* Send a message through a slot, if there is a free one; what has changed while others had the lock is left to `finish`. */
-static PyObject *gate_use_slot(
-    Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t size, int unlocked, int64_t now_ns) {
-    const Py_ssize_t slot = ledger_acquire(ledger, size);
-    if (slot < 0) return NULL;
+static PyObject *gate_use_slot(Gate *gate, PyObject *ring, PyObject *message, Py_ssize_t size, int unlocked, int64_t now_ns) {
+    Py_ssize_t room;
     int64_t stamp_ns;
-    if (!gate_write(gate, ledger, message, slot, size, unlocked, &stamp_ns)) {
-        ledger_abandon(ledger, slot);
-        return NULL;
+    PyObject *slot = broadcast_acquire(ring, size), *sent = NULL;
+    if (slot == NULL) return NULL;
+    if (gate_write(gate, message, slot_memory(slot, ring, &room), size, unlocked, &stamp_ns)) {
+        if (ring == gate->ring && gate->refresh_ns != 0 && slot_memory(slot, ring, &room) != NULL)
+            sent = gate_commit(gate, slot, size, stamp_ns, now_ns);
+        if (sent == NULL)
+            sent = PyObject_CallFunction(gate->finish, "OnLL", slot, size, (long long)stamp_ns, (long long)now_ns);
     }
-    if ((PyObject *)ledger == gate->ledger && gate->refresh_ns != 0 && ledger_has_room(ledger))
-        return gate_commit(gate, ledger, slot, size, stamp_ns, now_ns);
-    return PyObject_CallFunction(gate->finish, "nnLL", slot, size, (long long)stamp_ns, (long long)now_ns);
+    Py_DECREF(slot);
+    return sent;
 }
 
 /* Take the lock of large messages if it is free; 0 if not, perhaps with an error set. */
@@ -197,16 +190,14 @@ static void gate_unlock_large(Gate *gate) {
 
    While much is copied others may have the lock: then that of large messages keeps other large ones away. */
 static PyObject *gate_send_slot(Gate *gate, PyObject *message, Py_ssize_t size, int64_t now_ns) {
-    Ledger *ledger = gate->ledger == NULL ? NULL : ledger_of(gate->ledger);
-    if (ledger == NULL || gate->records != NULL || !ledger_has_room(ledger)) return NULL;
+    if (gate->ring == NULL || gate->ring == Py_None || gate->records != NULL) return NULL;
     const int unlocked = size >= UNLOCKED_BYTES;
-    Py_INCREF(ledger);
-    PyObject *sent = NULL;
+    PyObject *ring = Py_NewRef(gate->ring), *sent = NULL;
     if (!unlocked || gate_lock_large(gate)) {
-        sent = gate_use_slot(gate, ledger, message, size, unlocked, now_ns);
+        sent = gate_use_slot(gate, ring, message, size, unlocked, now_ns);
         if (unlocked) gate_unlock_large(gate);
     }
-    Py_DECREF(ledger);
+    Py_DECREF(ring);
     return sent;
 }
 
@@ -257,36 +248,24 @@ static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t fl
     return result != NULL ? result : PyObject_CallOneArg(gate->slowly, arguments[0]);
 }
 
-/* Send a message whose large arrays lie in a slot already; NULL without error if it has to go the long way. */
-static PyObject *gate_send_lent(Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t slot) {
-    const int64_t now_ns = monotonic_ns();
-    if (now_ns >= gate->refresh_ns || (PyObject *)ledger != gate->ledger || gate->records != NULL) return NULL;
-    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
-    if (!ledger_is_writing(ledger, slot) || !ledger_has_room(ledger)) return NULL;
-    char *memory = ledger_memory(ledger, slot);
-    const Py_ssize_t size = measure_in_place(gate->coder, message, memory, ledger_slot_bytes(ledger));
-    if (size <= gate->limit) return NULL;
-    Pack pack;
-    if (!write_body(gate->coder, message, &pack, memory, size, 0)) return NULL;
-    return gate_commit(gate, ledger, slot, size, pack.stamp_ns, now_ns);
-}
-
 PyDoc_STRVAR(gate_send_slot_doc,
-"send_slot($self, message, ledger, slot, /)\n--\n\n"
+"send_slot($self, message, slot, /)\n--\n\n"
 "Send a message whose arrays lie where they belong in a slot that is being written, with the lock held.\n\n"
 "Returns:\n"
 "    As a call; None if it has to go the long way: then the arrays are as they were, and the slot is not given up.\n");
 
 static PyObject *gate_send_slot_method(Gate *gate, PyObject *const *arguments, Py_ssize_t count) {
-    if (count != 3) {
-        PyErr_Format(PyExc_TypeError, "send_slot() takes 3 arguments, got %zd", count);
-        return NULL;
-    }
-    Ledger *ledger = ledger_of(arguments[1]);
-    const Py_ssize_t slot = PyLong_AsSsize_t(arguments[2]);
-    if (slot == -1 && PyErr_Occurred()) return NULL;
-    PyObject *sent = ledger == NULL ? NULL : gate_send_lent(gate, ledger, arguments[0], slot);
-    return sent != NULL || PyErr_Occurred() ? sent : Py_NewRef(Py_None);
+    if (!arguments_are(count, 2)) return NULL;
+    PyObject *message = arguments[0], *slot = arguments[1];
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns || gate->ring == NULL || gate->ring == Py_None || gate->records != NULL) Py_RETURN_NONE;
+    Py_ssize_t room;
+    char *memory = slot_memory(slot, gate->ring, &room);
+    const Py_ssize_t size = memory == NULL ? -1 : measure_in_place(gate->coder, message, memory, room);
+    Pack pack;
+    if (size <= gate->limit || !write_body(gate->coder, message, &pack, memory, size, 0)) return none_or_error(NULL);
+    PyObject *sent = gate_commit(gate, slot, size, pack.stamp_ns, now_ns);
+    return sent != NULL ? sent : none_or_error(NULL);
 }
 
 static PyMethodDef gate_methods[] = {
@@ -323,7 +302,7 @@ static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
     Py_VISIT(gate->retry);
     Py_VISIT(gate->again);
     Py_VISIT(gate->sends);
-    Py_VISIT(gate->ledger);
+    Py_VISIT(gate->ring);
     Py_VISIT(gate->prepare);
     Py_VISIT(gate->large_acquire);
     Py_VISIT(gate->large_release);
@@ -341,7 +320,7 @@ static int gate_clear(Gate *gate) {
     Py_CLEAR(gate->retry);
     Py_CLEAR(gate->again);
     Py_CLEAR(gate->sends);
-    Py_CLEAR(gate->ledger);
+    Py_CLEAR(gate->ring);
     Py_CLEAR(gate->prepare);
     Py_CLEAR(gate->large_acquire);
     Py_CLEAR(gate->large_release);
@@ -359,11 +338,11 @@ static void gate_dealloc(Gate *gate) {
 
 static PyMemberDef gate_members[] = {
     {"sends", T_OBJECT, offsetof(Gate, sends), 0, "Take a frame and flags; none: every message goes the long way."},
-    {"ledger", T_OBJECT, offsetof(Gate, ledger), 0, "A `Ledger`: where larger bodies go; None: the long way."},
+    {"ring", T_OBJECT, offsetof(Gate, ring), 0, "A `Broadcast`, into whose slots larger bodies go; None: the long way."},
     {"prepare", T_OBJECT, offsetof(Gate, prepare), 0, "Called with the lock held and the time when `refresh_ns` is over."},
     {"large_acquire", T_OBJECT, offsetof(Gate, large_acquire), 0, "Called with False, takes the lock of large messages."},
     {"large_release", T_OBJECT, offsetof(Gate, large_release), 0, "Gives it back."},
-    {"finish", T_OBJECT, offsetof(Gate, finish), 0, "Sends a written slot: number, size, stamp_ns, publish_ns."},
+    {"finish", T_OBJECT, offsetof(Gate, finish), 0, "Sends a written slot: slot, size, stamp_ns, publish_ns."},
     {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
     {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
     {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},

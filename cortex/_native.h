@@ -14,7 +14,6 @@ enum {
     HEADER_SIZE = 64,
     HEAD_SIZE = 24,   /* of a header: what all frames of a publisher begin with */
     RECORD_SIZE = 24, /* what precedes each body of a batch */
-    SLOT_FRAME_SIZE = HEADER_SIZE + 8 + 32,
 };
 
 /* Each adds its names to the module; 0, or -1 with an error set. */
@@ -24,6 +23,7 @@ int add_coder(PyObject *module);
 int add_construct(PyObject *module);
 int add_gate(PyObject *module);
 int add_inlet(PyObject *module);
+int add_ring_reader(PyObject *module);
 int add_socket(PyObject *module);
 
 /* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */

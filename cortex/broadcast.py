@@ -1,7 +1,8 @@
-"""The ring of one publisher, which carries its frames to all readers of this host; see WIRE.md, section 3.3.
+"""The ring of one publisher, which carries its frames to all readers of this host; see WIRE.md, 3.3 and 6.
 
 A reader asks for it at its publisher's node before it attaches; a publisher that takes it in sends everything
-but the answer through the ring. Who does not ask, and everybody where there is no C, goes on with ZeroMQ.
+but the answer through the ring. Large bodies are written into slots behind the frames; readers lease them.
+Who does not ask, and everybody where there is no C, goes on with ZeroMQ.
 """
 
 from __future__ import annotations
@@ -11,18 +12,56 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zmq
 
 from cortex.compiled import native
-from cortex.large import Reader
+from cortex.outlet import Outlet
+from cortex.patience import Patience
+from cortex.wire import AttachKey
 
 logger = logging.getLogger(__name__)
 
 WAITING_MAX = 256
 """Readers that have asked and not attached; older ones are forgotten."""
+
+PAGE = 4096
+SLOTS_BYTES = 4 << 20
+"""Small slots take this much in all, so that they stay in cache."""
+GROWTH_BYTES = 4 << 20
+"""What slots that replace ones for smaller messages have to spare, at most: to make them takes a millisecond
+or more, and who publishes waits for it."""
+DEEP_BYTES = 16 << 20
+DEEP_SLOTS = 128
+"""What slots take, and how many there are, where a reader keeps more messages than by default."""
+DEEP_QUOTA = 67
+"""A reader that may hold so many messages keeps more than by default, see `keep_last`."""
+SLOTS_BYTES_MAX = 2 << 30
+MOVE_S = 0.1
+"""How long readers have at least to come to their sockets, where there is no memory for slots."""
+RETRY_S = 5.0
+"""After slots could not be made, it is not tried again for so long."""
+
+
+@dataclass(eq=False)
+class Reader:
+    """One subscriber's link to this publisher."""
+
+    key: bytes
+    request: AttachKey
+    outlet: Outlet
+    member: int | None = None
+    """Its number in the publisher's ring, through which its frames go; None: through the outlet."""
+    confirmed: int = 0
+    """It has accounted for all messages below this."""
+
+    @property
+    def timeout_s(self) -> float:
+        """How long this reader may hold up the publisher [s]."""
+        return self.request.timeout_ms / 1000.0 if self.request.strict else 0.0
 
 
 class Hello(NamedTuple):
@@ -94,22 +133,34 @@ class Broadcast:
 
     Args:
         source: The publisher's number.
-        await_room: Calls a function until it returns true, for so many seconds at most, and says whether it
-            did; the lock is let go meanwhile.
-        is_over: Says whether nobody is waited for any more.
+        patience: Waits for readers; the lock is let go meanwhile.
+        await_room: As `patience.wait_for`; says so when a reader was too late.
+        reroute: Called when frames go another way to readers of the ring.
+        note: Says that something goes wrong.
+        expected_bytes: Make slots for messages of this size before the first reader is answered; 0: do not.
     """
 
     def __init__(
         self,
         source: int,
+        patience: Patience,
         await_room: Callable[[Callable[[], bool], float], bool],
-        is_over: Callable[[], bool],
+        reroute: Callable[[], None],
+        note: Callable[[str], None],
+        expected_bytes: int = 0,
     ) -> None:
         self._source = source
+        self._patience = patience
         self._await_room = await_room
-        self._is_over = is_over
+        self._reroute = reroute
+        self._note = note
+        self._expected_bytes = expected_bytes
+        self._unavailable_until_s = 0.0
+        self._is_dissolved = False
         self._ring: Any = None
         self._readers: dict[int, Reader] = {}
+        self._moving: set[Reader] = set()
+        """Those that were sent another way, and have not come there yet."""
         self.sends: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
         """Takes a frame and flags, or raises `zmq.Again`; with what to call then, see `send`."""
 
@@ -120,18 +171,24 @@ class Broadcast:
         if hello is None:
             return
         try:
-            if self._ring is None:
+            if self._ring is None and not self._is_dissolved:
                 self._ring = native.Broadcast(self._source, zmq.Again)
-        except OSError:  # no memory
+        except OSError as error:
+            self._is_dissolved = True
+            self._note(f"no shared memory for a ring: {error}")
+        if self._is_dissolved:
             hello.close()
             return
         with contextlib.suppress(OSError):  # it has left
             reader.member = self._ring.add(*hello, reader.request.strict, sequence)
             self._readers[reader.member] = reader
             self.sends = {self._ring.send: self.send}
+            if self._expected_bytes:
+                self._provide(self._expected_bytes, exact=True)
 
     def dismiss(self, reader: Reader) -> None:
         """A reader has left."""
+        self._moving.discard(reader)
         if reader.member is None or self._ring is None:
             return
         self._ring.remove(reader.member)
@@ -140,33 +197,131 @@ class Broadcast:
         if not self._readers:
             self.sends = {}
 
+    @property
+    def short_cut(self) -> Any:
+        """The ring in C, if it has readers and slots enough for them; see `gate.py`."""
+        if not self._readers or self._ring.slots < 2 * len(self._readers) + 2:
+            return None
+        return self._ring
+
+    @property
+    def has_readers(self) -> bool:
+        """Whether somebody reads it."""
+        return bool(self._readers)
+
+    def has_slots(self, size: int) -> bool:
+        """Whether there are slots for bodies of a size, free or not."""
+        return self.has_readers and self._ring.slot_bytes >= size
+
     def send(self, frame: bytes) -> bool:
         """Send a frame to all, waiting for reliable readers; False if one of them lost it."""
+        return not self._readers or self._send(lambda: self._ring.send(frame), len(frame))
+
+    def commit(self, slot: Any, header: bytes) -> bool:
+        """Send the header of what was written into a slot, as `send`."""
+        return self._send(lambda: self._ring.commit(slot, header), len(header))
+
+    def acquire(self, size: int, *, exact: bool, may_wait: bool = False) -> Any:
+        """Return a slot in which a body may be written; dropping it gives it back.
+
+        Args:
+            size: Bytes that will be written at most.
+            exact: Whether all messages have this size, so that nothing is kept for growth.
+            may_wait: Wait for reliable readers that have still to read what is in the slots.
+
+        Returns:
+            None if there is none.
+        """
+        if not self._readers:
+            return None
+        if not self._provide(size, exact=exact):
+            self._dissolve()
+            return None
+        slot: Any = None
+
+        def acquire() -> bool:
+            nonlocal slot
+            slot = self._ring.acquire(size)
+            return slot is not None
+
+        if not acquire() and may_wait:
+            self._wait(acquire, self._ring.behind)
+        return slot
+
+    def _provide(self, size: int, *, exact: bool) -> bool:
+        """Make slots for bodies of a size, if need be; whether there are any."""
+        ring, deep = self._ring, any(r.request.quota >= DEEP_QUOTA for r in self._readers.values())
+
+        def wanted(slot_bytes: int) -> int:
+            least = 2 * len(self._readers) + 2
+            return max(least, min(DEEP_SLOTS, DEEP_BYTES // slot_bytes)) if deep else least
+
+        fits = ring.slot_bytes >= size
+        if fits and ring.slots >= wanted(ring.slot_bytes):
+            return True
+        slot_bytes = size if exact else size + size // 4
+        if ring.slots and not exact and not fits:  # messages grow: the next slots are to last
+            slot_bytes = max(slot_bytes, size + min(size, GROWTH_BYTES))
+        slot_bytes = -(-max(slot_bytes, ring.slot_bytes) // PAGE) * PAGE
+        slots = max(min(max(SLOTS_BYTES // slot_bytes, 4), 64), wanted(slot_bytes))
+        slots = max(4, min(slots, SLOTS_BYTES_MAX // slot_bytes))
+        if (fits and ring.slots >= slots) or time.monotonic() < self._unavailable_until_s:
+            return bool(fits)
+        try:
+            ring.provide(slots, slot_bytes)
+        except OSError as error:
+            self._unavailable_until_s = time.monotonic() + RETRY_S
+            if not fits:
+                self._note(f"no shared memory for slots of {slot_bytes} bytes: {error}")
+            return bool(fits)
+        return True
+
+    def _dissolve(self) -> None:
+        """Send all readers to their sockets, for good, and wait a little until they are there."""
+        self._moving = set(self._readers.values())
+        self._is_dissolved = True
+        self._ring.dissolve()
+        self._forget()
+        self._reroute()
+        timeout_s = max(MOVE_S, *(reader.timeout_s for reader in self._moving))
+        self._patience.wait_for(lambda: not self._moving, timeout_s)
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether a reliable reader has still to come to its socket: it misses what is sent meanwhile."""
+        return any(reader.request.strict for reader in self._moving)
+
+    def _send(self, send: Callable[[], bool], size: int) -> bool:
+        """Call what sends a frame of so many bytes, until reliable readers have room or had their time."""
         on_time = True
 
-        def send() -> bool:
+        def attempt() -> bool:
             nonlocal on_time
             try:
-                on_time = not self._readers or self._ring.send(frame)
+                on_time = send()
             except zmq.Again:
                 return False
             return True
 
-        begin_s = time.monotonic()
-        while not send():
-            slow = self._slow(frame)
-            timeout_s = min((reader.timeout_s for reader in slow), default=0.0)
-            if self._await_room(send, timeout_s - (time.monotonic() - begin_s)):
-                break
-            waited_s, is_over = time.monotonic() - begin_s, self._is_over()
-            for reader in self._slow(frame):
-                if is_over or reader.timeout_s <= waited_s:
-                    self._ring.give_up(reader.member)
+        if not attempt():
+            self._wait(attempt, lambda: self._ring.in_the_way(size))
         return on_time
 
-    def _slow(self, frame: bytes) -> list[Reader]:
-        """The reliable readers that have no room for a frame."""
-        return [self._readers[member] for member in self._ring.in_the_way(len(frame))]
+    def _wait(self, attempt: Callable[[], bool], in_the_way: Callable[[], list[int]]) -> None:
+        """Attempt something until it works, or nobody is in its way; give up readers whose time is over."""
+        begin_s = time.monotonic()
+        while not attempt():
+            slow = [self._readers[member] for member in in_the_way()]
+            if not slow:
+                attempt()
+                return
+            timeout_s = min(reader.timeout_s for reader in slow)
+            if self._await_room(attempt, timeout_s - (time.monotonic() - begin_s)):
+                return
+            waited_s, is_over = time.monotonic() - begin_s, self._patience.is_over()
+            for member in in_the_way():
+                if is_over or self._readers[member].timeout_s <= waited_s:
+                    self._ring.give_up(member)
 
     def offer(self, frame: bytes) -> None:
         """Send a frame if all have room."""
@@ -181,9 +336,13 @@ class Broadcast:
 
     def close(self) -> None:
         """Send no more."""
+        if self._ring is not None:
+            self._ring.close()
+        self._forget()
+
+    def _forget(self) -> None:
         for reader in self._readers.values():
             reader.member = None
         self._readers.clear()
         self.sends = {}
-        if self._ring is not None:
-            self._ring.close()
+        self._ring = None

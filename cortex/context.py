@@ -39,7 +39,7 @@ class Closed(RuntimeError):
 
 
 def context() -> zmq.Context[zmq.Socket[bytes]]:
-    """The one context of this process: peers in one process meet over inproc. A forked child gets its own."""
+    """The one context of this process. A forked child gets its own."""
     global _context, _owner
     with _lock:
         if _context is None or _owner != os.getpid():
@@ -51,7 +51,7 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
 def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> zmq.Socket[bytes]:
     """A socket that never blocks its owner at close, bounds what comes, and over tcp notices a peer's death.
 
-    There are no heartbeats on ipc and inproc: the kernel reports a dead peer at once, and a stopped one may
+    There are no heartbeats on ipc: the kernel reports a dead peer at once, and a stopped one may
     still hold leases of shared memory.
     """
     socket = context().socket(kind)

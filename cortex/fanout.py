@@ -8,12 +8,22 @@ from typing import Any
 
 import zmq
 
-from cortex.broadcast import Broadcast
+from cortex.broadcast import Broadcast, Reader
 from cortex.gate import Gate
-from cortex.large import LargeSender, Reader
-from cortex.outlet import DONTWAIT, Outlet, Outlets
+from cortex.large import LargeSender
+from cortex.outlet import DONTWAIT, SNDMORE, Outlet, Outlets
 from cortex.patience import Patience
-from cortex.wire import REST, AttachKey
+from cortex.wire import (
+    BATCH,
+    LARGE,
+    MESSAGE,
+    REST,
+    SLOT,
+    AttachAnswer,
+    AttachKey,
+    answer_frame,
+    message_head,
+)
 
 READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
@@ -29,41 +39,55 @@ class Fanout:
     Args:
         topic: For what is logged.
         source: The publisher's number.
-        batch_head: What a batch begins with: one of nothing tells how many messages there have been.
+        fingerprint: Of its type.
+        stamped: Whether that has a stamp.
         gate: Sends where this says, if nothing special is to be done.
-        large: Sends large messages, and knows who reads them.
         outlets: Tell who has come and gone.
         patience: Waits for reliable readers.
+        latching: Whether who comes gets the last message.
         plain: Whether the gate may send messages.
         max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
         next_sequence: Says with which sequence a reader that comes now begins.
+        expected_bytes: See `Broadcast`.
     """
 
     def __init__(
         self,
         topic: str,
         source: int,
-        batch_head: bytes,
+        fingerprint: int,
         *,
+        stamped: bool,
         gate: Gate,
-        large: LargeSender,
         outlets: Outlets,
         patience: Patience,
+        latching: bool,
         plain: bool,
         max_wait_s: float,
         next_sequence: Callable[[], int],
+        expected_bytes: int,
     ) -> None:
         self._topic = topic
-        self._batch_head = batch_head
+        self._message_head, self._batch_head, self._slot_head, self._large_head = (
+            message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, BATCH, SLOT, LARGE)
+        )
         self._gate = gate
-        self._large = large
+        self._large = LargeSender()
         self._outlets = outlets
         self._patience = patience
+        self.latching = latching
         self._plain = plain
         self._max_wait_ms = round(max_wait_s * 1000.0)
         self._next_sequence = next_sequence
         self.readers: dict[bytes, Reader] = {}
-        self.ring = Broadcast(source, self._await_room, patience.is_over)
+        self.ring = Broadcast(
+            source,
+            patience,
+            self._await_room,
+            self.route,
+            lambda text: outlets.note(f"{topic}: {text}"),
+            expected_bytes,
+        )
         self.late: dict[Outlet, int] = {}
         """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
 
@@ -72,6 +96,8 @@ class Fanout:
         """The frame that a reader gets when it comes, if any."""
         self.timeouts = 0
         """Messages that some reliable reader lost."""
+        self.skipped = 0
+        """Messages that some reader did not get, because too much waited to be sent to it."""
         self.closed = False
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
@@ -96,11 +122,11 @@ class Fanout:
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
         sequence = self._next_sequence()
-        reader = self._large.admit(key, request, outlet, lambda reader: self.ring.admit(reader, sequence))
-        self.readers[key] = reader
-        self._large.reserve(reader, sequence)
+        reader = self.readers[key] = Reader(key, request, outlet)
+        if request.shared_memory and outlet.local:
+            self.ring.admit(reader, sequence)
         self.route()
-        answer = self._large.answer(reader, sequence, self.latched)
+        answer = answer_frame(key, AttachAnswer(sequence, self.latched))
         if outlet.strict:
             if not outlet.try_send(answer):
                 outlet.send_anyway(answer)
@@ -112,7 +138,6 @@ class Fanout:
         for key, reader in self.readers.items():
             if reader.request.reader == request.reader and reader.outlet is outlet:
                 del self.readers[key]
-                self._large.dismiss(reader)
                 self.ring.dismiss(reader)
                 self.late.pop(outlet, None)
                 self.route()
@@ -134,18 +159,20 @@ class Fanout:
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
         self._lossy_sends = tuple(sends)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        usual = self._plain and not self.late
+        usual = self._plain and not self.late and not self.ring.has_lost
         retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
         self._retries = retries | self.ring.sends
         self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
-        self.arm()
+        self._gate.ring = self.ring.short_cut if usual and not outlets else None
 
-    def arm(self) -> None:
-        """Let the gate send large messages, or not: when readers, the ring, or who is late has changed."""
-        self._gate.ledger = self._large.short_cut if self._plain and not self.late else None
+    @property
+    def has_sockets(self) -> bool:
+        """Whether somebody reads through a socket."""
+        return bool(self._lossy_sends or self._strict_outlets)
 
     def tick(self, now_ns: int) -> None:
-        """End a burst; called now and then."""
+        """Let go of what was sent, and end a burst; called now and then."""
+        self._large.prune()
         if self._patience.is_waiting:
             return
         sequence, silent_ns = self._gate.sequence, now_ns - self._gate.refresh_ns
@@ -162,7 +189,7 @@ class Fanout:
         """Send a frame to all, waiting for reliable readers; False if one of them lost it."""
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        on_time = not self.late
+        on_time = not (self.late or self.ring.has_lost)
         for outlet in self._strict_outlets:
             try:
                 outlet.send(frame, DONTWAIT)
@@ -172,6 +199,57 @@ class Fanout:
         if not on_time:
             self.timeouts += 1
         return on_time
+
+    def send_large(
+        self, body: memoryview, slot: Any, sequence: int, stamp_ns: int, publish_ns: int, size: int
+    ) -> bool:
+        """Send a large message as `send` does.
+
+        Args:
+            body: For readers of sockets, and for all if there is no slot; it stays as it is.
+            slot: Where it was written for the readers of the ring; None: nowhere.
+            sequence: The message's number.
+            stamp_ns: Its stamp [ns].
+            publish_ns: When it was published [ns].
+            size: Bytes of its body.
+        """
+        rest = REST.pack(sequence, stamp_ns, publish_ns, size, 0)
+        if self.latching:
+            self.latched = self._large_head + rest + body
+        on_time = not (self.late or self.ring.has_lost)
+        for outlet in {r.outlet for r in self.readers.values() if r.member is None}:
+            on_time &= self._send_body(outlet, self._large_head + rest, body)
+        if slot is None:
+            on_time &= self.ring.send(self._message_head + rest + body)
+        else:
+            rest = REST.pack(sequence, stamp_ns, publish_ns, size, slot.number)
+            on_time &= self.ring.commit(slot, self._slot_head + rest)
+        if self._gate.ring is None:  # there may be slots now
+            self.route()
+        self.timeouts += not on_time
+        return on_time
+
+    def _send_body(self, outlet: Outlet, head: bytes, body: memoryview) -> bool:
+        """Send header and body through a socket; False if a reliable reader lost the message."""
+
+        def has_room() -> bool:
+            return self._large.has_room(outlet, body.nbytes)
+
+        if not has_room() and not (outlet.strict and self._await_room(has_room, self._timeout_s(outlet))):
+            self.skipped += 1
+            return not outlet.strict
+        on_time = True
+        if outlet.strict:
+            on_time = self.send_strict(outlet, head, SNDMORE)
+        else:
+            outlet.send(head, DONTWAIT | SNDMORE)
+        self._large.send(outlet, body)
+        return on_time
+
+    def _timeout_s(self, outlet: Outlet) -> float:
+        """How long the readers of a socket may hold us up [s]."""
+        readers = (r for r in self.readers.values() if r.outlet is outlet and r.member is None)
+        return max((reader.timeout_s for reader in readers), default=0.0)
 
     def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
         """Send what one of the gate's `sends` refused, waiting; False if a reliable reader lost it."""
@@ -190,8 +268,7 @@ class Fanout:
         def send() -> bool:
             return outlet.try_send(frame, flags)
 
-        readers = [r for r in self.readers.values() if r.outlet is outlet and r.member is None]
-        if send() or self._await_room(send, max((r.timeout_s for r in readers), default=0.0)):
+        if send() or self._await_room(send, self._timeout_s(outlet)):
             return True
         self.late[outlet] = self._gate.sequence
         self.route()

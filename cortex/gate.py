@@ -29,18 +29,18 @@ class Gate(Protocol):
     """Of all bodies so far."""
     refresh_ns: int
     """When the next message goes the long way, on the monotonic clock."""
-    ledger: Any
-    """Account of the slots into which larger bodies go; None: they go the long way."""
+    ring: Any
+    """The `Broadcast` in C into whose slots larger bodies go; None: they go the long way."""
     prepare: Callable[[int], None]
     """Called with the lock held, and the time, when `refresh_ns` is over."""
     large_acquire: Callable[[bool], bool]
     """Takes the lock of large messages, without waiting if called with False."""
     large_release: Callable[[], None]
     """Gives it back."""
-    finish: Callable[[int, int, int, int], bool]
+    finish: Callable[[Any, int, int, int], bool]
     """Sends what was written into a slot, where something has changed meanwhile; both locks are held.
 
-    Number of the slot, size of the body, its stamp and when it was published [ns]."""
+    The slot, size of the body, its stamp and when it was published [ns]."""
     records: list[Any] | None
     """Those of the batch that is being collected; None where none ever is."""
     batch_bytes: int
@@ -54,7 +54,7 @@ class Gate(Protocol):
         """Send a message; False if a reliable subscriber lost it."""
         ...
 
-    def send_slot(self, message: Any, ledger: Any, slot: int, /) -> bool | None:
+    def send_slot(self, message: Any, slot: Any, /) -> bool | None:
         """Send a message whose large arrays lie in a slot that is being written; the lock is held.
 
         Returns:
@@ -71,11 +71,11 @@ class LongGate:
         self.sequence = 0
         self.bytes = 0
         self.refresh_ns = 0
-        self.ledger: Any = None
+        self.ring: Any = None
         self.prepare: Callable[[int], None]
         self.large_acquire: Callable[[bool], bool]
         self.large_release: Callable[[], None]
-        self.finish: Callable[[int, int, int, int], bool]
+        self.finish: Callable[[Any, int, int, int], bool]
         self.records: list[Any] | None = None
         self.batch_bytes = 0
         self.batch_start_ns = 0
@@ -86,7 +86,7 @@ class LongGate:
         """Send a message; False if a reliable subscriber lost it."""
         return self._slowly(message)
 
-    def send_slot(self, message: Any, ledger: Any, slot: int, /) -> None:
+    def send_slot(self, message: Any, slot: Any, /) -> None:
         """Leave it to the long way."""
 
 

@@ -86,11 +86,14 @@ class Intake:
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
-                    break
+                    if reliable or not link.is_crowded:
+                        break
+                    self._make_room(link)
+                    continue
                 self.accept(link, frame, timed=count & 7 == 0)
-                moved = link.receive is not receive  # what came has told it to read elsewhere: that first
+                receive = link.receive  # what came may have told it to read elsewhere
                 overtaken = not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns
-                if moved or overtaken:
+                if overtaken:
                     unread.append(link)
                     break
             else:
@@ -98,6 +101,13 @@ class Intake:
         self.inlet.exhausted = not unread
         self.drained_ns = monotonic_ns()
         return unread
+
+    def _make_room(self, link: Link) -> None:
+        """Let the oldest message give way to a large one, or that one, if the user keeps all the memory."""
+        if self.queue:
+            self._counters.overtaken += _count(self.queue.popleft())
+        else:
+            link.pass_over()
 
     def drain_decoded(self, messages: deque[Any], *, may_wait: bool) -> None:
         """As `drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
@@ -146,7 +156,7 @@ class Intake:
             link.read_batch(frame, messages)
             return
         self.accept(link, frame, timed=True)
-        while self.queue and self.queue[0].buffer is not None:
+        while self.queue:
             item = self.queue.popleft()
             try:
                 messages.append(item.link.codec.decode(item.buffer, item.offset, item.size))
@@ -194,7 +204,7 @@ class Intake:
             return
         if timed:
             self._time(publish_ns, link)
-        self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
+        self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)))
 
     def _accept_timed(self, link: Link, frame: bytes) -> None:
         self.accept(link, frame, timed=True)

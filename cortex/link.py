@@ -19,7 +19,6 @@ from cortex.packer import make_reader
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
-from cortex.shm import RingGone, RingView, ShmUnavailable
 from cortex.stats import SubscriberCounters
 from cortex.wire import (
     ATTACH,
@@ -27,19 +26,15 @@ from cortex.wire import (
     BODY_LIMIT,
     HEADER_SIZE,
     LARGE,
-    MASK,
     MESSAGE,
-    PLACE_SIZE,
     RECORD,
     SLOT,
     TAIL,
     AttachKey,
-    RingPlace,
     attach_key,
     batch_records,
     message_head,
     parse_answer,
-    parse_place,
     prefix,
     resume_key,
 )
@@ -52,8 +47,6 @@ BLOCK_MS = 20
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
-RINGS_MAX = 8
-"""Most rings of one publisher that are kept mapped."""
 WHOLE_BATCH = -1
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
@@ -67,13 +60,12 @@ class Item(NamedTuple):
     """
 
     link: Link
-    buffer: bytes | np.ndarray | None
+    buffer: bytes | np.ndarray
     offset: int
     size: int
     sequence: int
     stamp_ns: int
     publish_ns: int
-    slot: tuple[RingView, int] | None
 
 
 class Link:
@@ -115,18 +107,13 @@ class Link:
             prefix(BATCH, self.source, stamped=stamped): self._on_batch,
             prefix(ATTACH, self.source, stamped=stamped): self._on_answer,
         }
-        self._large_head, self._slot_head, self.batch_head = list(self._handlers)[:3]
-        self._rings: dict[int, RingView] = {}
-        self._newest_ring = -1
-        """The highest number of a ring that was mapped."""
-        self._given_up = 0
-        """The publisher writes to no ring of a lower number any more."""
+        large_head, _, self.batch_head = list(self._handlers)[:3]
+        self._socket_heads = (self._message_prefix, self.batch_head, large_head)
+        """What comes through the socket while there is no ring."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
         self._told = -1
         """The sequence that the publisher last said would come next."""
-        self._column: int | None = None
-        self._large_subscribed = True
         self._complained: set[str] = set()
         self.socket = new_socket(
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
@@ -144,9 +131,8 @@ class Link:
                 secure(self.socket)
             self._socket_fd = int(self.socket.get(zmq.FD))
             self.socket.connect(address)
-            for head in (self._message_prefix, *list(self._handlers)[:3]):
-                if head != self._slot_head or shared_memory:
-                    self.socket.subscribe(head)
+            for head in self._socket_heads:
+                self.socket.subscribe(head)
             self._key = b""
             self._ask(shared_memory=shared_memory)
         except BaseException:
@@ -158,7 +144,6 @@ class Link:
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
         self._reader = secrets.randbits(64) or 1
-        self._confirms = not self.address.startswith("inproc:")  # within a process nothing is on its way
         if shared_memory and native is not None and self.address.startswith("ipc://"):
             path = self.address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
             try:
@@ -176,11 +161,11 @@ class Link:
         key = AttachKey(
             self.source,
             self._reader,
-            shared_memory,
+            self._end is not None and shared_memory,
             policy.reliable,
             min(policy.depth + 2, 255),
             min(int(policy.timeout_s * 1000.0), 2**32 - 1),
-            self._confirms,
+            confirms=True,
         )
         self._key = attach_key(key, stamped=self._stamped)
         self.socket.subscribe(self._key)
@@ -197,6 +182,9 @@ class Link:
 
     def handle(self, frame: bytes) -> list[Item]:
         """Take in a frame that is not a plain small message."""
+        if not frame and self._ring is not None and self._ring.ended:
+            self._do_without_shared_memory("it has none for such messages")
+            return []
         handler = self._handlers.get(frame[:16])
         try:
             if handler is None or len(frame) < HEADER_SIZE:
@@ -230,8 +218,6 @@ class Link:
             return False
         if 0 <= self.expected < sequence:
             self.counters.lost += sequence - self.expected
-            for ring in self._rings.values():
-                ring.heal(sequence)
             if self._policy.reliable:
                 self._confirm(sequence)
         self.expected = sequence + count
@@ -247,7 +233,7 @@ class Link:
         """The publisher says which sequence comes next."""
         if self.advance(sequence, 0):
             self._told = sequence
-            if self._confirms and self._ring is None:
+            if self._ring is None:
                 self._confirm(sequence)
 
     def _check(self, fingerprint: int, size: int) -> None:
@@ -269,46 +255,17 @@ class Link:
             return []
         data = np.frombuffer(body.buffer, np.uint8)
         data.flags.writeable = False
-        return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns, None)]
+        return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns)]
 
     def _on_slot(self, frame: bytes) -> list[Item]:
-        fingerprint, sequence, stamp_ns, publish_ns, size, aux = TAIL.unpack_from(frame, 16)
-        if len(frame) != HEADER_SIZE + MASK.size + PLACE_SIZE:
-            raise MalformedMessage(f"a descriptor of {len(frame)} bytes")
-        if fingerprint != self.codec.fingerprint:
-            self._check(fingerprint, size)
-        (mask,) = MASK.unpack_from(frame, HEADER_SIZE)
-        ring, slot = aux >> 32, aux & 0xFFFFFFFF
-        view = self._rings.get(ring)
-        if view is None and self._column is not None:
-            place = parse_place(frame, HEADER_SIZE + MASK.size)
-            if place.ring != ring:
-                raise MalformedMessage(f"a descriptor for ring {ring} that places ring {place.ring}")
-            view = self._open_ring(place)
-        if len(self._rings) > 1:
-            self._forget_rings(ring)
-        leased = self._column is not None and bool(mask >> self._column & 1)
-        if view is None or not leased:
-            if self._large_subscribed or sequence < self.expected:
-                self._reached = max(self._reached, sequence + 1)
-                return []  # it comes, or came, as a large message; lost if the publisher ends before
-            if view is None or self._policy.reliable:
-                if self.advance(sequence):  # left out on purpose: the publisher held us to our share
-                    self.counters.lost += 1
-                return []
-            if slot >= view.slots or size > view.slot_bytes:
-                raise MalformedMessage(f"a descriptor of slot {slot} with {size} bytes: the ring has no such")
-            self.advance(sequence)
-            return [Item(self, None, 0, size, sequence, stamp_ns, publish_ns, (view, slot))]
-        try:
-            data = view.lease(slot, sequence, size)
-        except ValueError as error:
-            raise MalformedMessage(str(error)) from None
-        if sequence == self.expected:
-            self.expected = sequence + 1
-        elif not self.advance(sequence):
+        fingerprint, sequence, stamp_ns, publish_ns, size, slot = TAIL.unpack_from(frame, 16)
+        data = None if self._ring is None else self._ring.take_body()
+        if len(frame) != HEADER_SIZE or data is None:
+            raise MalformedMessage(f"slot {slot} does not hold message {sequence} of {size} bytes for us")
+        self._check(fingerprint, size)
+        if not self.advance(sequence):
             return []  # `data` gives the slot back
-        return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns, None))]
+        return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns))]
 
     def _on_batch(self, frame: bytes) -> list[Item]:
         fingerprint, first, _, publish_ns, size, count = TAIL.unpack_from(frame, 16)
@@ -325,7 +282,7 @@ class Link:
                 raise MalformedMessage(f"a batch of {size} bytes cannot hold {count} records of {stride}")
             if not self.advance(first, count):
                 return []
-            return [Item(self, frame[HEADER_SIZE:], WHOLE_BATCH, count, first, 0, publish_ns, None)]
+            return [Item(self, frame[HEADER_SIZE:], WHOLE_BATCH, count, first, 0, publish_ns)]
         records = self._records(frame, first, count)
         return records if self.advance(first, count) else []
 
@@ -363,7 +320,7 @@ class Link:
 
     def _records(self, frame: bytes, first: int, count: int) -> list[Item]:
         return [
-            Item(self, frame, record.offset, record.size, first + k, record.stamp_ns, record.publish_ns, None)
+            Item(self, frame, record.offset, record.size, first + k, record.stamp_ns, record.publish_ns)
             for k, record in enumerate(batch_records(frame, count))
         ]
 
@@ -376,7 +333,7 @@ class Link:
         for k in range(item.size):
             stamp_ns, publish_ns, _, _ = RECORD.unpack_from(item.buffer, k * stride)
             offset = k * stride + RECORD.size
-            items.append(Item(self, item.buffer, offset, size, item.sequence + k, stamp_ns, publish_ns, None))
+            items.append(Item(self, item.buffer, offset, size, item.sequence + k, stamp_ns, publish_ns))
         return items
 
     def cut(self, item: Item, count: int) -> Item:
@@ -395,140 +352,80 @@ class Link:
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
         self._told = max(self._told, answer.sequence)
-        self._column = answer.column
-        if answer.column is None and not self._large_subscribed:
-            self.socket.subscribe(self._large_head)
-            self._large_subscribed = True
-            self._shorten()
-        if answer.column is not None:
-            if answer.rings and not self._take_rings(answer.rings):
-                return []
-            if self._large_subscribed:
-                self.socket.unsubscribe(self._large_head)
-                self._large_subscribed = False
-                self._shorten()
         known = self.expected >= 0
-        if first:
-            self._use_ring()
+        if first and not self._use_ring():
+            self.attached = False
+            return []  # it is asked again
         if known:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
         return items
 
-    def _use_ring(self) -> None:
-        """If the publisher has taken us in, it sends all that follows through its ring."""
-        first = None if self._end is None else self._end.welcomed()
+    def _use_ring(self) -> bool:
+        """If the publisher has taken us in, its ring has all that follows; False if we cannot read it."""
+        try:
+            first = None if self._end is None else self._end.welcomed()
+        except OSError as error:
+            self._do_without_shared_memory(str(error))
+            return False
         if first is None:
-            return
+            return True
         self._ring = self._end
         self.receive = self._ring.receive
+        if self.coder is not None:
+            self.coder.slots = self._ring
         self.attached = True
         if self.expected < 0:  # what is lost counts from there on, also if the answer never comes
             self.expected = first
-        for head in (self._message_prefix, self.batch_head, self._slot_head):
+        for head in self._socket_heads:
             self.socket.unsubscribe(head)
+        return True
 
     def _use_socket(self) -> None:
         """What follows comes through the socket again, as we shall be another reader to the publisher."""
         self.receive = self._receive_socket
         self._ring = None
-        for head in (self._message_prefix, self.batch_head, self._slot_head):
+        if self.coder is not None:
+            self.coder.slots = None
+        for head in self._socket_heads:
             self.socket.subscribe(head)
 
     @property
     def carrier(self) -> str:
         """How messages come: the transport, and what carries them on this host."""
-        parts = [self.address.partition("://")[0]]
-        parts += ["ring"] if self._ring is not None else []
-        parts += ["shared memory"] if self._column is not None else []
-        return ", ".join(parts)
+        return self.address.partition("://")[0] + (", shared memory" if self._ring is not None else "")
+
+    @property
+    def is_crowded(self) -> bool:
+        """Whether the next message waits in the ring, because the user keeps too many large ones."""
+        return self._ring is not None and bool(self._ring.is_crowded)
+
+    def pass_over(self) -> None:
+        """Leave out the message for which there is no memory: it counts as lost when the next comes."""
+        self._ring.pass_over()
 
     @property
     def fds(self) -> tuple[int, ...]:
         """Descriptors that become readable when something may have come."""
         return (self._socket_fd,) if self._end is None else (self._socket_fd, self._end.fd)
 
-    def _take_rings(self, places: tuple[RingPlace, ...]) -> bool:
-        """Map the newest ring that is announced, and forget those that are given up.
-
-        An announcement comes through the socket, descriptors through a ring: what it says may be old news.
-
-        Returns:
-            False if there is no shared memory from now on.
-        """
-        self._given_up = max(self._given_up, min(places).ring)
-        newest = max(places)
-        if newest.ring > self._newest_ring:
-            try:
-                self._map_ring(newest)
-            except RingGone:
-                pass  # replaced meanwhile: descriptors say which ring there is
-            except ShmUnavailable as error:
-                self._do_without_shared_memory(error)
-                return False
-        self._forget_rings(self._newest_ring)
-        return True
-
-    def _map_ring(self, place: RingPlace) -> RingView:
-        assert self._column is not None
-        view = self._rings[place.ring] = RingView(self.source, *place, self._column)
-        self._newest_ring = max(self._newest_ring, place.ring)
-        self._shorten()
-        return view
-
-    def _shorten(self) -> None:
-        """Let the short cut in C read the slots of the ring, if there is one ring only."""
-        if self.coder is not None:
-            views = list(self._rings.values())
-            self.coder.slots = views[0].short_cut if len(views) == 1 and not self._large_subscribed else None
-
-    def _open_ring(self, place: RingPlace) -> RingView | None:
-        """Map the ring of a descriptor; where that cannot be done, go on without shared memory."""
-        try:
-            return self._map_ring(place)
-        except ShmUnavailable as error:
-            # The lease of a message keeps its ring; that of one that was left out may be gone.
-            if not isinstance(error, RingGone) or place.ring >= self._newest_ring:
-                self._do_without_shared_memory(error)
-            return None
-
-    def _forget_rings(self, newest: int) -> None:
-        """Unmap older rings that are not in use; one that is needed after all is mapped again.
-
-        Of a ring that the publisher has given up only messages on their way are waited for: those in use
-        become private copies.
-        """
-        for number, view in list(self._rings.items()):
-            surplus = len(self._rings) > RINGS_MAX  # whoever lets us wait for so many sends us nonsense
-            given_up = number < self._given_up and not view.is_awaited
-            if number < newest and (surplus or given_up or view.idle):
-                del self._rings[number]
-                self._shorten()
-                view.close()
-
     def _latched(self, frame: bytes) -> list[Item]:
-        if len(frame) < HEADER_SIZE or frame[:16] not in (self._message_prefix, self._large_head):
+        if len(frame) < HEADER_SIZE or frame[:16] not in self._socket_heads:
             raise MalformedMessage("a latched message that is none")
         fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
         if len(frame) != HEADER_SIZE + size:
             raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
-        return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)]
+        return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)]
 
-    def _do_without_shared_memory(self, reason: ShmUnavailable | str) -> None:
+    def _do_without_shared_memory(self, reason: str) -> None:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
-        self._close_rings()  # before the publisher can learn that our column is free
-        self._newest_ring = -1
         if self._ring is not None:
             self._use_socket()
-        if not self._large_subscribed:
-            self.socket.subscribe(self._large_head)
-            self._large_subscribed = True
-        self.socket.unsubscribe(self._slot_head)
-        self.socket.unsubscribe(self._key)
-        self._column = None
+        key = self._key
         self._ask(shared_memory=False)
+        self.socket.unsubscribe(key)  # after that, so that the publisher counts us all the time
 
     def leave(self) -> None:
         """The publisher has left: what it wrote into its ring counts, also if its answer never came."""
@@ -544,11 +441,9 @@ class Link:
             logger.warning("%s: a publisher ended without saying how much it had sent", self.record.topic)
 
     def close(self) -> None:
-        """Disconnect. Messages that the user still holds stay valid.
-
-        The end of the socket tells the publisher that it may write to our slots again: the rings close first.
-        """
-        self._close_rings()
+        """Disconnect. Messages that the user still holds stay as they are."""
+        if self.coder is not None:
+            self.coder.slots = None
         self._frames.close()
         self.socket.close(0)
         self._close_end()
@@ -556,13 +451,6 @@ class Link:
     def _close_end(self) -> None:
         if self._end is not None:
             self._end.close()
-
-    def _close_rings(self) -> None:
-        if self.coder is not None:
-            self.coder.slots = None
-        for ring in self._rings.values():
-            ring.close()
-        self._rings.clear()
 
     def schema(self) -> Schema:
         """The structure of this publisher's messages."""

@@ -54,7 +54,7 @@ class Outlet:
     socket: zmq.Socket[bytes]
     strict: bool
     local: bool
-    """Over ipc or inproc: readers may share memory."""
+    """Over ipc: readers may share memory."""
     listener: Listener | None = None
     """Where its readers ask for rings."""
 
@@ -103,7 +103,7 @@ def open_outlet(
     Args:
         addresses: Where to bind; a tcp address may end in `:*`.
         strict: Whether full queues hold up the sender.
-        local: Whether the addresses are ipc or inproc.
+        local: Whether the addresses are ipc.
         listener: Where its readers ask for rings.
         secure: Sets up CURVE on the socket before it binds.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket as sockets
 import time
 from collections.abc import Callable
@@ -68,8 +67,7 @@ class Places:
         path = self._files.endpoint
         listener = self._listener = make_listener(self._files.path("ring"))
         for role, strict in (("lossy", False), ("strict", True)):
-            addresses = [path(role), _inproc(node, os.getpid(), role)]
-            outlets.add(open_outlet(addresses, strict=strict, local=True, listener=listener))
+            outlets.add(open_outlet([path(role)], strict=strict, local=True, listener=listener))
         router = self._router(tcp=False)
         router.bind(path("control"))
         self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
@@ -150,7 +148,7 @@ class Reach(NamedTuple):
 
 
 def reach(node: NodeRecord, host: str, keys: Keys | None, *, insecure: bool = False) -> Reach | None:
-    """Choose how to reach a node: inproc within the process, ipc on this host, else tcp.
+    """Choose how to reach a node: ipc on this host, else tcp.
 
     Args:
         node: The record that the node has sent; its addresses are not trusted.
@@ -163,18 +161,6 @@ def reach(node: NodeRecord, host: str, keys: Keys | None, *, insecure: bool = Fa
     """
     for endpoint in node.endpoints:
         if endpoint.transport == "ipc" and node.host == host:
-            if node.pid == os.getpid():
-                return Reach(
-                    Endpoint(
-                        "inproc",
-                        _inproc(node.node, node.pid, "lossy"),
-                        _inproc(node.node, node.pid, "strict"),
-                        endpoint.control,
-                        "",
-                    ),
-                    True,
-                    None,
-                )
             return Reach(endpoint, True, None)
     for endpoint in node.endpoints:
         if endpoint.transport == "tcp":
@@ -195,10 +181,6 @@ def _may_be_plain(endpoint: Endpoint, *, insecure: bool) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _inproc(node: int, pid: int, role: str) -> str:
-    return f"inproc://cortex-{node:016x}-{pid}-{role}"
 
 
 def _bracket(host: str) -> str:

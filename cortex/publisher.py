@@ -9,7 +9,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -19,22 +18,12 @@ from cortex.codec import Codec
 from cortex.context import Closed
 from cortex.fanout import Fanout
 from cortex.gate import Gate, LongGate, make_gate
-from cortex.large import LargeSender, Slot, Stamps
-from cortex.loan import Loan, lend
+from cortex.loan import Loan
 from cortex.outlet import Backoff, Outlets
 from cortex.packer import coder_of
 from cortex.patience import Patience
 from cortex.stats import PublisherCounters
-from cortex.wire import (
-    BATCH,
-    LARGE,
-    MESSAGE,
-    RECORD,
-    REST,
-    TAIL,
-    message_head,
-    prefix,
-)
+from cortex.wire import BATCH, MESSAGE, RECORD, REST, message_head
 
 monotonic_ns = time.monotonic_ns
 
@@ -44,7 +33,7 @@ INLINE_MAX = 16_384
 """Bodies up to this size travel in the frame; measured by `cortex bench threshold`."""
 REFRESH_NS = 1_000_000
 LINGER_S = 0.5
-"""How long `close` waits for whom it owes nothing: lossy readers, and slots that nobody has given back."""
+"""How long `close` waits for whom it owes nothing: lossy readers of sockets."""
 
 MAX_WAIT_S = 1.0
 COMMAND_MAX_WAIT_S = 0.1
@@ -75,18 +64,15 @@ class Publisher(Generic[T]):
         self.codec = codec
         self.source = secrets.randbits(64) or 1
         self.latch = latch
-        self._skipped = 0
         stamped = codec.stamp_of is not None
         self._type = codec.type
         self._stamp_of = codec.stamp_of
-        self._fingerprint = codec.fingerprint
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
         coder = coder_of(codec, self._head)
         self._pack_record = None if coder is None else coder.record
         self._gathers = coalesce and not latch
-        self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
         self._gate: Gate = make_gate(
@@ -106,25 +92,19 @@ class Publisher(Generic[T]):
         if self._gathers:
             self._gate.records = self._batch.records
         self._patience = Patience(outlets, self._gate, self._check_open)
-        self._large = LargeSender(
-            self.source,
-            codec.fingerprint,
-            stamped=stamped,
-            topic=topic,
-            outlets=outlets,
-            expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
-        )
         self._fanout = Fanout(
             topic,
             self.source,
-            batch_head,
+            codec.fingerprint,
+            stamped=stamped,
             gate=self._gate,
-            large=self._large,
             outlets=outlets,
             patience=self._patience,
+            latching=latch,
             plain=not latch and not coalesce,
             max_wait_s=max_wait_s,
             next_sequence=self._next_sequence,
+            expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
         )
         self._was_large = False
         self._on_close = on_close
@@ -173,9 +153,7 @@ class Publisher(Generic[T]):
             else:
                 prepared = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-            if self._was_large == isinstance(prepared, bytes):
-                self._was_large = not self._was_large
-                self._fanout.route()
+            self._was_large = not isinstance(prepared, bytes)
             if not self._was_large:
                 return self._publish_inline(prepared, stamp_ns, now_ns)
         finally:
@@ -183,21 +161,22 @@ class Publisher(Generic[T]):
         return self._publish_large(prepared, stamp_ns, now_ns)
 
     def _publish_large(self, prepared: Any, stamp_ns: int, now_ns: int) -> bool:
-        """Write a large message into a slot, without the lock, and send it."""
+        """Write a large message without the lock, into a slot if there is one, and send it."""
         with self._large_lock:
             with self._lock:
-                self._check_open()
-                exact = self.codec.fixed_size is not None
-                slot = self._large.acquire(prepared.size, self._gate.sequence, exact=exact, spare=True)
-                if slot is None:
-                    return self._skip()
-            try:
-                prepared.write(slot.buffer)
-            except BaseException:
-                self._large.give_back(slot)
-                raise
+                slot = self._acquire(prepared.size, now_ns, may_wait=True)
+            buffer = np.empty(prepared.size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+            prepared.write(buffer)
             with self._lock:
-                return self._publish_slot(slot, prepared.size, stamp_ns, now_ns)
+                return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns)
+
+    def _acquire(self, size: int, now_ns: int, *, may_wait: bool = False) -> Any:
+        """A slot for a large message; None if there is none. The lock is held."""
+        if self._patience.is_waiting:
+            self._prepare(now_ns)
+        self._check_open()
+        exact = self.codec.fixed_size is not None
+        return self._fanout.ring.acquire(size, exact=exact, may_wait=may_wait)
 
     @contextmanager
     def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:
@@ -212,9 +191,10 @@ class Publisher(Generic[T]):
             published when the block ends, and dropped if the block raises. Do not keep its arrays.
 
         Raises:
-            RuntimeError: All slots are out on loan.
+            RuntimeError: All slots are out on loan. Reliable readers that have not come to them are waited
+                for as by `publish`.
         """
-        loan = self.try_loan(dtypes, **dims)
+        loan = self._lend(dtypes, dims, may_wait=True)
         if loan is None:
             with self._lock:
                 self._skip()
@@ -236,73 +216,58 @@ class Publisher(Generic[T]):
         Returns:
             The message; None if there is no slot for it now.
         """
+        return self._lend(dtypes, dims, may_wait=False)
+
+    def _lend(
+        self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
+    ) -> Loan | None:
         size = self.codec.draft_size(dims, dtypes)
-        slot: Slot | None
-        if size <= self._inline_max:
-            self._check_open()
-            slot = Slot(np.empty(size, np.uint8), None, 0)
-        else:
+        slot = None
+        if size > self._inline_max:
             with self._large_lock, self._lock:
-                self._prepare(monotonic_ns())
-                exact = self.codec.fixed_size is not None
-                slot = self._large.acquire(size, self._gate.sequence, exact=exact)
-            if slot is None:
-                return None
-        publish = self._publish_inline_loan if size <= self._inline_max else self._publish_loan
-        make_draft = partial(self.codec.draft, dims=dims, dtypes=dtypes)
-        return lend(slot, make_draft, publish, self._large, self._warn_of_forgotten_loan)
+                now_ns = monotonic_ns()
+                self._prepare(now_ns)
+                slot = self._acquire(size, now_ns, may_wait=may_wait)
+                if slot is None and self._fanout.ring.has_slots(size):
+                    return None
+        self._check_open()
+        buffer = np.empty(size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+        draft = self.codec.draft(buffer, dims=dims, dtypes=dtypes)
+        if slot is not None:
+            slot.on_forgotten = self._warn_of_forgotten_loan
+        return Loan(draft, buffer, slot, self._publish_loan)
 
     def _warn_of_forgotten_loan(self) -> None:
         if not self._closed:
             text = f"{self.topic}: a loan was forgotten, neither published nor dropped"
             warnings.warn(text, ResourceWarning, stacklevel=2)
 
-    def _publish_inline_loan(self, draft: Any, slot: Slot, message: Any) -> bool:
-        """Send a small message that was written on loan; returns and raises as `Loan.publish`."""
-        size, stamp_ns = self._finish_draft(draft, message)
-        with self._lock:
-            now_ns = monotonic_ns()
-            self._prepare(now_ns)
-            return self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
-
-    def _publish_loan(self, draft: Any, slot: Slot, message: Any) -> bool:
-        """As `_publish_inline_loan` for a large message."""
-        if message is not None and slot.ring is not None and self.codec.drafts_by_tail:
-            sent = self._send_lent(slot, slot.ring.ledger, message)
+    def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
+        """Send a message that was written on loan; returns and raises as `Loan.publish`."""
+        if message is not None and slot is not None and self.codec.drafts_by_tail:
+            sent = self._send_lent(message, slot)
             if sent is not None:
                 self.codec.seal(draft)
                 return sent
-        try:
-            size, stamp_ns = self._finish_draft(draft, message)
-        except BaseException:
-            self._large.give_back(slot)
-            raise
+        size, stamp_ns = self._finish_draft(draft, message)
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
-            try:
-                self._prepare(now_ns)
-            except BaseException:
-                self._large.abandon(slot)
-                raise
-            renewed = self._large.renew(slot, size, self._gate.sequence)
-            if renewed is None:
-                return self._skip()
-            return self._publish_slot(renewed, size, stamp_ns, now_ns)
+            self._prepare(now_ns)
+            if size <= self._inline_max:
+                return self._publish_inline(buffer[:size].tobytes(), stamp_ns, now_ns)
+            if slot is None or not slot.is_current:  # its ring was replaced by one of larger slots
+                slot, written = self._acquire(size, now_ns, may_wait=True), buffer
+                buffer = np.empty(size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+                buffer[:size] = written[:size]
+            return self._send_written(buffer, slot, size, stamp_ns, now_ns)
 
-    def _send_lent(self, slot: Slot, ledger: Any, message: Any) -> bool | None:
+    def _send_lent(self, message: Any, slot: Any) -> bool | None:
         """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
-        handed_over = False
-        try:
-            with self._lock:
-                now_ns = monotonic_ns()
-                if now_ns >= self._gate.refresh_ns:
-                    self._prepare(now_ns)
-                handed_over = True
-                return self._gate.send_slot(message, ledger, slot.number)
-        except BaseException:
-            if not handed_over:
-                self._large.give_back(slot)
-            raise
+        with self._lock:
+            now_ns = monotonic_ns()
+            if now_ns >= self._gate.refresh_ns:
+                self._prepare(now_ns)
+            return self._gate.send_slot(message, slot)
 
     def _finish_draft(self, draft: Any, message: Any) -> tuple[int, int]:
         """Write what is not in its place yet; the size of the body, and its stamp [ns]."""
@@ -312,6 +277,22 @@ class Publisher(Generic[T]):
             self.codec.fill(draft, message)
         size = self.codec.finish(draft)
         return size, 0 if self._stamp_of is None else int(draft.stamp_ns)
+
+    def _send_written(self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
+        """Send a large message that lies in a slot, or in memory of its own; both locks are held."""
+        if self._patience.is_waiting:
+            self._prepare(now_ns)
+        self._check_open()
+        self._flush()
+        body = buffer[:size].data
+        if slot is not None:  # who reads it elsewhere gets a copy
+            wanted = self.latch or self._fanout.has_sockets or not slot.is_current
+            body = memoryview(body.tobytes() if wanted else b"")
+        sequence = self._gate.sequence
+        self._gate.sequence += 1
+        self._gate.bytes += size
+        slot = slot if slot is not None and slot.is_current else None
+        return self._fanout.send_large(body, slot, sequence, stamp_ns, now_ns, size)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""
@@ -360,50 +341,8 @@ class Publisher(Generic[T]):
         """Count a message that finds no slot: its readers see the gap. The lock is held."""
         self._flush()
         self._gate.sequence += 1
-        self._skipped += 1
+        self._fanout.skipped += 1
         return False
-
-    def _publish_slot(self, slot: Slot, size: int, stamp_ns: int, now_ns: int) -> bool:
-        """Send what was written into a slot; both locks are held."""
-        fanout = self._fanout
-        try:
-            mask, passed_over, on_time = self._await_readers(slot, now_ns)
-        except BaseException:  # of a signal, say, while it waits
-            self._large.abandon(slot)
-            raise
-        stamps = Stamps(self._gate.sequence, stamp_ns, now_ns)
-        self._gate.sequence += 1
-        self._gate.bytes += size
-        if self.latch:
-            head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
-            fanout.latched = head + slot.buffer[:size].tobytes()
-        sent, inline_passed_over = self._large.send(
-            slot, size, mask, stamps, fanout.send_strict, fanout.ring.send
-        )
-        self._skipped += passed_over or inline_passed_over
-        on_time &= sent and not fanout.late
-        fanout.timeouts += not on_time
-        fanout.arm()
-        return on_time
-
-    def _await_readers(self, slot: Slot, now_ns: int) -> tuple[int, bool, bool]:
-        """Wait until reliable readers have room for one more slot; both locks are held.
-
-        Returns:
-            The columns that get a lease, whether some reader is passed over, whether all had room in time.
-        """
-        if self._patience.is_waiting:
-            self._prepare(now_ns)
-        self._flush()
-        on_time = not self._fanout.late
-        mask, full, passed_over = self._large.grant(slot.ring)
-        if full:
-            with self._patience:
-                on_time &= self._large.await_strict(slot.ring, self._patience.sleep)
-            mask, _, passed_over = self._large.grant(slot.ring)
-        if self._closed:
-            self._check_open()
-        return mask, passed_over, on_time and not self._large.is_leaving_out
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
@@ -424,17 +363,15 @@ class Publisher(Generic[T]):
         if self._closed:
             raise Closed(f"the publisher of {self.topic} is closed")
 
-    def _finish(self, number: int, size: int, stamp_ns: int, now_ns: int) -> bool:
+    def _finish(self, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
         """Send a slot that the gate has written, but that needs more care; both locks are held."""
-        self._check_open()
-        return self._publish_slot(self._large.slot_of(number), size, stamp_ns, now_ns)
+        return self._send_written(np.frombuffer(slot, np.uint8), slot, size, stamp_ns, now_ns)
 
     def tick(self, now_ns: int) -> None:
         """Free what the sockets have sent, end a burst; called by the node now and then."""
         if self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
-                    self._large.prune()
                     self._fanout.tick(now_ns)
             finally:
                 self._lock.release()
@@ -443,9 +380,8 @@ class Publisher(Generic[T]):
     def counters(self) -> PublisherCounters:
         """What has been published so far."""
         with self._lock:
-            return PublisherCounters(
-                self._gate.sequence, self._gate.bytes, self._fanout.timeouts, self._skipped
-            )
+            fanout = self._fanout
+            return PublisherCounters(self._gate.sequence, self._gate.bytes, fanout.timeouts, fanout.skipped)
 
     @property
     def subscriber_count(self) -> int:
@@ -488,8 +424,7 @@ class Publisher(Generic[T]):
         through sockets reaches reliable subscribers that confirm it within their `timeout_s`.
 
         Args:
-            linger_s: How long to wait for other subscribers of sockets, and for large messages that are on
-                their way to be taken in [s].
+            linger_s: How long to wait for other subscribers of sockets [s].
         """
         close_publishers([self], linger_s=linger_s)
 
@@ -520,8 +455,7 @@ class Publisher(Generic[T]):
             if self._outlets.closed:
                 return True
             self._outlets.refresh()
-            written = self._fanout.finish(waited_s, linger_s)
-            return written and (waited_s >= linger_s or self._large.taken_in)
+            return self._fanout.finish(waited_s, linger_s)
 
     def _end(self) -> None:
         """Let go of everything."""
@@ -529,7 +463,6 @@ class Publisher(Generic[T]):
             if not self._outlets.closed:
                 self._fanout.give_up()
             self._fanout.close()
-            self._large.close()
         self._outlets.unregister(self.source)
         if self._on_close is not None:
             self._on_close(self)
@@ -548,7 +481,7 @@ def close_publishers(
 
     Args:
         publishers: Those that are closed already are left alone.
-        linger_s: How long to wait for lossy subscribers and for large messages [s].
+        linger_s: How long to wait for lossy subscribers [s].
         longest_s: How long to wait in all, for reliable subscribers, too [s].
     """
     begin_s = time.monotonic()

@@ -46,7 +46,7 @@ class ServiceRecord:
 
 @message(name="cortex/Endpoint")
 class Endpoint:
-    """The ZeroMQ addresses of a node over one transport ("ipc", "tcp" or "inproc").
+    """The ZeroMQ addresses of a node over one transport ("ipc" or "tcp").
 
     `lossy` and `strict` are its XPUB sockets, `control` its ROUTER; `server_key` is its CURVE key in Z85, or
     empty.

@@ -162,12 +162,8 @@ class Subscriber(Generic[T]):
         """Take the next message as the bytes of its body, with its structure; see `recv`."""
 
         def raw(item: Item) -> tuple[Info, bytes | np.ndarray, Schema]:
-            buffer = self._buffer(item)
-            return (
-                self._info(item),
-                buffer[item.offset : item.offset + item.size],
-                item.link.schema(),
-            )
+            body = item.buffer[item.offset : item.offset + item.size]
+            return self._info(item), body, item.link.schema()
 
         found: tuple[Info, bytes | np.ndarray, Schema] = self._receive(timeout_s, raw)
         return found
@@ -347,28 +343,10 @@ class Subscriber(Generic[T]):
             with self._turn:
                 self.counters.received -= 1
                 item.link.reject(str(error))
-        except _Overwritten:
-            with self._turn:
-                self.counters.received -= 1
-                self.counters.lost += 1
         return NOTHING
 
-    def _buffer(self, item: Item) -> bytes | np.ndarray:
-        if item.buffer is not None:
-            return item.buffer
-        assert item.slot is not None
-        view, slot = item.slot
-        try:
-            with self._turn:
-                copy = view.snapshot(slot, item.sequence, item.size)
-        except ValueError:  # the ring was closed meanwhile
-            copy = None
-        if copy is None:
-            raise _Overwritten
-        return copy
-
     def _decode(self, item: Item) -> T:
-        message: T = item.link.codec.decode(self._buffer(item), item.offset, item.size)
+        message: T = item.link.codec.decode(item.buffer, item.offset, item.size)
         return message
 
     def _info(self, item: Item) -> Info:
@@ -395,11 +373,10 @@ class Subscriber(Generic[T]):
                 self.counters.received += item.size - 1
             records: np.ndarray = np.ndarray((item.size,), dtype, item.buffer, RECORD.size, (stride,))
             return records
-        bodies: list[Any] = [self._record(item, self._buffer(item))]
+        bodies: list[Any] = [self._record(item, item.buffer)]
         with self._turn:
-            while self._queue and self._queue[0].offset != WHOLE_BATCH and self._queue[0].buffer is not None:
+            while self._queue and self._queue[0].offset != WHOLE_BATCH:
                 more = self._queue.popleft()
-                assert more.buffer is not None
                 bodies.append(self._record(more, more.buffer))
                 self.counters.received += 1
         if any(len(body) != fixed for body in bodies):
@@ -549,7 +526,7 @@ class Subscriber(Generic[T]):
 
     @property
     def carriers(self) -> list[str]:
-        """How the messages of each publisher come, such as "ipc, ring, shared memory" or "tcp"."""
+        """How the messages of each publisher come, such as "ipc, shared memory" or "tcp"."""
         with self._turn:
             return [link.carrier for link in self._links if link.attached]
 
@@ -686,7 +663,3 @@ class _Messages(Generic[T]):
             return self._subscriber.recv()
         except Closed:
             raise StopIteration from None
-
-
-class _Overwritten(Exception):
-    """The slot was written again before it was read."""

@@ -1,4 +1,4 @@
-"""The frames of WIRE.md: the 64-byte header, kinds, batches, descriptors of slots, attaching, control."""
+"""The frames of WIRE.md: the 64-byte header, kinds, batches, attaching, control."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ CONTROL, REQUEST, REPLY, ERROR = b"C", b"Q", b"P", b"E"
 FLAG_STAMP = 1
 BODY_LIMIT = 1 << 30
 CONTROL_LIMIT = 16 << 20
-NO_COLUMN = 0xFFFFFFFF
 
 _HEADER = struct.Struct("<3sBBBHQQQqqQQ")
 _PREFIX = struct.Struct("<3sBBBHQ")
@@ -31,11 +30,8 @@ REST = struct.Struct("<QqqQQ")
 """What follows the head: sequence, stamp_ns, publish_ns, body length, aux."""
 RECORD = struct.Struct("<qqII")
 """Head of a batch's record: stamp_ns, publish_ns, body length, reserved."""
-MASK = struct.Struct("<Q")
-"""What follows a descriptor's header: the mask of columns; then the ring's place."""
 _KEY = struct.Struct("<QQ")
-_ANSWER = struct.Struct("<QIIQQ")
-_RING = struct.Struct("<IIQIiQ")
+_ANSWER = struct.Struct("<QQQQ")
 
 
 class Header(NamedTuple):
@@ -189,22 +185,10 @@ class AttachKey(NamedTuple):
     """It says how far it has read, when it is told how many messages there have been."""
 
 
-class RingPlace(NamedTuple):
-    """Where a ring of shared memory is found."""
-
-    ring: int
-    slots: int
-    slot_bytes: int
-    pid: int
-    fd: int
-
-
 class AttachAnswer(NamedTuple):
     """A publisher's answer to a reader."""
 
     sequence: int
-    column: int | None
-    rings: tuple[RingPlace, ...]
     latched: bytes
 
 
@@ -252,24 +236,9 @@ def parse_resume_key(data: bytes) -> tuple[int, int, int] | None:
     return int.from_bytes(data[8:16], "little"), *_KEY.unpack_from(data, PREFIX_SIZE)
 
 
-def pack_place(place: RingPlace) -> bytes:
-    """The place of a ring as it travels: 32 bytes."""
-    return _RING.pack(*place, 0)
-
-
-def parse_place(data: bytes, offset: int) -> RingPlace:
-    """Read the place of a ring."""
-    return RingPlace(*_RING.unpack_from(data, offset)[:5])
-
-
-PLACE_SIZE = _RING.size
-
-
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:
     """The frame that answers a reader; `key` is the 32 bytes that it subscribed to."""
-    column = NO_COLUMN if answer.column is None else answer.column
-    head = _ANSWER.pack(answer.sequence, column, len(answer.rings), len(answer.latched), 0)
-    return key + head + b"".join(_RING.pack(*ring, 0) for ring in answer.rings) + answer.latched
+    return key + _ANSWER.pack(answer.sequence, 0, len(answer.latched), 0) + answer.latched
 
 
 def parse_answer(frame: bytes) -> AttachAnswer:
@@ -278,19 +247,10 @@ def parse_answer(frame: bytes) -> AttachAnswer:
     Raises:
         MalformedMessage: The counts do not match the frame's length.
     """
-    if len(frame) < KEY_SIZE + _ANSWER.size:
-        raise MalformedMessage(f"an attach answer of {len(frame)} bytes is too short")
-    sequence, column, rings, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
     start = KEY_SIZE + _ANSWER.size
-    if rings > 4 or latched > BODY_LIMIT or len(frame) != start + rings * _RING.size + latched:
-        raise MalformedMessage(
-            f"an attach answer of {len(frame)} bytes cannot hold {rings} rings and {latched} bytes"
-        )
-    if column != NO_COLUMN and column >= 64:
-        raise MalformedMessage(f"column {column} is not below 64")
-    places = tuple(
-        RingPlace(*_RING.unpack_from(frame, start + index * _RING.size)[:5]) for index in range(rings)
-    )
-    return AttachAnswer(
-        sequence, None if column == NO_COLUMN else column, places, frame[start + rings * _RING.size :]
-    )
+    if len(frame) < start:
+        raise MalformedMessage(f"an attach answer of {len(frame)} bytes is too short")
+    sequence, _, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
+    if latched > BODY_LIMIT or len(frame) != start + latched:
+        raise MalformedMessage(f"an attach answer of {len(frame)} bytes cannot hold {latched} bytes")
+    return AttachAnswer(sequence, frame[start:])

@@ -9,6 +9,7 @@ imports rclpy itself.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -22,6 +23,8 @@ try:
 except ImportError:  # launch alone: names can then be set by arguments only
     Node = None
 
+PYTHON = f"{os.environ['VIRTUAL_ENV']}/bin/python" if "VIRTUAL_ENV" in os.environ else sys.executable
+"""That of the virtual environment that is active: `ros2` itself runs in that of ROS."""
 ARGUMENTS = {
     "config": ("", "settings of the bridge (YAML); none: all standard topics"),
     "params_file": ("", "ROS parameters of the bridge (YAML); they win over `config`"),
@@ -29,7 +32,7 @@ ARGUMENTS = {
     "backend": ("auto", "auto, rclpy or dds; or the name of a bag to write, such as run.mcap"),
     "distro": ("", "ROS distribution for the backend dds; none: ROS_DISTRO"),
     "autostart": ("true", "false: it waits until ROS configures and activates it, as a managed node"),
-    "python": (sys.executable, "the Python that neurosim is installed for"),
+    "python": (PYTHON, "the Python that neurosim is installed for"),
 }
 """Defaults and explanations."""
 

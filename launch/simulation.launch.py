@@ -10,6 +10,7 @@ ends. Nothing here imports rclpy.
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -27,6 +28,8 @@ from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
+PYTHON = f"{os.environ['VIRTUAL_ENV']}/bin/python" if "VIRTUAL_ENV" in os.environ else sys.executable
+"""That of the virtual environment that is active: `ros2` itself runs in that of ROS."""
 ARGUMENTS = {
     "scene": ("", "settings of the simulation (YAML): scene, vehicle, sensors; none: a generated apartment"),
     "lockstep": ("false", "wait for the command of every control period instead of running in real time"),
@@ -45,7 +48,7 @@ ARGUMENTS = {
     "rviz_config": ("", "what RViz shows; none: images, events, tf, trail and points of `vehicle`"),
     "vehicle": ("drone", "the vehicle that RViz shows"),
     "rerun": ("false", "open Rerun"),
-    "python": (sys.executable, "the Python that neurosim is installed for"),
+    "python": (PYTHON, "the Python that neurosim is installed for"),
 }
 """Defaults and explanations."""
 

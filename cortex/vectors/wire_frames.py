@@ -11,19 +11,16 @@ from cortex.schema import schema_of
 from cortex.wire import (
     BATCH,
     LARGE,
-    MASK,
     MESSAGE,
     RECORD,
     SLOT,
     AttachAnswer,
     AttachKey,
     Header,
-    RingPlace,
     answer_frame,
     attach_key,
     control_frame,
     pack_header,
-    pack_place,
     resume_key,
 )
 
@@ -48,18 +45,17 @@ def frames() -> list[Frame]:
     """Return one frame of each kind that carries messages, and those by which readers attach and resume."""
     stamped = Header(MESSAGE, SOURCE, FINGERPRINT, 7, -5, 2**62, len(BODY), 0)
     plain = stamped._replace(stamp_ns=None)
-    place = RingPlace(2, 8, 1 << 16, 4242, 9)
     records = b"".join(
         RECORD.pack(stamp, 100 + stamp, size, 0) + BODY[:size] + bytes(-size % 8)
         for stamp, size in ((1, 12), (2, 0), (3, 8))
     )
     batch = stamped._replace(kind=BATCH, stamp_ns=0, body_size=len(records), aux=3)
     nothing = batch._replace(body_size=0, aux=0)
-    slot = stamped._replace(kind=SLOT, body_size=50_000, aux=2 << 32 | 5)
+    slot = stamped._replace(kind=SLOT, body_size=50_000, aux=5)
     asked = AttachKey(SOURCE, READER, True, True, 66, 1500, True)
     key = attach_key(asked, stamped=True)
     latched = pack_header(stamped) + BODY
-    answer = AttachAnswer(8, 3, (place,), latched)
+    answer = AttachAnswer(8, latched)
     shown_key = {"kind": "A", "source": SOURCE, "stamped": True, "reader": READER}
     shown_key |= {"options": int.from_bytes(key[24:], "little")}
     return [
@@ -76,21 +72,17 @@ def frames() -> list[Frame]:
             _shown(batch) | {"body": records.hex(), "records": [BODY.hex(), "", BODY[:8].hex()]},
         ),
         Frame("batch of nothing", pack_header(nothing).hex(), _shown(nothing) | {"body": "", "records": []}),
-        Frame(
-            "descriptor of a slot",
-            (pack_header(slot) + MASK.pack(0b1001) + pack_place(place)).hex(),
-            _shown(slot) | {"mask": 0b1001, "place": place._asdict()},
-        ),
+        Frame("slot", pack_header(slot).hex(), _shown(slot)),
         Frame("attach key", key.hex(), shown_key),
         Frame(
             "answer",
             answer_frame(key, answer).hex(),
-            shown_key | {"next": 8, "column": 3, "places": [place._asdict()], "latched": latched.hex()},
+            shown_key | {"next": 8, "latched": latched.hex()},
         ),
         Frame(
-            "answer without column",
-            answer_frame(key, AttachAnswer(0, None, (), b"")).hex(),
-            shown_key | {"next": 0, "column": None, "places": [], "latched": ""},
+            "answer without latched message",
+            answer_frame(key, AttachAnswer(0, b"")).hex(),
+            shown_key | {"next": 0, "latched": ""},
         ),
         Frame(
             "resume key",
@@ -129,7 +121,7 @@ def malformed() -> list[dict[str, str]]:
         "reserved bytes of a record": put(batch, 64 + 20, "01"),
         "records that do not fill the batch": put(batch[:-16], 48, f"{len(batch) // 2 - 72:02x}"),
         "a batch of nothing that has a body": put(batch, 56, "00"),
-        "an answer with more places than it has": put(answer, 44, "02"),
+        "an answer with more than its latched message": answer + "00",
         "an answer whose latched message is cut off": answer[:-2],
     }
     return [{"name": name, "frame": frame} for name, frame in bad.items()]

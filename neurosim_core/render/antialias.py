@@ -37,6 +37,7 @@ from neurosim_core.render.antialias_groups import even_thread_count, group_kerne
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.coverage import (
+    APART,
     FACE_COUNT_MAX,
     RAY_COUNT,
     RAY_WIDTH,
@@ -53,7 +54,7 @@ from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.shading import pixel_shader
+from neurosim_core.render.shading import pixel_shader, surface_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _CELLS = 4
@@ -135,6 +136,7 @@ def _cover_pixel(
     ray_out: wp.array[wp.vec3],
     hit_out: wp.array[wp.vec3],
     normal_out: wp.array[wp.vec3],
+    slope_out: wp.array[wp.vec2],
 ) -> int:
     """Find the faces that a pixel shows, -1: the sky; how many points show each; where to shade it.
 
@@ -147,7 +149,7 @@ def _cover_pixel(
 def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are pixels, for all terms."""
     radiance_of = pixel_shader(terms)
-    radiance_beyond = pixel_shader(terms, beyond=True)
+    shade = surface_shader(terms, beyond=True)
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree) if terms.embree else None
@@ -189,6 +191,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         ray = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
         met = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
         normal = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
+        slope = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec2)
         count = _cover_pixel(
             scene,
             out.face,
@@ -206,6 +209,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
             ray,
             met,
             normal,
+            slope,
         )
         total = wp.vec3(0.0)
         whole = float(0.0)
@@ -217,8 +221,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
             hit.v = met[entry][2]
             hit.normal = normal[entry]
             width_rad = footprint_width(number[entry]) * spread_rad
-            light = radiance_beyond(scene, bodies, instant, -1, q, ray[entry], origin, width_rad, hit)
-            total += number[entry] * light
+            total += number[entry] * shade(scene, ray[entry], origin, width_rad, hit, slope[entry])
             whole += number[entry]
         if count < 0:
             whole = float(RAY_COUNT)
@@ -295,9 +298,10 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
         MOST=FACE_COUNT_MAX,
         TEXTURED=textured,
         EMISSIVE=emissive,
-        UNIT=False,
+        UNIT=True,
         LIGHT_WITHIN=True,
         SHARPNESS=round(100 * SHARPNESS),
+        APART=round(100 * APART),
     )
     return wp.func_native(code)(shade_block)
 

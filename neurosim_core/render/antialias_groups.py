@@ -34,7 +34,7 @@ from neurosim_core.render.ray_intersection import UNFUSED, Hit, intersect_bodies
 from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, turn_count
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.shading import pixel_shader
+from neurosim_core.render.shading import pixel_shader, surface_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
@@ -46,8 +46,8 @@ _COVER_BOUNDS = (64, 16)
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
-Met = wp.types.vector(length=6, dtype=float)
-MetPair = wp.types.vector(length=12, dtype=float)
+Met = wp.types.vector(length=8, dtype=float)
+MetPair = wp.types.vector(length=14, dtype=float)
 
 
 @wp.struct
@@ -222,10 +222,10 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     requested = requested_outputs(outputs)
     locate_pixel = _pixel_locator(terms, images=requested.images, instants=requested.log)
     radiance_of = pixel_shader(terms)
-    radiance_beyond = pixel_shader(terms, beyond=True)
+    shade = surface_shader(terms, beyond=True)
     write_radiance = radiance_writer(outputs, supersampled=False)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=PIXEL_BOUNDS)
     def shade_even_blocks(
         first: int,
         # In:
@@ -280,12 +280,11 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 hit.u = met[1]
                 hit.v = met[2]
                 hit.normal = wp.vec3(met[3], met[4], met[5])
-                radiance = radiance_beyond(
-                    scene, bodies, at.instant, -1, q, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit
-                )
+                slope = wp.vec2(met[6], met[7])
+                radiance = shade(scene, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit, slope)
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=_COVER_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
         first: int,
         # In:
@@ -345,17 +344,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     hit.u = met[7]
                     hit.v = met[8]
                     hit.normal = wp.vec3(met[9], met[10], met[11])
-                    light = radiance_beyond(
-                        scene,
-                        bodies,
-                        at.instant,
-                        -1,
-                        q,
-                        wp.normalize(toward),
-                        origin,
-                        footprint_width(met[1]) * spread_rad,
-                        hit,
-                    )
+                    width_rad = footprint_width(met[1]) * spread_rad
+                    slope = wp.vec2(met[12], met[13])
+                    light = shade(scene, wp.normalize(toward), origin, width_rad, hit, slope)
                     _store_pair(covered[5], pair, met[1] * light)
                 total += _sum_pairs(covered[5], covered[1], covered[2], step)
             whole = float(SAMPLE_COUNT)

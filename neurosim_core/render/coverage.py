@@ -14,11 +14,13 @@ RAY_WIDTH = wp.constant(RAY_COUNT**-0.5)
 """Width of the footprint of one of them [px]."""
 FACE_COUNT_MAX = 48
 """Most faces of a block of 4 x 4 pixels and the ring around it."""
-SHARPNESS = wp.constant(0.7)
+SHARPNESS = wp.constant(0.64)
 """Width of the footprint that a texture is averaged over where a surface fills a pixel [px].
 
 A lookup blurs more than a mean does.
 """
+APART = wp.constant(0.42)
+"""How far from the middle of a long footprint the two lookups are whose mean is taken, of its length."""
 
 
 @wp.func_native(read_native(__file__, "sample_point", SAMPLES=RAY_COUNT))

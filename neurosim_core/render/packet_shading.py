@@ -55,6 +55,7 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
         EMISSIVE=emissive,
         UNIT=unit_normals,
         LIGHT_WITHIN=False,
+        APART=0,
     )
     return wp.func_native(code)(shade_packet)
 
@@ -106,5 +107,6 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
         EMISSIVE=emissive,
         UNIT=False,
         LIGHT_WITHIN=False,
+        APART=0,
     )
     return wp.func_native(code)(render_packet)

@@ -20,6 +20,7 @@ from neurosim_core.render.outputs import RenderOutputs, geometry_writer, radianc
 from neurosim_core.render.ray_intersection import (
     FAR_M,
     UNFUSED,
+    Hit,
     intersect_bodies,
     intersect_candidate,
     intersect_scene,
@@ -240,7 +241,10 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                     origin = view.p_WC[instant]
                     q = view.q_WC[instant]
                     ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-                    hit = intersect_candidate(scene, origin, ray, faces[member])
+                    hit = Hit()
+                    hit.face = faces[member]
+                    if wp.static(requested.radiance or requested.geometry or terms.bodies):
+                        hit = intersect_candidate(scene, origin, ray, faces[member])
                     unresolved = hit.face == UNRESOLVED
                     if not unresolved:
                         body = int(-1)

@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.coverage import APART
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
 from neurosim_core.render.ray_intersection import Hit
 from neurosim_core.render.render_terms import RenderTerms
@@ -21,17 +22,13 @@ _OFFSET_M = wp.constant(1.0e-3)
 
 
 @cache
-def pixel_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
+def pixel_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that says what light a pixel receives along a ray.
 
     Its parameters: the scene and its bodies; the instant; the body that the ray hits, -1: none; orientation
     of the camera; the ray, in W, and its origin; its spread [rad]; what it hits.
-
-    Args:
-        terms: Of the kernel.
-        beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not.
     """
-    shade = _scene_shader(terms, beyond)
+    shade = surface_shader(terms)
     shade_body = _body_shader(terms) if terms.bodies else None
 
     @wp.func
@@ -49,18 +46,26 @@ def pixel_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
         if wp.static(terms.bodies):
             if body >= 0:
                 return shade_body(scene, bodies, instant, body, q_WC, ray, origin, spread_rad, hit)
-        return shade(scene, ray, origin, spread_rad, hit)
+        return shade(scene, ray, origin, spread_rad, hit, wp.vec2(0.0))
 
     return radiance_of
 
 
 @cache
-def _scene_shader(terms: RenderTerms, beyond: bool) -> wp.Function:
-    """Return the function that says what light comes from what stands still, or from the sky."""
-    surface_albedo, emitted = albedo_reader(terms), _emission(terms)
+def surface_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
+    """Return the function that says what light comes from what stands still, or from the sky.
+
+    Args:
+        terms: Of the kernel.
+        beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not. The
+            texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
+    """
+    surface_albedo, emitted = albedo_reader(terms, beyond=beyond), _emission(terms)
 
     @wp.func
-    def shade(scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit) -> wp.vec3:
+    def shade(
+        scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit, slope: wp.vec2
+    ) -> wp.vec3:
         if hit.face < 0:
             return scene.sky
         corner = 3 * hit.face
@@ -71,7 +76,7 @@ def _scene_shader(terms: RenderTerms, beyond: bool) -> wp.Function:
             v = wp.clamp(v, 0.0, 1.0 - u)
         w = 1.0 - u - v
         facing = wp.dot(ray, hit.normal)
-        albedo = surface_albedo(scene, spread_rad, facing, hit)
+        albedo = surface_albedo(scene, spread_rad, facing, hit, slope)
         if wp.static(terms.baked):
             side = wp.where(facing > 0.0, 1, 0)
             light = (
@@ -149,23 +154,29 @@ def _body_shader(terms: RenderTerms) -> wp.Function:
                     if wp.mesh_query_ray_anyhit(bodies.shading, start, to_lamp / distance, distance):
                         part = wp.vec3(0.0)
             light += part
-        return reflect_light(surface_albedo(scene, spread_rad, facing, hit), light, emitted(scene, hit))
+        return reflect_light(
+            surface_albedo(scene, spread_rad, facing, hit, wp.vec2(0.0)), light, emitted(scene, hit)
+        )
 
     return shade_body
 
 
 @cache
-def albedo_reader(terms: RenderTerms) -> wp.Function:
+def albedo_reader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
     """Return the function that reads the base colour and the texture of what is hit.
 
     The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
     side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much
     as along. The short side or the geometric mean would keep more detail there, but alias along the surface,
-    and aliasing makes events that no sensor sees. |cos| counts as at least 0.05.
+    and aliasing makes events that no sensor sees. |cos| counts as at least 0.05. The middle of the surface in
+    a pixel (`beyond`) has room for two lookups along the footprint, which blur less: as far apart as the
+    surface recedes, and close together where the texture is coarser than the pixel.
     """
 
     @wp.func
-    def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
+    def surface_albedo(
+        scene: SceneData, spread_rad: float, facing: float, hit: Hit, slope: wp.vec2
+    ) -> wp.vec3:
         material = scene.face_material[hit.face]
         albedo = scene.base_color[material]
         if wp.static(terms.textured):
@@ -184,7 +195,16 @@ def albedo_reader(terms: RenderTerms) -> wp.Function:
                 else:
                     footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
                     lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
-                    albedo = wp.cw_mul(albedo, sample_texture(scene.texels, scene.levels, texture, uv, lod))
+                    if wp.static(beyond):
+                        apart = APART * spread_rad * wp.clamp(lod + 1.0, 0.0, 1.0)
+                        away = apart * slope[0] * (scene.corner_uv[corner] - scene.corner_uv[corner + 2])
+                        away += apart * slope[1] * (scene.corner_uv[corner + 1] - scene.corner_uv[corner + 2])
+                        color = sample_texture(scene.texels, scene.levels, texture, uv + away, lod)
+                        color += sample_texture(scene.texels, scene.levels, texture, uv - away, lod)
+                        albedo = wp.cw_mul(albedo, 0.5 * color)
+                    else:
+                        color = sample_texture(scene.texels, scene.levels, texture, uv, lod)
+                        albedo = wp.cw_mul(albedo, color)
         return albedo
 
     return surface_albedo

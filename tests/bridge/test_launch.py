@@ -57,7 +57,8 @@ class LaunchConfiguration:
 
 @pytest.fixture
 def fake_launch(monkeypatch):
-    """A `launch` of a few lines in sys.modules."""
+    """A `launch` of a few lines in sys.modules, and no virtual environment."""
+    monkeypatch.delenv("VIRTUAL_ENV", raising=False)
     launch = types.ModuleType("launch")
     launch.LaunchDescription = lambda entities: entities
     launch.actions = types.ModuleType("launch.actions")
@@ -120,6 +121,13 @@ def test_the_bridge_with_all_its_arguments(fake_launch):
     assert command[-3:] == ["--ros-args", "--params-file", "p.yaml"]
     command = commands(run(path, params_file="p.yaml", autostart="false"))["cortex_bridge"]
     assert command[-5:] == ["--ros-args", "--params-file", "p.yaml", "-p", "autostart:=false"]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_virtual_environment_that_is_active_runs_it(fake_launch, monkeypatch, path):
+    """Though `ros2 launch` runs in the Python of ROS."""
+    monkeypatch.setenv("VIRTUAL_ENV", "/home/me/ws/venv")
+    assert {command[0] for command in commands(run(path)).values()} == {"/home/me/ws/venv/bin/python"}
 
 
 def test_the_bridge_is_a_node_where_launch_ros_is(fake_launch_ros):
@@ -216,7 +224,7 @@ def test_an_argument_that_is_neither_true_nor_false(fake_launch):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_no_launch_file_imports_rclpy(path):
     """They run where only `launch` is installed."""
-    allowed = {"__future__", "launch", "launch_ros", "pathlib", "sys", "tempfile", "typing"}
+    allowed = {"__future__", "launch", "launch_ros", "os", "pathlib", "sys", "tempfile", "typing"}
     for node in ast.walk(ast.parse(path.read_text())):
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
         names += [node.module] if isinstance(node, ast.ImportFrom) else []

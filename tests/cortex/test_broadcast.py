@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zmq
@@ -20,7 +21,6 @@ import cortex.link
 import cortex.subscriber
 from cortex import keep_last, reliable
 from cortex.compiled import native
-from cortex.shm import ShmUnavailable
 from cortex.wire import MESSAGE, Header, pack_header
 
 pytestmark = pytest.mark.skipif(native is None, reason="no C module")
@@ -282,7 +282,7 @@ def test_a_reader_cannot_write_to_the_ring(ring):
 
 
 @pytest.mark.parametrize(
-    "said", [b"", b"x" * 24, (b"CTXCAST1" * 3)], ids=["nothing", "nonsense", "no descriptors"]
+    "said", [b"", b"x" * 24, (b"CTXCAST2" * 3)], ids=["nothing", "nonsense", "no descriptors"]
 )
 def test_who_says_something_else_is_refused(ring, said):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
@@ -312,7 +312,7 @@ def test_processes_speak_through_the_ring(make_node, start_child, policy):
         assert is_whole(block)
         numbers.append(block.number)
     assert numbers == sorted(set(numbers))
-    assert subscriber.carriers == ["ipc, ring, shared memory"]
+    assert subscriber.carriers == ["ipc, shared memory"]
     counters = subscriber.counters
     assert numbers[-1] - numbers[0] <= 59 + counters.lost + counters.overtaken
     assert counters.rejected == 0
@@ -387,20 +387,32 @@ def test_what_came_before_the_answer_was_read_counts(make_node, start_child, mon
 
 
 @pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
-def test_a_reader_that_cannot_map_the_first_slots(make_node, start_child, monkeypatch, policy):
+def test_a_reader_that_cannot_map_the_ring(make_node, start_child, monkeypatch, policy):
     """It attaches anew, through the socket: the latched message comes all the same."""
-
-    def refuse(*_):
-        raise ShmUnavailable("not here")
-
     child = start_child("peer")
     child.hear()
     child.ask(do="publisher", topic="/blocks", type="Block", latch=True)
     child.ask(do="publish", topic="/blocks", count=1, start=7, size=100_000)
-    monkeypatch.setattr(cortex.link, "RingView", refuse)
+    asked = []
+
+    class Refusing:
+        """A reader's end that is welcome, and cannot map what it is given."""
+
+        def __init__(self, *arguments):
+            asked.append(native.RingReader(*arguments))
+
+        def welcomed(self):
+            if asked[-1].welcomed() is not None:
+                raise OSError("not here")
+
+        def __getattr__(self, name):
+            return getattr(asked[-1], name)
+
+    monkeypatch.setattr(cortex.link, "native", SimpleNamespace(RingReader=Refusing))
     subscriber = make_node().subscriber("/blocks", Block, policy=policy)
     block = subscriber.recv(SOON_S)
     assert (block.number, is_whole(block)) == (7, True)
+    assert asked
     assert subscriber.carriers == ["ipc"]
     child.ask(do="publish", topic="/blocks", count=2, start=8, size=100_000)
     assert [subscriber.recv(SOON_S).number for _ in range(2)] == [8, 9]
@@ -408,11 +420,11 @@ def test_a_reader_that_cannot_map_the_first_slots(make_node, start_child, monkey
     child.finish()
 
 
-def test_a_reader_in_the_same_process_needs_no_ring(make_node):
+def test_a_reader_in_the_same_process_has_the_ring_as_others(make_node):
     node = make_node()
     publisher = node.publisher("/blocks", Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable())
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(make_block(1, 100))
     assert subscriber.recv(SOON_S).number == 1
-    assert subscriber.carriers == ["inproc, shared memory"]
+    assert subscriber.carriers == ["ipc, shared memory"]

@@ -63,11 +63,10 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
     assert done.stdout.startswith(f"{len(lines)} bodies, ")
 
 
-@pytest.mark.parametrize("what", ["ring", "broadcast"])
-def test_between_threads(programs: Path, what: str) -> None:
+def test_between_threads(programs: Path) -> None:
     """Under the thread sanitizer: nothing is torn, lost or written while somebody looks at it."""
     done = subprocess.run(
-        [programs / f"{what}_test"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [programs / "broadcast_test"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
@@ -122,7 +121,7 @@ def test_loans_arrive_as_views_of_shared_memory(
             expected = np.arange(number, number + 64 * height, dtype=np.uint64).astype(np.uint8)
             assert np.array_equal(picture.pixels.ravel(), expected)
             assert np.array_equal(picture.depth, np.full((height, 64), number, np.float32))
-            assert bool(shared_mappings()) == (height == 600)
+            assert shared_mappings()
             del picture
         assert (pictures.counters.lost, pictures.counters.rejected) == (0, 0)
         peer.end()
@@ -314,7 +313,7 @@ def test_killed_cpp_reader_frees_its_slots(
 def test_cpp_publisher_takes_slots_of_the_dead_back(
     start: Callable[..., Peer], make_node: Callable[..., Node]
 ) -> None:
-    """A reader that is killed with all slots of its share leaves them to the next one with its column."""
+    """A reader that is killed with all slots of its share leaves them to the next one."""
     node = make_node()
     start("publish", "/scan", -1, 20_000)
     slow = start("count", "/scan", "reliable", 20_000, 3)
@@ -383,16 +382,7 @@ def test_lies_are_rejected(
         malformed = make_frame(b"M", 0, body[:8] + b"\xff" * 8 + body[16:])
         impostor.xpub.send(malformed)
         impostor.xpub.send(make_frame(b"M", 1, body))
-        # One that is a process's standard input may have been replaced meanwhile: nothing follows from it.
-        place = wire.RingPlace(1, 4, 4096, os.getpid(), 0)
-        impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(2, 3, (place,), b"")))
-        # A ring of a process that cannot be seen makes it ask again, without shared memory.
-        place = wire.RingPlace(2, 4, 4096, 2**31 - 2, 0)
-        impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(2, 3, (place,), b"")))
-        second = impostor.await_key()
-        assert second[16:24] != key[16:24]
-        assert not second[24] & 1
-        impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(2, None, (), b"")))
+        impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(2, b"")))
         impostor.xpub.send_multipart([make_frame(b"L", 2, b"", size=len(body)), body])
         end = codec_of(Scan).encode(Scan(-1, np.zeros(0, np.float32)), 1000)
         assert end is not None
@@ -401,7 +391,7 @@ def test_lies_are_rejected(
         assert result["received"] + result["wrong"] >= 1
         assert result["rejected"] == len(bad) + 1
         assert result["lost"] == 2  # numbers 3 and 4
-        assert "cannot share memory" in peer.end()
+        peer.end()
     finally:
         impostor.close()
     shutil.rmtree(runtime, ignore_errors=True)

@@ -26,7 +26,6 @@ from cortex.codec import codec_of
 from cortex.compiled import native
 from cortex.node import Node
 from cortex.policy import Policy, keep_last, latest, reliable
-from cortex.shm import RingView
 
 __all__ = ["programs", "start"]
 
@@ -79,7 +78,7 @@ def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: 
         assert (received.stamp_ns, received.ranges.size) == (number, sizes()[number % 5])
         assert (received.ranges == number).all()
     assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
-    assert scans.carriers == ["ipc, ring, shared memory"]
+    assert scans.carriers == ["ipc, shared memory"]
 
 
 def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
@@ -91,10 +90,8 @@ def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
     assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
 
 
-def test_messages_without_a_slot_go_through_the_ring(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
-    """A C++ publisher that has no descriptor left for slots sends whole bodies through the ring."""
+def test_no_memory_for_slots(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """A C++ publisher that has no descriptor left for slots sends its readers to their sockets."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "full")
     for number in range(100):
@@ -143,7 +140,7 @@ def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[...
     for number in range(1200):  # each in turn, as a reliable one holds up the publisher
         assert {reader.recv(SOON_S).stamp_ns for reader in readers} == {number}
         if number == 0:
-            assert {reader.carriers[0] for reader in readers} == {"ipc, ring, shared memory"}
+            assert {reader.carriers[0] for reader in readers} == {"ipc, shared memory"}
         if number % 100 == 50:
             passers.append(node.subscriber("/scan", Scan, policy=keep_last(4)))
         elif number % 100 == 0 and passers:
@@ -263,10 +260,8 @@ class SlowReader:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.connect(address)
         self._socket.subscribe(self.key)
-        column = self.answer().column
-        assert column is not None
+        self.answer()
         assert self._ring.welcomed() is not None
-        self.column: int = column
 
     def answer(self) -> wire.AttachAnswer:
         """The publisher's next answer."""
@@ -276,6 +271,12 @@ class SlowReader:
     def frame(self) -> bytes:
         """The next frame."""
         found: bytes = self._ring.receive(zmq.DONTWAIT)
+        return found
+
+    def body(self) -> np.ndarray:
+        """What the frame that was read last says is in a slot."""
+        found: np.ndarray | None = self._ring.take_body()
+        assert found is not None
         return found
 
     def leave(self) -> None:
@@ -347,31 +348,17 @@ def test_cpp_reader_counts_what_it_had_no_time_for(
     wait_for(lambda: counted(watcher) == [sent])
 
 
-def is_ring(place: wire.RingPlace) -> bool:
-    """Whether its process has this ring, or another, there."""
-    try:
-        return "cortex-" in os.readlink(f"/proc/{place.pid}/fd/{place.fd}")
-    except FileNotFoundError:
-        return False
-
-
 def test_slots_of_a_closed_publisher_stay(
     attach: Callable[..., tuple[SlowReader, dict[str, int]]],
 ) -> None:
-    """What was sent through shared memory is there until its reader has given it back."""
+    """What was sent through shared memory is there when its process has ended."""
     reader, result = attach(5, 20_000)
     assert result == {"taken": 5, "published": 5}
-    frames = [reader.frame() for _ in range(5)]
+    reader.publisher.end()
+    for number in range(5):
+        assert reader.frame()[3:4] == b"S"
+        assert reader.body().tobytes() == body_of(number, 20_000)
     assert reader.frame()[3:4] == b"B"
-    offset = wire.HEADER_SIZE + wire.MASK.size
-    place = wire.parse_place(frames[0], offset)
-    assert is_ring(place)
-    ring = RingView(reader.source, *place, reader.column)
-    for number, frame in enumerate(frames):
-        assert frame[3:4] == b"S"
-        size, aux = (int.from_bytes(frame[at : at + 8], "little") for at in (48, 56))
-        assert ring.lease(aux & 0xFFFFFFFF, number, size).tobytes() == body_of(number, 20_000)
-    wait_for(lambda: not is_ring(place))  # all was given back
 
 
 class RingImpostor(Impostor):
@@ -387,7 +374,7 @@ class RingImpostor(Impostor):
         source, number, page, bell = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
         self.ring.add(fd, page, bell, False, 0)
-        self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
+        self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
 
     def close(self) -> None:
         super().close()
@@ -424,7 +411,7 @@ def bad_frames() -> list[bytes]:
         make_frame(b"B", 1, record, aux=2),
         make_frame(b"B", 1, record, aux=2**64 - 1),
         make_frame(b"B", 1, record[:-8], aux=1),
-        make_frame(b"S", 0, bytes(40), size=40, aux=1 << 32),  # its place is of another ring
+        make_frame(b"S", 0, b"", size=40, aux=9),  # there is no such slot
     ]
 
 
@@ -447,7 +434,7 @@ def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> 
     second = impostor.await_key()  # it attaches anew, without shared memory
     assert second[16:24] != key[16:24]
     assert not second[24] & 1
-    impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(6, None, (), b"")))
+    impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(6, b"")))
     impostor.xpub.send(make_frame(b"M", 6, body_of(6)))
     impostor.xpub.send_multipart([make_frame(b"L", 7, b"", size=len(body_of(7))), body_of(7)])
     impostor.xpub.send(make_frame(b"M", 8, codec_of(Scan).encode(scan(-1, 0), 1000)))
@@ -456,14 +443,31 @@ def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> 
     assert result["wrong"] == 0
     assert result["rejected"] == len(bad) + 1 + 1  # with the body, and the ring
     assert result["lost"] == 2  # 4 and 5
-    assert "cannot be read" in peer.end()
+    assert "nothing more comes through its ring" in peer.end()
+
+
+def test_ring_that_ends(programs: Path, impostor: RingImpostor) -> None:
+    """All that is in it is read, what follows comes through the socket, and nothing is rejected."""
+    peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
+    impostor.take_in(impostor.await_key())
+    for number in range(3):
+        assert impostor.ring.send(make_frame(b"M", number, body_of(number)))
+    impostor.ring.dissolve()
+    second = impostor.await_key()
+    assert not second[24] & 1
+    impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(3, b"")))
+    impostor.xpub.send_multipart([make_frame(b"L", 3, b"", size=len(body_of(3))), body_of(3)])
+    impostor.xpub.send(make_frame(b"M", 4, codec_of(Scan).encode(scan(-1, 0), 1000)))
+    result = result_of(peer)
+    assert (result["received"], result["wrong"], result["rejected"], result["lost"]) == (4, 0, 0, 0)
+    peer.end()
 
 
 def test_publisher_that_takes_nobody_in(programs: Path, impostor: RingImpostor) -> None:
     """Its subscriber reads the socket."""
     peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
     key = impostor.await_key()
-    impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
+    impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
     impostor.xpub.send(make_frame(b"M", 0, body_of(0)))
     impostor.xpub.send(make_frame(b"M", 1, codec_of(Scan).encode(scan(-1, 0), 1000)))
     assert result_of(peer)["received"] == 1

@@ -66,7 +66,7 @@ class Stream:
 
 def slots_held(publisher):
     with publisher._outlets.lock:
-        return sum(ring.outstanding(column) for ring in publisher._large._rings for column in range(64))
+        return publisher._fanout.ring._ring.leased()
 
 
 def goes_on(stream, count=20):
@@ -358,3 +358,49 @@ def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
     assert subscriber.counters.lost == 0
     child.finish()
     assert "no shared memory" in child.errors()
+
+
+def test_no_memory_for_slots(make_node, start_child, runtime):
+    """Readers of a ring go on through their sockets, in order: who is reliable and reads loses nothing."""
+    child = start_child("peer", limit_file_bytes=1_000_000)
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
+    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(8, SOON_S))
+    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+    for number, size in enumerate((100, 100, 1_000_000, 100, 20_000, 300_000)):
+        child.say(do="publish", topic="/blocks", count=1, start=number, size=size)
+        block = subscriber.recv(SOON_S)
+        assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
+        assert child.hear()["delivered"] == 1
+        assert ("shared memory" in subscriber.carriers[0]) == (number < 2)
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
+    child.finish()
+    assert "no shared memory" in child.errors()
+
+
+@pytest.mark.parametrize("policy", [POLICIES[0], ["reliable", {"depth": 4, "timeout_s": 0.05}]], ids=str)
+def test_no_memory_for_slots_and_a_reader_that_stands_still(start_child, runtime, policy):
+    """The publisher waits for its time only; what came before is there, and what is lost is counted once."""
+    child, reader = start_child("peer", limit_file_bytes=1_000_000), start_child("peer")
+    child.hear()
+    reader.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    reader.ask(do="subscriber", topic="/blocks", type="Block", policy=policy)
+    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+    with reader.stopped():
+        child.ask(do="publish", topic="/blocks", count=4, size=100)
+        delivered = child.ask(do="publish", topic="/blocks", count=5, start=4, size=1_000_000)["delivered"]
+        assert delivered == (0 if policy[0] == "reliable" else 5)
+    published, received, last = 9, 0, -1
+    while last < 9:
+        child.ask(do="publish", topic="/blocks", count=1, start=published, size=100)
+        published += 1
+        got = reader.ask(do="receive", topic="/blocks", until=9, timeout_s=0.02)
+        assert got["ordered"]
+        assert got["whole"]
+        received, last = received + got["count"], max(last, got["last"])
+    counters = reader.ask(do="counters", topic="/blocks")
+    assert (counters["received"], counters["received"] + counters["lost"]) == (received, last + 1)
+    assert received >= 5
+    child.finish()
+    reader.finish()

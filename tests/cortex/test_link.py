@@ -18,7 +18,6 @@ from cortex.codec import codec_of
 from cortex.context import new_socket
 from cortex.link import Link
 from cortex.records import PublisherRecord
-from cortex.shm import Ring
 from cortex.subscriber import Subscriber
 from cortex.wire import (
     ATTACH,
@@ -28,13 +27,10 @@ from cortex.wire import (
     LARGE,
     MESSAGE,
     RECORD,
-    SLOT,
     AttachAnswer,
     Header,
-    RingPlace,
     answer_frame,
     pack_header,
-    pack_place,
     parse_attach_key,
 )
 
@@ -52,7 +48,7 @@ class Feed:
 
     SOURCE = 0x0123456789ABCDEF
 
-    def __init__(self, kind, *, shared=True):
+    def __init__(self, kind):
         self.codec = codec_of(kind)
         self.socket = new_socket(zmq.XPUB, high_water_mark=0)
         address = f"inproc://feed-{next(_numbers)}"
@@ -60,10 +56,7 @@ class Feed:
         record = PublisherRecord(
             "/feed", self.SOURCE, kind.__name__, self.codec.fingerprint, self.codec.schema.to_json(), False
         )
-        self.ring = Ring(self.SOURCE, 0, slots=4, slot_bytes=4096)
-        self.column = 5
         self.sequence = -1
-        self.large = SLOT if shared else LARGE
         self.subscriber = Subscriber("/feed", self.codec, keep_last(1000))
         self.link = Link(
             record,
@@ -71,16 +64,13 @@ class Feed:
             address,
             policy=self.subscriber.policy,
             local=True,
-            shared_memory=True,
+            shared_memory=False,
             counters=self.subscriber.counters,
             clock_offset_ns=0,
         )
         self.subscriber.connect(self.link)
         self.key = wait_for(self._attach)
-        self.place = RingPlace(0, self.ring.slots, self.ring.slot_bytes, self.ring.pid, self.ring.fd)
-        shown = AttachAnswer(0, self.column, (self.place,), b"")
-        answer = shown if shared else AttachAnswer(0, None, (), b"")
-        self.answer = answer_frame(self.key, answer)
+        self.answer = answer_frame(self.key, AttachAnswer(0, b""))
         self.socket.send(self.answer)
         assert self.subscriber.wait_for_publisher(SOON_S)
 
@@ -111,13 +101,6 @@ class Feed:
             return [self.header(kind, len(body)) + body]
         if kind == LARGE:
             return [self.header(kind, len(body)), body]
-        if kind == SLOT:
-            slot = self.ring.acquire()
-            assert slot >= 0, "no slot came back"
-            self.ring.buffer(slot)[: len(body)] = np.frombuffer(body, np.uint8)
-            self.ring.commit(slot, self.sequence, len(body), 1 << self.column)
-            mask = struct.pack("<Q", 1 << self.column)
-            return [self.header(kind, len(body), slot) + mask + pack_place(self.place)]
         if kind == BATCH:
             record = RECORD.pack(0, 0, len(body), 0) + body + bytes(-len(body) % 8)
             return [self.header(kind, len(record), 1) + record]
@@ -132,30 +115,27 @@ class Feed:
                 return taken
 
     def still_lives(self, value):
-        """The next good messages arrive, one of each kind, and all slots come back."""
-        for kind in (MESSAGE, self.large, BATCH):
+        """The next good messages arrive, one of each kind."""
+        for kind in (MESSAGE, LARGE, BATCH):
             self.socket.send_multipart(self.frames(kind, value))
             assert self.drain() == [value], kind
-        assert self.ring.outstanding(self.column) == 0
 
     def close(self):
         self.subscriber.close()
         self.socket.close(0)
-        self.ring.close()
 
 
 @pytest.fixture(params=[Number, Scan], ids=lambda kind: kind.__name__)
 def feed(request, runtime):
-    """A link that shares memory."""
+    """A link to a publisher of either type."""
     made = Feed(request.param)
     yield made
     made.close()
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_the_feed_is_what_a_publisher_sends(runtime, shared):
+def test_the_feed_is_what_a_publisher_sends(runtime):
     """Without this the tests below could pass by rejecting everything."""
-    feed = Feed(Number, shared=shared)
+    feed = Feed(Number)
     try:
         feed.still_lives(7)
         counters = feed.subscriber.counters
@@ -176,14 +156,6 @@ BAD = {
     "large of another size": lambda f: [f.header(LARGE, 10), b"123"],
     "large over the limit": lambda f: [f.header(LARGE, BODY_LIMIT + 1), b"123"],
     "large that does not decode": lambda f: [f.header(LARGE, 5), b"12345"],
-    "descriptor without mask": lambda f: [f.frames(SLOT, 1)[0][:-40]],
-    "descriptor with more": lambda f: [f.frames(SLOT, 1)[0] + b"x"],
-    "slot that does not exist": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
-    "slot far outside": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 0xFFFFFFFF)],
-    "slot of another size": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 17)],
-    "slot larger than it is": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 1 << 20)],
-    "copy of a slot that does not exist": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
-    "copy of more than a slot holds": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 48, "<Q", 4097)],
     "batch of records that are not there": lambda f: [f.header(BATCH, 0, 2)],
     "batch of records not counted": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 0)],
     "batch of too many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2)],
@@ -193,10 +165,7 @@ BAD = {
     "batch with a record too long": lambda f: [
         _with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)
     ],
-    "answer with too many rings": lambda f: [_with(f.answer, 44, "<I", 5)],
-    "answer with five rings": lambda f: [_with(f.answer, 44, "<I", 5) + 4 * f.answer[-32:]],
-    "answer with rings that are not there": lambda f: [_with(f.answer, 44, "<I", 2)],
-    "answer with a column too high": lambda f: [_with(f.answer, 40, "<I", 64)],
+    "answer with more than it says": lambda f: [f.answer + b"x"],
     "answer cut short": lambda f: [f.answer[:50]],
 }
 
@@ -207,14 +176,9 @@ def _with(frame, offset, form, value):
     return bytes(data)
 
 
-def _not_granted(frame, offset, form, value):
-    """A descriptor without the reader's bit: it may try to copy the slot."""
-    return _with(_with(frame, offset, form, value), HEADER_SIZE, "<Q", 0)
-
-
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
-    feed = Feed(Number, shared=not name.startswith("large"))
+    feed = Feed(Number)
     caplog.set_level(logging.DEBUG)
     try:
         for _ in range(3):
@@ -236,7 +200,7 @@ def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
 @pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
 def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog):
     """Or somebody who sends rubbish would fill the log."""
-    feed = Feed(Scan, shared=False)
+    feed = Feed(Scan)
     try:
         for more in range(1, 40):
             frames = feed.frames(kind, 1)
@@ -251,7 +215,7 @@ def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog
 @pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
 def test_frames_that_follow_a_good_one_are_junk(runtime, kind):
     """A message has its frames and no more; what is behind them is not taken for another message."""
-    feed = Feed(Number, shared=False)
+    feed = Feed(Number)
     try:
         feed.socket.send_multipart([*feed.frames(kind, 1), b"junk", b""])
         assert feed.drain() == [1]
@@ -268,29 +232,15 @@ def test_a_latched_message_that_is_none_is_rejected(runtime):
         good = pack_header(Header(MESSAGE, feed.SOURCE, feed.codec.fingerprint, 4, 3, 0, len(body), 0)) + body
         for latched in (b"x", good[:-1], _with(good, 8, "<Q", 1), _with(good, 16, "<Q", 1), good[:70]):
             feed.link.expected, feed.link.attached = -1, False
-            feed.socket.send(answer_frame(feed.key, AttachAnswer(5, None, (), latched)))
+            feed.socket.send(answer_frame(feed.key, AttachAnswer(5, latched)))
             assert feed.drain() == []
         assert feed.subscriber.counters.rejected == 5
         feed.link.expected, feed.link.attached = -1, False
-        feed.socket.send(answer_frame(feed.key, AttachAnswer(5, None, (), good)))
+        feed.socket.send(answer_frame(feed.key, AttachAnswer(5, good)))
         assert feed.drain() == [3]
         assert feed.link.expected == 5
     finally:
         feed.close()
-
-
-def test_rings_that_cannot_be_mapped_are_done_without(feed):
-    """Memory that is not what the answer says: the link asks for the messages through the socket."""
-    bad = answer_frame(feed.key, AttachAnswer(0, 3, (RingPlace(9, 4, 4096, 2**31 - 2, 0),), b""))
-    feed.socket.send(bad)
-    assert feed.drain() == []
-    key = wait_for(feed._attach)
-    assert key != feed.key
-    assert not parse_attach_key(key).shared_memory
-    feed.socket.send(answer_frame(key, AttachAnswer(0, None, (), b"")))
-    for kind in (MESSAGE, LARGE, BATCH):
-        feed.socket.send_multipart(feed.frames(kind, 3))
-        assert feed.drain() == [3]
 
 
 @pytest.mark.parametrize("jump", [2**48, 2**63, 2**64 - 1])
@@ -303,14 +253,12 @@ def test_a_number_from_nowhere_does_not_end_the_stream(feed, jump):
     assert feed.subscriber.counters.lost < 2**40
 
 
-@pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("type_", [Number, Scan])
-def test_mutated_frames_never_hurt(runtime, type_, shared):
-    """Whatever comes, the next good message arrives, and all slots come back."""
-    feed = Feed(type_, shared=shared)
-    generator = np.random.Generator(np.random.Philox(key=[shared, len(feed.codec.schema.fields[1].name)]))
-    kinds = (MESSAGE, feed.large, BATCH, ATTACH)
-    rejected = 0
+def test_mutated_frames_never_hurt(runtime, type_):
+    """Whatever comes, the next good message arrives."""
+    feed = Feed(type_)
+    generator = np.random.Generator(np.random.Philox(key=[0, len(feed.codec.schema.fields[1].name)]))
+    kinds = (MESSAGE, LARGE, BATCH, ATTACH)
     try:
         for count in range(FRAMES // 4):
             kind = kinds[count % len(kinds)]
@@ -319,15 +267,10 @@ def test_mutated_frames_never_hurt(runtime, type_, shared):
                 frames.insert(int(generator.integers(len(frames) + 1)), generator.bytes(8))
             feed.socket.send_multipart(frames)
             feed.drain()
-            if feed.socket.poll(0) or feed.link._column != (feed.column if shared else None):
-                rejected += feed.subscriber.counters.rejected
-                feed.close()  # an answer with another column or place was believed
-                feed = Feed(type_, shared=shared)
-            elif count % 8 == 7:
-                feed.sequence += 1  # a gap, so that slots are taken back whose descriptor did not make sense
+            if count % 8 == 7:
                 feed.still_lives(6)
         feed.still_lives(6)
-        assert rejected + feed.subscriber.counters.rejected > FRAMES // 40
+        assert feed.subscriber.counters.rejected > FRAMES // 40
     finally:
         feed.close()
 

@@ -158,3 +158,18 @@ def test_what_a_reliable_reader_has_not_read_is_not_written_over(early):
     ends = explore({"tail": 0, "one": 1, "two": 1}, publisher, tail + loads if early else loads + tail)
     torn = [read for _, (_, read) in ends if (read["one"], read["two"]) != (1, 1)]
     assert bool(torn) == early
+
+
+@pytest.mark.parametrize("left_out", [None, "publisher", "reader"], ids=str)
+def test_what_is_leased_is_not_written(left_out):
+    """The publisher takes a slot while a reader leases it: one of the two sees the other."""
+    publisher = [("store", "word", 0), ("fence",), ("skip unless", "lease", 0, 1), ("store", "body", 2)]
+    reader = [("store", "lease", 1), ("fence",), ("skip unless", "word", 1, 1), ("load", "body")]
+    ends = explore(
+        {"word": 1, "lease": 0, "body": 1},
+        without(publisher, ("fence",) if left_out == "publisher" else None),
+        without(reader, ("fence",) if left_out == "reader" else None),
+    )
+    read = [read["body"] for _, (_, read) in ends if "body" in read]
+    assert read
+    assert (2 in read) == (left_out is not None)

@@ -1,4 +1,4 @@
-"""The same messages over inproc, ipc and tcp, plain and encrypted, with a registry and without."""
+"""The same messages over ipc and tcp, plain and encrypted, with a registry and without."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from peer import Block, Number, Scan, is_whole, make, make_block
 from processes import SOON_S, wait_for
 
 import cortex.node
-from cortex import keep_last, reliable
+from cortex import reliable
 from cortex.context import new_socket
 from cortex.matching import Matcher
 from cortex.places import reach
@@ -52,15 +52,6 @@ def keys_of(base, names):
         (base / name / AUTHORIZED_FILE).write_text(lines)
         (base / name / AUTHORIZED_FILE).chmod(0o644)
     return {name: base / name for name in names}
-
-
-@pytest.mark.parametrize("policy", [keep_last(64), reliable(8, 60.0)], ids=str)
-def test_inproc(make_node, policy):
-    publisher = make_node("one").publisher("/blocks", Block)
-    subscriber = make_node("two").subscriber("/blocks", Block, policy=policy)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    exchange(publisher, subscriber)
-    assert addresses(subscriber) == ["inproc"]
 
 
 TRANSPORTS = {

@@ -156,10 +156,10 @@ def processes_with(text: str) -> list[int]:
 
 def shared_mappings() -> list[str]:
     """Rings that this process has mapped or open."""
-    maps = [line for line in Path("/proc/self/maps").read_text().splitlines() if "memfd:cortex-" in line]
+    maps = [line for line in Path("/proc/self/maps").read_text().splitlines() if "memfd:cortex" in line]
     for entry in os.scandir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             target = os.readlink(entry.path)
-            if "memfd:cortex-" in target:
+            if "memfd:cortex" in target:
                 maps.append(target)
     return maps

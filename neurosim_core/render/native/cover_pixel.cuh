@@ -19,6 +19,7 @@ for (int layer = 0; layer < layer_count; ++layer) {
     number_out.data[found] = number[layer][0];
     ray_out.data[found] = toward / length;
     hit_out.data[found] = wp::vec3(length * near, corner[0] * near, corner[1] * near);
+    slope_out.data[found] = wp::vec2(slope[0], slope[1]);
     normal_out.data[found++] = normal;
     whole += (int)number[layer][0];
 }

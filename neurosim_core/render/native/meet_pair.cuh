@@ -1,7 +1,7 @@
 // CUDA: what a pixel sees of a surface, of the pairs that `cover_block.cuh` leaves: the pixel; the number of points that
 // show it; the part to shade (see `part_of` in `cover_lanes.cuh`), as bits; the direction; distance, weights of the first two
 // corners and the normal of the front where it meets the plane of the part.
-wp::vec_t<12, float> met;
+wp::vec_t<14, float> met;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
@@ -30,5 +30,6 @@ for (int axis = 0; axis < 3; ++axis) {
     met[3 + axis] = toward[axis];
     met[9 + axis] = normal[axis];
 }
+for (int side = 0; side < 2; ++side) met[12 + side] = slope[side];
 #endif
 return met;

@@ -1,10 +1,11 @@
-// Where a direction meets the plane of a face: distance, weights of the first two corners, the normal of the front.
+// Where a direction meets the plane of a face: distance, weights of the first two corners, the normal of the front, `slope`.
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 #include "edge_functions.cuh"
 #include "meet_plane.cuh"
-wp::vec_t<6, float> met;
+wp::vec_t<8, float> met;
 met[0] = length * near;
 met[1] = corner[0] * near;
 met[2] = corner[1] * near;
 for (int axis = 0; axis < 3; ++axis) met[3 + axis] = normal[axis];
+for (int side = 0; side < 2; ++side) met[6 + side] = slope[side];
 return met;

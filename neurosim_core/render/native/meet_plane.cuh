@@ -1,5 +1,6 @@
 // Where direction `toward` meets the plane of face `part` of `mesh`: weights of the corners in `corner`, times the nearness
-// `near` [1/m], and `normal` of the front. Needs `edge_functions.cuh`.
+// `near` [1/m]; `normal` of the front; `slope`, the change of the weights of the first two per radian along the footprint, in
+// the direction in which the plane recedes. Needs `edge_functions.cuh`.
 constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon
 const int* index = &mesh.indices[3 * (size_t)part];
 float function[3][3], corner[3];
@@ -12,3 +13,10 @@ wp::vec3 normal;
 for (int axis = 0; axis < 3; ++axis)
     normal[axis] = (volume < 0.0f ? -1.0f : 1.0f) * (function[0][axis] + function[1][axis] + function[2][axis]);
 normal = wp::normalize(normal);
+const wp::vec3 unit = toward / length;
+const float facing = wp::dot(unit, normal), longer = length * near / wp::max(wp::abs(facing), 0.05f);
+float slope[2];
+for (int side = 0; side < 2; ++side) {
+    slope[side] = 0.0f;
+    for (int axis = 0; axis < 3; ++axis) slope[side] += longer * function[side][axis] * (unit[axis] - facing * normal[axis]);
+}

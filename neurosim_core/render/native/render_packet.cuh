@@ -23,6 +23,7 @@ for (int layer = layers > 1; layer < layers; ++layer) {
         for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = turned[axis];
     }
 #include "embree_packet.cuh"
+constexpr float slope[2][N] = {};
 #include "shade_lanes.cuh"
     for (int channel = 0; channel < 3; ++channel)
         for (int lane = 0; lane < N; ++lane) total[channel][lane] += radiance[channel][lane];

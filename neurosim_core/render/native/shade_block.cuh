@@ -40,35 +40,72 @@ for (int lane = 0; lane < LANES; ++lane) {
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
     return 0.01f * SHARPNESS * wp::sqrt(points_shown / SAMPLES);
 };
-alignas(64) float direction[3][N], corner[3][N], normal[3][N], spread[N], share[N];
+constexpr float COSINE_MIN = 0.05f;
+auto root = [](float square) {
+#ifdef __CUDA_ARCH__
+    return sqrtf(square);
+#else
+    return __builtin_elementwise_sqrt(square); // a vector instruction without a branch
+#endif
+};
+alignas(64) float direction[3][N], spread[N], share[N];
 alignas(64) int faces_of[N], owner[N];
 int filled = 0;
 auto shade = [&]() {
-    alignas(64) float ts[N], us[N], vs[N], toward[3][N];
+    alignas(64) float ts[N], us[N], vs[N], toward[3][N], normal[3][N], slope[2][N], tip[3][3][N];
     for (int lane = filled; lane < N; ++lane) {
         faces_of[lane] = faces_of[0];
         spread[lane] = spread[0];
-        for (int axis = 0; axis < 3; ++axis) {
-            direction[axis][lane] = direction[axis][0];
-            corner[axis][lane] = corner[axis][0];
-            normal[axis][lane] = normal[axis][0];
-        }
+        for (int axis = 0; axis < 3; ++axis) direction[axis][lane] = direction[axis][0];
     }
-    for (int lane = 0; lane < N; ++lane) {
+    int other_faces = 0;
+    for (int lane = 0; lane < N; ++lane) other_faces |= faces_of[lane] ^ faces_of[0];
+    for (int lane = 0; lane < (other_faces ? N : 1); ++lane)
+        for (int corner = 0; corner < 3; ++corner) {
+            const wp::vec3& point = mesh.points[mesh.indices[3 * (size_t)faces_of[lane] + corner]];
+            for (int axis = 0; axis < 3; ++axis) tip[corner][axis][lane] = point[axis] - origin[axis];
+        }
+    if (!other_faces)
+        for (int corner = 0; corner < 3; ++corner)
+            for (int axis = 0; axis < 3; ++axis)
+                for (int lane = 1; lane < N; ++lane) tip[corner][axis][lane] = tip[corner][axis][0];
+    for (int lane = 0; lane < N; ++lane) { // as in `meet_plane.cuh`
+        float function[3][3], weight_of[3], unit[3], facing = 0.0f;
+        for (int side = 0; side < 3; ++side)
+            for (int axis = 0; axis < 3; ++axis) {
+                const auto& from = tip[(side + 1) % 3];
+                const auto& to = tip[(side + 2) % 3];
+                const int next = (axis + 1) % 3, last = (axis + 2) % 3;
+                function[side][axis] = from[next][lane] * to[last][lane] - from[last][lane] * to[next][lane];
+            }
+        const float volume = tip[0][0][lane] * function[0][0] + tip[0][1][lane] * function[0][1] + tip[0][2][lane] * function[0][2];
+        const float scale = wp::abs(volume) > 1e-30f ? 1.0f / volume : 0.0f;
         const float x = direction[0][lane], y = direction[1][lane], z = direction[2][lane];
-        const float square = x * x + y * y + z * z;
-#ifdef __CUDA_ARCH__
-        const float length = sqrtf(square);
-#else
-        const float length = __builtin_elementwise_sqrt(square);
-#endif
-        const float near = 1.0f / wp::max(corner[0][lane] + corner[1][lane] + corner[2][lane], NEARNESS_MIN);
+        for (int side = 0; side < 3; ++side)
+            weight_of[side] = scale * (function[side][0] * x + function[side][1] * y + function[side][2] * z);
+        const float length = root(x * x + y * y + z * z);
+        const float near = 1.0f / wp::max(weight_of[0] + weight_of[1] + weight_of[2], NEARNESS_MIN);
+        float square = 0.0f;
+        for (int axis = 0; axis < 3; ++axis) {
+            toward[axis][lane] = direction[axis][lane] / length;
+            unit[axis] = function[0][axis] + function[1][axis] + function[2][axis];
+            square += unit[axis] * unit[axis];
+        }
+        const float size = wp::max(root(square), 1e-30f);
+        for (int axis = 0; axis < 3; ++axis) {
+            unit[axis] = unit[axis] / size;
+            facing += unit[axis] * toward[axis][lane];
+            normal[axis][lane] = unit[axis];
+        }
         ts[lane] = length * near;
-        us[lane] = corner[0][lane] * near;
-        vs[lane] = corner[1][lane] * near;
-        toward[0][lane] = x / length;
-        toward[1][lane] = y / length;
-        toward[2][lane] = z / length;
+        us[lane] = weight_of[0] * near;
+        vs[lane] = weight_of[1] * near;
+        const float longer = scale * ts[lane] / wp::max(wp::abs(facing), COSINE_MIN);
+        for (int side = 0; side < 2; ++side) {
+            slope[side][lane] = 0.0f;
+            for (int axis = 0; axis < 3; ++axis)
+                slope[side][lane] += longer * function[side][axis] * (toward[axis][lane] - facing * unit[axis]);
+        }
     }
     {
         auto& ray = toward;
@@ -80,8 +117,6 @@ auto shade = [&]() {
     }
     filled = 0;
 };
-int current = -1;
-float function[3][3], front = 1.0f;
 for (int layer = 0; layer < layer_count; ++layer)
     for (int lane = 0; lane < LANES; ++lane) {
         if (number[layer][lane] == 0.0f) continue;
@@ -89,24 +124,11 @@ for (int layer = 0; layer < layer_count; ++layer)
         for (int axis = 0; axis < 3; ++axis)
             toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
                            + middle[1][layer][lane] * ray[2][axis][lane];
-        const int part = part_of(layer, own[lane], toward);
-        if (part != current) {
-            const int* index = &mesh.indices[3 * (size_t)part];
-            const float volume = functions_of(mesh.points[index[0]] - origin, mesh.points[index[1]] - origin,
-                                              mesh.points[index[2]] - origin, function);
-            front = volume < 0.0f ? -1.0f : 1.0f;
-            current = part;
-        }
-        faces_of[filled] = part;
+        faces_of[filled] = part_of(layer, own[lane], toward);
         owner[filled] = lane;
         spread[filled] = footprint_width(number[layer][lane]) * pixel_spread[lane];
         share[filled] = number[layer][lane] * weight[lane];
-        for (int axis = 0; axis < 3; ++axis) {
-            direction[axis][filled] = toward[axis];
-            normal[axis][filled] = front * (function[0][axis] + function[1][axis] + function[2][axis]);
-        }
-        for (int side = 0; side < 3; ++side)
-            corner[side][filled] = function[side][0] * toward[0] + function[side][1] * toward[1] + function[side][2] * toward[2];
+        for (int axis = 0; axis < 3; ++axis) direction[axis][filled] = toward[axis];
         if (++filled == N) shade();
     }
 if (filled) shade();

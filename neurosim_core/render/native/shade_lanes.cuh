@@ -1,7 +1,8 @@
-// Radiance of N lanes: from `ray`, `spread`, `faces`, `ts`, `us`, `vs` and `normal` to `radiance`.
+// Radiance of N lanes: from `ray`, `spread`, `faces`, `ts`, `us`, `vs` and `normal` to `radiance`. Textures are
+// looked up twice, as `shading.py` says: `slope` [2][N] is the change of us and vs along the footprint [1/rad], 0: once.
 constexpr float COSINE_MIN = 0.05f, SCALE_RG = (float)(1.0 / 2047), SCALE_B = (float)(1.0 / 1023);
 alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
-alignas(64) float light[3][3][N];
+alignas(64) float light[3][3][N], emitted[3][N];
 alignas(64) int face[N], material[N];
 for (int lane = 0; lane < N; ++lane) {
     const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
@@ -31,6 +32,8 @@ for (int lane = 0; lane < different; ++lane) {
     red[lane] = base[0];
     green[lane] = base[1];
     blue[lane] = base[2];
+    for (int channel = 0; channel < 3; ++channel)
+        emitted[channel][lane] = EMISSIVE ? scene.emission.data[material[lane]][channel] : 0.0f;
     const wp::vec3* corner = scene.corner_light.data
                              + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0)
                              + 3 * (size_t)face[lane];
@@ -44,11 +47,12 @@ if (different == 1) {
     repeat(blue);
     for (int tip = 0; tip < 3; ++tip)
         for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
+    for (int channel = 0; channel < 3; ++channel) repeat(emitted[channel]);
 }
 if constexpr (TEXTURED) {
     alignas(64) float x[N], y[N], blend[N], lod[N];
     alignas(64) int first[N], finer[N];
-    alignas(64) float uv[2][3][N];
+    alignas(64) float uv[2][3][N], away[2][N];
     alignas(64) float face_lods[N];
     alignas(64) int level_count[N];
     for (int lane = 0; lane < different; ++lane) {
@@ -74,86 +78,93 @@ if constexpr (TEXTURED) {
         const float wanted = lod[lane] + face_lods[lane] + scene.mip_bias;
         x[lane] = us[lane] * uv[0][0][lane] + vs[lane] * uv[0][1][lane] + w[lane] * uv[0][2][lane];
         y[lane] = us[lane] * uv[1][0][lane] + vs[lane] * uv[1][1][lane] + w[lane] * uv[1][2][lane];
-        x[lane] = x[lane] - wp::floor(x[lane]);
-        y[lane] = 1.0f - (y[lane] - wp::floor(y[lane]));
         const float clamped = wp::clamp(wanted, 0.0f, (float)(level_count[lane] - 1));
         finer[lane] = (int)(clamped);
         blend[lane] = clamped - (float)(finer[lane]);
+        const float apart = 0.01f * APART * spread[lane] * wp::clamp(wanted + 1.0f, 0.0f, 1.0f);
+        const float du = apart * slope[0][lane], dv = apart * slope[1][lane];
+        for (int axis = 0; axis < 2; ++axis)
+            away[axis][lane] = du * (uv[axis][0][lane] - uv[axis][2][lane]) + dv * (uv[axis][1][lane] - uv[axis][2][lane]);
     }
-    int mixed = 0;
+    int mixed = 0, twice = 0;
     for (int lane = 0; lane < N; ++lane) {
         const bool textured = level_count[lane] > 0 && faces[lane] >= 0;
         if (!textured) first[lane] = finer[lane] = 0; // read something, and use nothing of it
-        if (!textured) blend[lane] = x[lane] = y[lane] = 0.0f;
+        if (!textured) blend[lane] = x[lane] = y[lane] = away[0][lane] = away[1][lane] = 0.0f;
+        twice |= away[0][lane] != 0.0f || away[1][lane] != 0.0f;
         level_count[lane] = textured;
         mixed |= blend[lane] > 0.0f;
     }
-    alignas(64) float color[2][3][N];
-    for (int coarser = 0; coarser <= mixed; ++coarser) {
-        alignas(64) float blend_x[N], blend_y[N];
-        alignas(64) int origin[N], width[N], height[N], place[4][N];
-        alignas(64) uint32_t code[4][N];
-        for (int lane = 0; lane < N; ++lane) {
-            const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
-            const wp::vec3i& level = scene.levels.data[index];
-            origin[lane] = level[0];
-            width[lane] = level[1];
-            height[lane] = level[2];
-        }
-        for (int lane = 0; lane < N; ++lane) {
-            const float column = x[lane] * (float)(width[lane]) - 0.5f;
-            const float row = y[lane] * (float)(height[lane]) - 0.5f;
-            const float column_floor = wp::floor(column);
-            const float row_floor = wp::floor(row);
-            blend_x[lane] = column - column_floor;
-            blend_y[lane] = row - row_floor;
-            int left = (int)(column_floor);
-            int top = (int)(row_floor);
-            const int right = left + 1 < width[lane] ? left + 1 : 0;
-            const int bottom = top + 1 < height[lane] ? top + 1 : 0;
-            left = left < 0 ? width[lane] - 1 : left;
-            top = top < 0 ? height[lane] - 1 : top;
-            const int upper = origin[lane] + top * width[lane];
-            const int lower = origin[lane] + bottom * width[lane];
-            place[0][lane] = upper + left;
-            place[1][lane] = upper + right;
-            place[2][lane] = lower + left;
-            place[3][lane] = lower + right;
-        }
-        for (int corner = 0; corner < 4; ++corner)
-            for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
-        for (int lane = 0; lane < N; ++lane) {
-            for (int channel = 0; channel < 3; ++channel) {
-                float texel[4];
-                for (int corner = 0; corner < 4; ++corner) {
-                    const uint32_t bits = channel == 2 ? code[corner][lane] >> 22
-                                                       : (code[corner][lane] >> (11 * channel)) & 2047u;
-                    const float root = (float)((int)(bits)) * (channel == 2 ? SCALE_B : SCALE_RG);
-                    texel[corner] = root * root;
+    alignas(64) float color[2][3][N], mean[3][N] = {};
+    for (int tap = 0; tap <= twice; ++tap) {
+        for (int coarser = 0; coarser <= mixed; ++coarser) {
+            alignas(64) float blend_x[N], blend_y[N];
+            alignas(64) int origin[N], width[N], height[N], place[4][N];
+            alignas(64) uint32_t code[4][N];
+            for (int lane = 0; lane < N; ++lane) {
+                const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
+                const wp::vec3i& level = scene.levels.data[index];
+                origin[lane] = level[0];
+                width[lane] = level[1];
+                height[lane] = level[2];
+            }
+            for (int lane = 0; lane < N; ++lane) {
+                const float along = tap ? x[lane] - away[0][lane] : x[lane] + away[0][lane];
+                const float up = tap ? y[lane] - away[1][lane] : y[lane] + away[1][lane];
+                const float u = along - wp::floor(along), v = 1.0f - (up - wp::floor(up));
+                const float column = u * (float)(width[lane]) - 0.5f;
+                const float row = v * (float)(height[lane]) - 0.5f;
+                const float column_floor = wp::floor(column);
+                const float row_floor = wp::floor(row);
+                blend_x[lane] = column - column_floor;
+                blend_y[lane] = row - row_floor;
+                int left = (int)(column_floor);
+                int top = (int)(row_floor);
+                const int right = left + 1 < width[lane] ? left + 1 : 0;
+                const int bottom = top + 1 < height[lane] ? top + 1 : 0;
+                left = left < 0 ? width[lane] - 1 : left;
+                top = top < 0 ? height[lane] - 1 : top;
+                const int upper = origin[lane] + top * width[lane];
+                const int lower = origin[lane] + bottom * width[lane];
+                place[0][lane] = upper + left;
+                place[1][lane] = upper + right;
+                place[2][lane] = lower + left;
+                place[3][lane] = lower + right;
+            }
+            for (int corner = 0; corner < 4; ++corner)
+                for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
+            for (int lane = 0; lane < N; ++lane) {
+                for (int channel = 0; channel < 3; ++channel) {
+                    float texel[4];
+                    for (int corner = 0; corner < 4; ++corner) {
+                        const uint32_t bits = channel == 2 ? code[corner][lane] >> 22
+                                                           : (code[corner][lane] >> (11 * channel)) & 2047u;
+                        const float root = (float)((int)(bits)) * (channel == 2 ? SCALE_B : SCALE_RG);
+                        texel[corner] = root * root;
+                    }
+                    const float above = texel[0] * (1.0f - blend_x[lane]) + texel[1] * blend_x[lane];
+                    const float below = texel[2] * (1.0f - blend_x[lane]) + texel[3] * blend_x[lane];
+                    color[coarser][channel][lane] = above * (1.0f - blend_y[lane]) + below * blend_y[lane];
                 }
-                const float above = texel[0] * (1.0f - blend_x[lane]) + texel[1] * blend_x[lane];
-                const float below = texel[2] * (1.0f - blend_x[lane]) + texel[3] * blend_x[lane];
-                color[coarser][channel][lane] = above * (1.0f - blend_y[lane]) + below * blend_y[lane];
             }
         }
-    }
-    if (mixed)
+        if (mixed)
+            for (int channel = 0; channel < 3; ++channel)
+                for (int lane = 0; lane < N; ++lane)
+                    color[0][channel][lane] = blend[lane] > 0.0f ? color[0][channel][lane] * (1.0f - blend[lane])
+                                                                       + color[1][channel][lane] * blend[lane]
+                                                                 : color[0][channel][lane];
         for (int channel = 0; channel < 3; ++channel)
-            for (int lane = 0; lane < N; ++lane)
-                color[0][channel][lane] = blend[lane] > 0.0f ? color[0][channel][lane] * (1.0f - blend[lane])
-                                                                   + color[1][channel][lane] * blend[lane]
-                                                             : color[0][channel][lane];
+            for (int lane = 0; lane < N; ++lane) mean[channel][lane] += color[0][channel][lane];
+    }
+    const float each = twice ? 0.5f : 1.0f;
     for (int lane = 0; lane < N; ++lane) {
-        red[lane] = level_count[lane] ? red[lane] * color[0][0][lane] : red[lane];
-        green[lane] = level_count[lane] ? green[lane] * color[0][1][lane] : green[lane];
-        blue[lane] = level_count[lane] ? blue[lane] * color[0][2][lane] : blue[lane];
+        red[lane] = level_count[lane] ? red[lane] * (each * mean[0][lane]) : red[lane];
+        green[lane] = level_count[lane] ? green[lane] * (each * mean[1][lane]) : green[lane];
+        blue[lane] = level_count[lane] ? blue[lane] * (each * mean[2][lane]) : blue[lane];
     }
 }
-alignas(64) float radiance[3][N], emitted[3][N];
-for (int channel = 0; channel < 3; ++channel)
-    for (int lane = 0; lane < N; ++lane)
-        emitted[channel][lane] =
-            EMISSIVE ? scene.emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
+alignas(64) float radiance[3][N];
 if constexpr (LIGHT_WITHIN) // no light is extrapolated beyond the face
     for (int lane = 0; lane < N; ++lane) {
         us[lane] = wp::clamp(us[lane], 0.0f, 1.0f);

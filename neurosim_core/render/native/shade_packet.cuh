@@ -11,6 +11,7 @@ for (int lane = 0; lane < N; ++lane) {
         normal[axis][lane] = normals.data[lane][axis];
     }
 }
+constexpr float slope[2][N] = {};
 #include "shade_lanes.cuh"
 for (int lane = 0; lane < N; ++lane)
     for (int channel = 0; channel < 3; ++channel) total.data[lane][channel] += radiance[channel][lane];

@@ -1,11 +1,16 @@
 /* SPDX-License-Identifier: Apache-2.0
-   Frames of one publisher for all its readers on this host: a ring in shared memory (WIRE.md, section 3.3). For C and C++.
+   Frames of one publisher for all its readers on this host: a ring in shared memory, and slots for large bodies behind it
+   (WIRE.md, sections 3.3 and 6). For C and C++.
 
-   The publisher is the only one that writes to the ring. Each reader has a page of its own, in which it says how far it
-   has read, and whether it sleeps; it can harm nobody but itself there. Positions count bytes and never wrap.
+   The publisher is the only one that writes to this memory. Each reader has a page of its own, in which it says how far it
+   has read, which slots it looks at, and whether it sleeps; it can harm nobody but itself there. Positions count bytes and
+   never wrap.
 
    `reserved` is raised before bytes are written, `head` after: a reader copies first and then looks whether `reserved` has
-   come round to what it has copied. A reliable reader is never overrun unless it is late: the publisher waits for its `tail`. */
+   come round to what it has copied. A reliable reader is never overrun unless it is late: the publisher waits for its `tail`.
+
+   A slot is written while its word is 0. A reader leases it and then looks at the word, the publisher sets the word to 0 and
+   then looks at the leases: one of the two sees the other, and gives way. */
 
 #ifndef CORTEX_BROADCAST_H
 #define CORTEX_BROADCAST_H
@@ -13,6 +18,7 @@
 #include <errno.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 
 enum {
@@ -22,20 +28,27 @@ enum {
     CORTEX_PAGE_BYTES = 4096,
     CORTEX_ENTRY_BYTES = 8,      /* before each frame: its size, and what it is */
     CORTEX_SPARE_BYTES = 128,    /* kept free of messages, so that the last entry always finds room */
+    CORTEX_SLOTS = 1024,         /* at most: each reader's page has a byte for each */
 };
 
 enum { CORTEX_FRAME = 0, CORTEX_MOVED = 1 };                          /* what an entry is */
+enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a ring is to its reader */
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
+enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT }; /* what a reader finds in a slot */
 
-#define CORTEX_RING_MAGIC 0x3154534143585443u /* "CTXCAST1" */
+#define CORTEX_RING_MAGIC 0x3254534143585443u /* "CTXCAST2" */
 
 typedef struct {
-    uint64_t magic, capacity, source, unused[5];
+    uint64_t magic, capacity, source, generation, slots, slot_bytes;
+    uint64_t quota; /* how many slots a reader may lease at once; further messages it copies */
+    uint64_t unused;
     uint64_t reserved; /* bytes below this, less the capacity, may have been written over */
     uint64_t head;     /* all below this is whole */
     uint64_t last;     /* where the last entry begins */
     uint64_t unused_too[5];
     uint64_t marks[CORTEX_MARKS]; /* where the first entry of each part of the ring begins */
+    uint64_t unused_three[480];
+    uint64_t words[CORTEX_SLOTS]; /* of each slot: the sequence of its message and 1; 0: it is being written */
 } CortexRing;
 
 typedef struct {
@@ -43,33 +56,75 @@ typedef struct {
     uint64_t unused[7];
     uint32_t sleeping; /* whoever writes next takes this back and rings the bell */
     uint32_t unused_too[15];
+    uint64_t generation; /* of the ring to whose slots the leases belong */
+    uint64_t unused_three[111];
+    uint8_t leases[CORTEX_SLOTS]; /* 1: the reader looks at this slot */
 } CortexPage;
+
+/* The memory of one ring: its head, its frames twice in a row, so that no entry is cut, and its slots. */
+typedef struct {
+    CortexRing *ring;
+    uint8_t *data, *slots;
+    uint64_t capacity, generation, slot_count, slot_bytes;
+    uint32_t users; /* it is unmapped with the last */
+} CortexMap;
 
 typedef struct {
     int used, strict, late;
+    int left; /* it reads no more, but looks at slots still */
     int socket, bell;
     CortexPage *page;
     uint64_t tail; /* as last seen */
+    uint64_t late_until;
 } CortexMember;
 
+/* What the publisher knows of a slot. */
 typedef struct {
+    uint64_t end;     /* where the entry that names it ends: who has read less may still want it */
+    uint64_t written; /* when it was written last: `clock` */
+    int busy;         /* it is being written */
+} CortexSlot;
+
+typedef struct {
+    CortexMap *map;
     CortexRing *ring;
-    uint8_t *data; /* mapped twice in a row, so that no entry is cut */
-    uint64_t capacity, source, head;
+    uint8_t *data;
+    uint64_t capacity, source, head, clock;
     int fd;
     int count; /* of members, those that have left between them included */
     CortexMember members[CORTEX_MEMBERS];
+    CortexSlot slots[CORTEX_SLOTS];
 } CortexWriter;
 
+/* What a reader shares with the leases of its messages: the publisher frees their slots when the last is gone. */
 typedef struct {
+    CortexPage *page;
+    CortexMap *current;
+    int socket, process;
+    uint32_t users, lock;
+    uint32_t held;          /* leases */
+    uint64_t private_bytes; /* of messages that were copied, as there were too many leases */
+} CortexSeat;
+
+typedef struct {
+    CortexSeat *seat;
+    CortexMap *map;
     CortexRing *ring;
     const uint8_t *data;
     CortexPage *page;
     uint64_t capacity, source, tail;
     uint64_t first; /* sequence of the first message that is sent to it */
     int socket, bell;
-    int armed, broken;
+    int armed;
+    int state; /* CORTEX_BROKEN: it carries something that is no frame; CORTEX_ENDED: more comes through another way only */
 } CortexReader;
+
+/* A message in a slot, which stays as it is until `cortex_lease_end`; any thread may call that. */
+typedef struct {
+    CortexSeat *seat;
+    CortexMap *map;
+    uint32_t slot;
+} CortexLease;
 
 typedef struct {
     uint64_t source, reader;
@@ -80,16 +135,21 @@ typedef struct {
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
 static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first); /* owns the hello */
-static inline void cortex_writer_remove(CortexWriter *writer, int member);
-static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity);
+static inline void cortex_writer_remove(CortexWriter *writer, int member); /* its leases hold while its connection does */
+static inline void cortex_writer_forget(CortexWriter *writer, int member);
+static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes);
 static inline void cortex_writer_close(CortexWriter *writer);
 static inline int cortex_listen(const char *path);
 static inline int cortex_accept(int listener);
 static inline int cortex_hear(int socket, CortexHello *hello); /* EAGAIN: not yet */
 static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number);
-static inline int cortex_reader_welcomed(CortexReader *reader); /* 1 once the publisher has taken the reader in, else 0 */
+static inline int cortex_reader_welcomed(CortexReader *reader); /* 1 once the publisher has taken the reader in, else 0; -1: but it cannot be mapped */
 static inline int cortex_reader_follow(CortexReader *reader);
-static inline void cortex_reader_close(CortexReader *reader);
+static inline void cortex_reader_close(CortexReader *reader); /* leases stay */
+static inline void cortex_map_end(CortexMap *map);   /* one user less */
+static inline void cortex_seat_end(CortexSeat *seat);
+static inline int cortex_process(void);
+static inline void cortex_yield(void);
 static inline int cortex_is_gone(int socket); /* whether the other end is closed */
 static inline void cortex_ring_bell(int bell);
 static inline void cortex_hush_bell(int bell);
@@ -100,7 +160,7 @@ static inline uint64_t cortex_entry_bytes(uint64_t size) { return (CORTEX_ENTRY_
 
 /* Whether a reliable reader that is not late has no room for an entry. */
 static inline int cortex_member_is_full(CortexWriter *writer, CortexMember *member, uint64_t bytes) {
-    if (!member->used || !member->strict || member->late) return 0;
+    if (!member->used || member->left || !member->strict || member->late) return 0;
     if (writer->head + bytes - member->tail <= writer->capacity) return 0;
     member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it has read may be written over */
     if (writer->head + bytes - member->tail <= writer->capacity) return 0;
@@ -108,15 +168,16 @@ static inline int cortex_member_is_full(CortexWriter *writer, CortexMember *memb
     return member->strict;
 }
 
-/* Whether somebody gets what comes; `late` is set if somebody does not. Who was late takes part once half is free. */
+/* Whether somebody gets what comes; `late` is set if somebody does not. Who was late takes part once
+   half of the ring is free, and half of what waited for it then is read. */
 static inline int cortex_writer_look(CortexWriter *writer, int *late) {
     int some = 0;
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &writer->members[index];
-        if (!member->used) continue;
+        if (!member->used || member->left) continue;
         if (member->late) {
             member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
-            member->late = writer->head - member->tail > writer->capacity / 2;
+            member->late = writer->head - member->tail > writer->capacity / 2 || member->tail < member->late_until;
         }
         *late |= member->late;
         some |= !member->late;
@@ -124,21 +185,39 @@ static inline int cortex_writer_look(CortexWriter *writer, int *late) {
     return some;
 }
 
-/* Write an entry for which there is room. */
-static inline void cortex_writer_append(CortexWriter *writer, uint32_t what, const void *frame, size_t size) {
-    CortexRing *ring = writer->ring;
-    const uint64_t at = writer->head, next = at + cortex_entry_bytes(size), part = writer->capacity / CORTEX_MARKS;
+/* Wait for a reliable reader no more, until it has read half of what waits for it. */
+static inline void cortex_member_give_up(const CortexWriter *writer, CortexMember *member) {
+    member->late = 1;
+    member->late_until = member->tail + (writer->head - member->tail + 1) / 2;
+}
+
+/* Write an entry for which there is room; where it ends. */
+static inline uint64_t cortex_ring_append(
+    CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, uint32_t what, const void *frame, size_t size) {
+    const uint64_t next = at + cortex_entry_bytes(size), part = capacity / CORTEX_MARKS;
     const uint32_t entry[2] = {(uint32_t)size, what};
     __atomic_store_n(&ring->reserved, next, __ATOMIC_RELAXED);
     __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
-    uint8_t *place = writer->data + (at & (writer->capacity - 1));
+    uint8_t *place = data + (at & (capacity - 1));
     memcpy(place, entry, sizeof entry);
     if (size) memcpy(place + CORTEX_ENTRY_BYTES, frame, size);
     const uint64_t before = __atomic_load_n(&ring->last, __ATOMIC_RELAXED);
     if (before / part != at / part) __atomic_store_n(&ring->marks[at / part % CORTEX_MARKS], at, __ATOMIC_RELAXED);
     __atomic_store_n(&ring->last, at, __ATOMIC_RELAXED);
     __atomic_store_n(&ring->head, next, __ATOMIC_RELEASE);
-    writer->head = next;
+    return next;
+}
+
+static inline void cortex_writer_append(CortexWriter *writer, const void *frame, size_t size) {
+    writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_FRAME, frame, size);
+}
+
+/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
+static inline void cortex_writer_share(CortexWriter *writer) {
+    uint64_t readers = 0;
+    for (int index = 0; index < writer->count; ++index) readers += writer->members[index].used && !writer->members[index].left;
+    const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
+    __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
 }
 
 /* Wake who sleeps: it has set `sleeping` and then looked at `head`, we have set `head` and now look at `sleeping`. */
@@ -146,7 +225,7 @@ static inline void cortex_writer_wake(CortexWriter *writer) {
     __atomic_thread_fence(__ATOMIC_SEQ_CST);
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &writer->members[index];
-        if (!member->used || !__atomic_load_n(&member->page->sleeping, __ATOMIC_RELAXED)) continue;
+        if (!member->used || member->left || !__atomic_load_n(&member->page->sleeping, __ATOMIC_RELAXED)) continue;
         if (__atomic_exchange_n(&member->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_ring_bell(member->bell);
     }
 }
@@ -156,29 +235,139 @@ static inline int cortex_writer_fits(CortexWriter *writer, uint64_t bytes) {
     if (2 * bytes + CORTEX_SPARE_BYTES <= writer->capacity) return 1;
     uint64_t capacity = writer->capacity;
     while (capacity < 4 * bytes) capacity *= 2;
-    return cortex_writer_grow(writer, capacity) == 0 || bytes <= writer->capacity;
+    return cortex_writer_grow(writer, capacity, writer->map->slot_count, writer->map->slot_bytes) == 0 || bytes <= writer->capacity;
+}
+
+/* Let go of who has left and looks at nothing any more, or has ended. */
+static inline void cortex_writer_tidy(CortexWriter *writer) {
+    for (int index = 0; index < writer->count; ++index) {
+        CortexMember *member = &writer->members[index];
+        if (member->used && member->left && cortex_is_gone(member->socket)) cortex_writer_forget(writer, index);
+    }
 }
 
 /* Send a frame to all readers. If all are late it is not written: what waits for them stays. With `mind`, somebody who is
    late counts as having no room. */
 static inline int cortex_writer_put(CortexWriter *writer, const void *frame, size_t size, int mind) {
     const uint64_t bytes = cortex_entry_bytes(size) + CORTEX_SPARE_BYTES;
-    if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     int late = 0;
     const int some = cortex_writer_look(writer, &late);
     if (late && mind) return CORTEX_FULL;
     if (!some) return late ? CORTEX_LATE : CORTEX_WRITTEN;
+    if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     for (int index = 0; index < writer->count; ++index)
         if (cortex_member_is_full(writer, &writer->members[index], bytes)) return CORTEX_FULL;
-    cortex_writer_append(writer, CORTEX_FRAME, frame, size);
+    cortex_writer_append(writer, frame, size);
     cortex_writer_wake(writer);
     return late ? CORTEX_LATE : CORTEX_WRITTEN;
 }
 
 /* Send the last frame, for which there is room always; of at most 64 bytes. */
 static inline void cortex_writer_end(CortexWriter *writer, const void *frame, size_t size) {
-    cortex_writer_append(writer, CORTEX_FRAME, frame, size);
+    cortex_writer_append(writer, frame, size);
     cortex_writer_wake(writer);
+}
+
+/* Send all readers another way: they find the end of the ring after what is in it, and attach anew. It is to be closed. */
+static inline void cortex_writer_dissolve(CortexWriter *writer) {
+    writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_MOVED, NULL, 0);
+    cortex_writer_wake(writer);
+}
+
+/* Slots, of the publisher. */
+
+static inline uint8_t *cortex_slot_memory(const CortexMap *map, int slot) { return map->slots + (uint64_t)slot * map->slot_bytes; }
+
+/* Whether a reader looks at a slot, or a reliable one that is not late has not come to it. */
+static inline int cortex_member_wants(CortexWriter *writer, CortexMember *member, int slot) {
+    if (!member->used) return 0;
+    if (member->strict && !member->late && !member->left && member->tail < writer->slots[slot].end) {
+        member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it leases before that, we see */
+        if (member->tail < writer->slots[slot].end) return 1;
+    }
+    return __atomic_load_n(&member->page->generation, __ATOMIC_ACQUIRE) == writer->map->generation
+        && __atomic_load_n(&member->page->leases[slot], __ATOMIC_ACQUIRE);
+}
+
+static inline int cortex_slot_is_wanted(CortexWriter *writer, int slot) {
+    for (int index = 0; index < writer->count; ++index)
+        if (cortex_member_wants(writer, &writer->members[index], slot)) return 1;
+    return 0;
+}
+
+/* Whether every reader has come to a slot, lossy ones, too. */
+static inline int cortex_slot_is_read(CortexWriter *writer, int slot) {
+    for (int index = 0; index < writer->count; ++index) {
+        CortexMember *member = &writer->members[index];
+        if (!member->used || member->left || member->tail >= writer->slots[slot].end) continue;
+        member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
+        if (member->tail < writer->slots[slot].end) return 0;
+    }
+    return 1;
+}
+
+/* Take a slot to be written; 0 if somebody has just leased it. */
+static inline int cortex_slot_take(CortexWriter *writer, int slot) {
+    const uint64_t word = __atomic_load_n(&writer->ring->words[slot], __ATOMIC_RELAXED);
+    __atomic_store_n(&writer->ring->words[slot], 0, __ATOMIC_RELAXED);
+    __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_reader_lease` */
+    if (cortex_slot_is_wanted(writer, slot)) {
+        __atomic_store_n(&writer->ring->words[slot], word, __ATOMIC_RELEASE);
+        return 0;
+    }
+    writer->slots[slot].busy = 1;
+    writer->slots[slot].written = ++writer->clock;
+    return 1;
+}
+
+/* A slot to write, until `cortex_slot_commit` or `cortex_slot_abandon`; -1 if none is free. Of those that all have read the
+   one that was written last, as it is in the cache; else the one that was written first, so that who lags loses the oldest. */
+static inline int cortex_slot_acquire(CortexWriter *writer) {
+    cortex_writer_tidy(writer);
+    for (uint64_t tries = 0; tries < 2 * writer->map->slot_count; ++tries) {
+        int best = -1, best_is_read = 0;
+        for (int slot = 0; slot < (int)writer->map->slot_count; ++slot) {
+            const CortexSlot *known = &writer->slots[slot];
+            if (known->busy || cortex_slot_is_wanted(writer, slot)) continue;
+            const int is_read = cortex_slot_is_read(writer, slot);
+            const int better = best < 0 || is_read > best_is_read
+                || (is_read == best_is_read && (known->written > writer->slots[best].written) == is_read);
+            if (!better) continue;
+            best = slot;
+            best_is_read = is_read;
+        }
+        if (best < 0) return -1;
+        if (cortex_slot_take(writer, best)) return best;
+    }
+    return -1;
+}
+
+/* Whether a reliable reader has still to come to a slot: then one may become free when it has. */
+static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *member) {
+    if (!member->used || member->left || !member->strict || member->late) return 0;
+    uint64_t end = 0;
+    for (uint64_t slot = 0; slot < writer->map->slot_count; ++slot)
+        if (writer->slots[slot].end > end) end = writer->slots[slot].end;
+    if (member->tail >= end) return 0;
+    member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
+    if (member->tail < end) member->strict = !cortex_is_gone(member->socket);
+    return member->strict && member->tail < end;
+}
+
+static inline void cortex_slot_abandon(CortexWriter *writer, int slot) {
+    writer->slots[slot].busy = 0;
+    writer->slots[slot].end = 0;
+}
+
+/* Send the frame that names a slot which has been written; with CORTEX_FULL it is still to be sent. */
+static inline int cortex_slot_commit(CortexWriter *writer, int slot, uint64_t sequence, const void *frame, size_t size, int mind) {
+    __atomic_store_n(&writer->ring->words[slot], sequence + 1, __ATOMIC_RELEASE);
+    const uint64_t before = writer->head;
+    const int found = cortex_writer_put(writer, frame, size, mind);
+    if (found == CORTEX_FULL) return found;
+    writer->slots[slot].busy = 0;
+    writer->slots[slot].end = writer->head == before ? 0 : writer->head;
+    return found;
 }
 
 /* A reader. Not for several threads at once. */
@@ -207,9 +396,9 @@ static inline void cortex_reader_skip(CortexReader *reader) {
     cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
 }
 
-/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if it is broken. */
+/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
-    while (!reader->broken) {
+    while (reader->state == CORTEX_SOUND) {
         const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
         uint32_t entry[2];
         if (!left) return 0;
@@ -218,9 +407,9 @@ static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **f
         if (left > reader->capacity || !cortex_reader_is_whole(reader)) {
             cortex_reader_skip(reader);
         } else if (entry[1] == CORTEX_MOVED) {
-            reader->broken = cortex_reader_follow(reader) < 0;
+            if (cortex_reader_follow(reader) < 0) reader->state = CORTEX_ENDED;
         } else if (entry[1] != CORTEX_FRAME || !entry[0] || cortex_entry_bytes(entry[0]) > left) {
-            reader->broken = 1;
+            reader->state = CORTEX_BROKEN;
         } else {
             *frame = place + CORTEX_ENTRY_BYTES;
             return entry[0];
@@ -234,6 +423,54 @@ static inline int cortex_reader_take(CortexReader *reader, int64_t size) {
     if (!cortex_reader_is_whole(reader)) return 0;
     cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
     return 1;
+}
+
+/* Lease the slot that a frame names, before `cortex_reader_take`. CORTEX_COPY: the reader has enough of them, but may copy the
+   message and then call `cortex_reader_has`; CORTEX_NO_SLOT: the frame is wrong. */
+static inline int cortex_reader_lease(CortexReader *reader, uint64_t slot, uint64_t sequence, uint64_t size, CortexLease *lease) {
+    CortexMap *map = reader->map;
+    if (slot >= map->slot_count || size > map->slot_bytes) return CORTEX_NO_SLOT;
+    lease->seat = reader->seat;
+    lease->map = map;
+    lease->slot = (uint32_t)slot;
+    const uint64_t *word = &map->ring->words[slot];
+    if (__atomic_load_n(&reader->page->leases[slot], __ATOMIC_RELAXED)) return CORTEX_NO_SLOT; /* it has a message of ours */
+    if (__atomic_load_n(&reader->seat->held, __ATOMIC_RELAXED) >= __atomic_load_n(&map->ring->quota, __ATOMIC_RELAXED))
+        return __atomic_load_n(word, __ATOMIC_ACQUIRE) == sequence + 1 ? CORTEX_COPY : CORTEX_OVERWRITTEN;
+    __atomic_store_n(&reader->page->leases[slot], 1, __ATOMIC_RELAXED);
+    __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_slot_take` */
+    if (__atomic_load_n(word, __ATOMIC_ACQUIRE) != sequence + 1) {
+        __atomic_store_n(&reader->page->leases[slot], 0, __ATOMIC_RELEASE);
+        return CORTEX_OVERWRITTEN;
+    }
+    __atomic_fetch_add(&lease->seat->held, 1, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&lease->seat->users, 1, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&map->users, 1, __ATOMIC_RELAXED);
+    return CORTEX_LEASED;
+}
+
+/* Whether a slot that was copied had this message all the time. */
+static inline int cortex_reader_has(const CortexReader *reader, uint64_t slot, uint64_t sequence) {
+    __atomic_thread_fence(__ATOMIC_ACQUIRE);
+    return __atomic_load_n(&reader->map->ring->words[slot], __ATOMIC_RELAXED) == sequence + 1;
+}
+
+static inline void cortex_seat_lock(CortexSeat *seat) {
+    while (__atomic_exchange_n(&seat->lock, 1, __ATOMIC_ACQUIRE)) cortex_yield();
+}
+static inline void cortex_seat_unlock(CortexSeat *seat) { __atomic_store_n(&seat->lock, 0, __ATOMIC_RELEASE); }
+
+/* Give a slot back. In a forked child nothing is: the lease is the parent's. */
+static inline void cortex_lease_end(const CortexLease *lease) {
+    CortexSeat *seat = lease->seat;
+    if (seat->process == cortex_process()) {
+        cortex_seat_lock(seat); /* the reader may be going on to another ring, whose slots have the same numbers */
+        if (seat->current == lease->map) __atomic_store_n(&seat->page->leases[lease->slot], 0, __ATOMIC_RELEASE);
+        cortex_seat_unlock(seat);
+    }
+    __atomic_fetch_sub(&seat->held, 1, __ATOMIC_RELAXED);
+    cortex_map_end(lease->map);
+    cortex_seat_end(seat);
 }
 
 /* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring

@@ -2,6 +2,8 @@
 // The ring that carries a publisher's frames to the readers of its host; what it does is in `broadcast.h`.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
 #include <cerrno>
 #include <cstddef>
 #include <cstdint>
@@ -15,10 +17,24 @@
 
 #include "cortex/array.hpp"
 #include "cortex/broadcast.h"
+#include "cortex/slot.hpp"
+#include "cortex/wire.hpp"
 
 namespace cortex::detail {
 
 constexpr std::size_t ring_bytes = 1 << 19;
+constexpr std::uint64_t slots_bytes = 4u << 20;  // small slots stay in cache
+constexpr std::uint64_t slots_bytes_max = std::uint64_t{2} << 30;
+constexpr std::uint64_t private_bytes_max = 64u << 20;  // that wait for a socket, or that a reader copies
+
+// Keeps a message in its slot.
+struct Lease {
+  explicit Lease(const CortexLease& taken) noexcept : lease(taken) {}
+  Lease(const Lease&) = delete;
+  Lease& operator=(const Lease&) = delete;
+  ~Lease() { cortex_lease_end(&lease); }
+  CortexLease lease;
+};
 
 // Where a node's local readers ask for rings. Without one they go on with ZeroMQ.
 class Listener {
@@ -93,12 +109,51 @@ class Broadcast {
   int put(Span<const std::uint8_t> frame) noexcept { return cortex_writer_put(&writer_, frame.data(), frame.size(), 0); }
   // The last frame of all, of 64 bytes.
   void end(Span<const std::uint8_t> frame) noexcept { cortex_writer_end(&writer_, frame.data(), frame.size()); }
+  // Sends all readers another way; nothing else may be called after this.
+  void dissolve() noexcept { cortex_writer_dissolve(&writer_); }
   // Whether a reliable reader has no room for a frame.
   bool is_full(int member, std::size_t size) noexcept {
     return cortex_member_is_full(&writer_, &writer_.members[member], cortex_entry_bytes(size) + CORTEX_SPARE_BYTES) != 0;
   }
   // Waits for it no more, until it has read half.
-  void give_up(int member) noexcept { writer_.members[member].late = 1; }
+  void give_up(int member) noexcept { cortex_member_give_up(&writer_, &writer_.members[member]); }
+  // Whether a reliable reader has still to come to a slot.
+  bool is_behind(int member) noexcept { return cortex_member_is_behind(&writer_, &writer_.members[member]) != 0; }
+
+  // Makes slots for bodies of a size and so many readers, if need be; false if there is no memory for them.
+  bool provide(std::size_t size, bool exact, std::uint64_t readers) noexcept {
+    const std::uint64_t before = writer_.map->slot_bytes;
+    const std::uint64_t wanted = 2 * readers + 2;
+    const bool fits = before >= size;
+    if (fits && writer_.map->slot_count >= wanted) return true;
+    std::uint64_t slot_bytes = std::max<std::uint64_t>(exact ? size : size + size / 4, before);
+    slot_bytes = (slot_bytes + CORTEX_PAGE_BYTES - 1) / CORTEX_PAGE_BYTES * CORTEX_PAGE_BYTES;
+    std::uint64_t slots = std::max(std::clamp<std::uint64_t>(slots_bytes / slot_bytes, 4, 64), wanted);
+    slots = std::max<std::uint64_t>(4, std::min(slots, slots_bytes_max / slot_bytes));
+    return (fits && writer_.map->slot_count >= slots) ||
+           cortex_writer_grow(&writer_, writer_.capacity, slots, slot_bytes) == 0 || fits;
+  }
+
+  // A slot to be written; without a buffer if none is free.
+  Slot acquire() {
+    int late = 0;
+    if (cortex_writer_look(&writer_, &late) == 0 && late != 0) return {};
+    const int index = cortex_slot_acquire(&writer_);
+    if (index < 0) return {};
+    CortexMap* map = writer_.map;
+    __atomic_fetch_add(&map->users, 1, __ATOMIC_RELAXED);
+    const Span<std::uint8_t> buffer(cortex_slot_memory(map, index), static_cast<std::size_t>(map->slot_bytes));
+    return {buffer, index, std::shared_ptr<CortexMap>(map, cortex_map_end), nullptr};
+  }
+  // Whether its ring is still in use.
+  bool has(const Slot& slot) const noexcept { return slot.index >= 0 && slot.map.get() == writer_.map; }
+  void abandon(const Slot& slot) noexcept {
+    if (has(slot)) cortex_slot_abandon(&writer_, slot.index);
+  }
+  // Sends the header of what was written into a slot, as `put`.
+  int commit(const Slot& slot, std::uint64_t sequence, Span<const std::uint8_t> header) noexcept {
+    return cortex_slot_commit(&writer_, slot.index, sequence, header.data(), header.size(), 0);
+  }
 
  private:
   Broadcast() = default;
@@ -123,30 +178,93 @@ class RingReader {
   }
 
   int fd() const noexcept { return reader_.bell; }
-  bool broken() const noexcept { return reader_.broken != 0; }
-  // Whether the publisher has taken us in.
-  bool welcomed() noexcept { return cortex_reader_welcomed(&reader_) != 0; }
+  // CORTEX_SOUND; CORTEX_BROKEN or CORTEX_ENDED if nothing more comes through it.
+  int state() const noexcept { return reader_.state; }
+  // 1 if the publisher has taken us in, -1 if we cannot map its ring, else 0.
+  int welcomed() noexcept { return cortex_reader_welcomed(&reader_); }
+  // Whether the next message waits, because too many large ones are kept.
+  bool is_crowded() const noexcept { return is_crowded_; }
+  // Leaves it out.
+  void pass_over() noexcept {
+    if (is_crowded_) cortex_reader_move(&reader_, reader_.tail + cortex_entry_bytes(wire::header_size));
+    is_crowded_ = false;
+  }
+  // The body that the last frame names, and what keeps it; null if it names none.
+  std::shared_ptr<const void> take_body(Span<const std::uint8_t>& body) noexcept {
+    body = body_;
+    return std::move(owner_);
+  }
 
   // The next frame, until the next call; empty if there is none: then the descriptor tells when one comes.
   Span<const std::uint8_t> next() {
+    owner_.reset();
+    is_crowded_ = false;
     do {
       const std::uint8_t* data = nullptr;
       std::int64_t size = 0;
       while ((size = cortex_reader_peek(&reader_, &data)) > 0) {
         frame_.assign(data, data + size);
-        if (cortex_reader_take(&reader_, size) == 0) continue;  // it was written over meanwhile
+        if (cortex_reader_is_whole(&reader_) == 0) {
+          cortex_reader_take(&reader_, size);
+          continue;
+        }
+        const bool taken = size != wire::header_size || frame_[3] != 'S' || take_slot();
+        if (is_crowded_) return {};
+        cortex_reader_move(&reader_, reader_.tail + cortex_entry_bytes(static_cast<std::uint64_t>(size)));
+        if (!taken) continue;  // it was written over meanwhile
         cortex_reader_disarm(&reader_);
         return {frame_.data(), frame_.size()};
       }
-    } while (!broken() && cortex_reader_arm(&reader_) == 0);
+    } while (reader_.state == CORTEX_SOUND && cortex_reader_arm(&reader_) == 0);
     return {};
   }
 
  private:
   RingReader() = default;
+
+  // Takes the body that the frame names; false if the message is lost, or has to wait.
+  bool take_slot() {
+    const auto sequence = wire::load<std::uint64_t>(frame_.data() + 24);
+    const auto size = wire::load<std::uint64_t>(frame_.data() + 48);
+    const auto slot = wire::load<std::uint64_t>(frame_.data() + 56);
+    CortexLease lease;
+    const int found = cortex_reader_lease(&reader_, slot, sequence, size, &lease);
+    if (found == CORTEX_OVERWRITTEN) return false;
+    if (found == CORTEX_NO_SLOT) return true;  // the frame is wrong, as who reads it finds
+    const std::uint8_t* at = cortex_slot_memory(reader_.map, static_cast<int>(slot));
+    if (found == CORTEX_LEASED) {
+      owner_ = std::make_shared<Lease>(lease);
+      body_ = {at, static_cast<std::size_t>(size)};
+      return true;
+    }
+    return copy_slot(at, static_cast<std::size_t>(size), slot, sequence);
+  }
+
+  // Copies what may not be leased.
+  bool copy_slot(const std::uint8_t* at, std::size_t size, std::uint64_t slot, std::uint64_t sequence) {
+    if (*copied_ + size > (size < private_bytes_max / 4 ? private_bytes_max : 4 * size)) {
+      is_crowded_ = true;
+      return false;
+    }
+    *copied_ += size;
+    const std::shared_ptr<std::vector<std::uint8_t>> copy(
+        new std::vector<std::uint8_t>(at, at + size), [copied = copied_](const std::vector<std::uint8_t>* bytes) {
+          *copied -= bytes->size();
+          delete bytes;
+        });
+    if (cortex_reader_has(&reader_, slot, sequence) == 0) return false;
+    owner_ = copy;
+    body_ = {copy->data(), size};
+    return true;
+  }
+
   CortexReader reader_{};
   bool open_ = false;
+  bool is_crowded_ = false;
   std::vector<std::uint8_t> frame_;
+  Span<const std::uint8_t> body_;
+  std::shared_ptr<const void> owner_;
+  std::shared_ptr<std::atomic<std::size_t>> copied_ = std::make_shared<std::atomic<std::size_t>>(0);
 };
 
 }  // namespace cortex::detail

@@ -7,6 +7,8 @@
 #if defined(__linux__)
 
 #include <fcntl.h>
+#include <sched.h>
+#include <stdio.h>
 #include <sys/eventfd.h>
 #include <sys/mman.h>
 #include <sys/socket.h>
@@ -39,7 +41,8 @@ static inline void cortex_hush_bell(int bell) {
 
 static inline int cortex_is_gone(int socket) {
     char byte;
-    return recv(socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT) == 0;
+    const ssize_t got = recv(socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
+    return got == 0 || (got < 0 && errno == ECONNRESET);
 }
 
 /* Sealed memory of its own: nobody can change its size, and if `others_read` nobody else can write to it. */
@@ -63,22 +66,56 @@ static inline int cortex_is_memory(int fd, uint64_t bytes) {
         && (uint64_t)status.st_size == bytes;
 }
 
-/* Map a ring, its frames twice in a row. */
-static inline CortexRing *cortex_map(int fd, uint64_t capacity, int protection) {
-    const size_t whole = CORTEX_HEAD_BYTES + (size_t)capacity;
-    uint8_t *base = (uint8_t *)mmap(NULL, whole + (size_t)capacity, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
-    if (base == MAP_FAILED) return NULL;
+static inline int cortex_process(void) { return (int)getpid(); }
+static inline void cortex_yield(void) { sched_yield(); }
+
+/* Map a ring; NULL if that cannot be done. */
+static inline CortexMap *cortex_map_begin(int fd, uint64_t capacity, uint64_t slots, uint64_t slot_bytes, int protection) {
+    const size_t whole = CORTEX_HEAD_BYTES + (size_t)capacity, bodies = (size_t)(slots * slot_bytes);
+    CortexMap *map = (CortexMap *)calloc(1, sizeof *map);
+    if (map == NULL) return NULL;
+    uint8_t *base = (uint8_t *)mmap(NULL, whole + (size_t)capacity + bodies, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
     const int flags = MAP_SHARED | MAP_FIXED;
-    if (mmap(base, whole, protection, flags, fd, 0) == MAP_FAILED
-        || mmap(base + whole, (size_t)capacity, protection, flags, fd, CORTEX_HEAD_BYTES) == MAP_FAILED) {
-        munmap(base, whole + (size_t)capacity);
-        return NULL;
-    }
-    return (CortexRing *)base;
+    map->ring = (CortexRing *)base;
+    map->data = base + CORTEX_HEAD_BYTES;
+    map->slots = base + whole + capacity;
+    map->capacity = capacity;
+    map->slot_count = slots;
+    map->slot_bytes = slot_bytes;
+    map->users = 1;
+    if (base != MAP_FAILED && mmap(base, whole, protection, flags, fd, 0) != MAP_FAILED
+        && mmap(base + whole, (size_t)capacity, protection, flags, fd, CORTEX_HEAD_BYTES) != MAP_FAILED
+        && (!bodies || mmap(map->slots, bodies, protection, flags | MAP_POPULATE, fd, (off_t)whole) != MAP_FAILED))
+        return map;
+    if (base != MAP_FAILED) munmap(base, whole + (size_t)capacity + bodies);
+    free(map);
+    return NULL;
 }
 
-static inline void cortex_unmap(CortexRing *ring, uint64_t capacity) {
-    if (ring != NULL) munmap(ring, CORTEX_HEAD_BYTES + 2 * (size_t)capacity);
+static inline void cortex_map_end(CortexMap *map) {
+    if (map == NULL || __atomic_sub_fetch(&map->users, 1, __ATOMIC_ACQ_REL)) return;
+    munmap(map->ring, CORTEX_HEAD_BYTES + 2 * (size_t)map->capacity + (size_t)(map->slot_count * map->slot_bytes));
+    free(map);
+}
+
+static inline void cortex_seat_end(CortexSeat *seat) {
+    if (seat == NULL || __atomic_sub_fetch(&seat->users, 1, __ATOMIC_ACQ_REL)) return;
+    if (seat->page != NULL) munmap(seat->page, CORTEX_PAGE_BYTES);
+    cortex_close_fd(seat->socket);
+    free(seat);
+}
+
+/* Whether so much memory is to be had: what is missing later would not be an error, but end some process. */
+static inline int cortex_has_memory(uint64_t bytes) {
+    char line[128];
+    unsigned long long kilobytes = 0;
+    FILE *file = fopen("/proc/meminfo", "re");
+    if (file == NULL) return 1;
+    int found = 0;
+    while (!found && fgets(line, sizeof line, file) != NULL) found = sscanf(line, "MemAvailable: %llu", &kilobytes) == 1;
+    fclose(file);
+    errno = ENOMEM;
+    return !found || bytes / 1024 < kilobytes;
 }
 
 /* Send a message with descriptors. */
@@ -191,34 +228,43 @@ static inline int cortex_hear(int socket, CortexHello *hello) {
 }
 
 /* Make memory for a ring that goes on at the writer's head; the writer is as it was if there is none. */
-static inline int cortex_writer_make(CortexWriter *writer, uint64_t capacity) {
-    const int fd = cortex_memory(CORTEX_HEAD_BYTES + capacity, 1);
-    CortexRing *ring = fd < 0 ? NULL : cortex_map(fd, capacity, PROT_READ | PROT_WRITE);
-    if (ring == NULL) {
+static inline int cortex_writer_make(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes) {
+    const uint64_t bytes = CORTEX_HEAD_BYTES + capacity + slots * slot_bytes;
+    const int fd = cortex_has_memory(bytes) ? cortex_memory(bytes, 1) : -1;
+    CortexMap *map = fd < 0 ? NULL : cortex_map_begin(fd, capacity, slots, slot_bytes, PROT_READ | PROT_WRITE);
+    if (map == NULL) {
         cortex_close_fd(fd);
         return -1;
     }
     if (fcntl(fd, F_ADD_SEALS, CORTEX_SEAL_FUTURE_WRITE | CORTEX_SEAL) < 0) fcntl(fd, F_ADD_SEALS, CORTEX_SEAL); /* Linux < 5.1 */
+    CortexRing *ring = map->ring;
     ring->magic = CORTEX_RING_MAGIC;
     ring->capacity = capacity;
     ring->source = writer->source;
+    ring->generation = map->generation = writer->map == NULL ? 1 : writer->map->generation + 1;
+    ring->slots = slots;
+    ring->slot_bytes = slot_bytes;
     ring->reserved = ring->head = ring->last = writer->head;
+    writer->map = map;
     writer->ring = ring;
-    writer->data = (uint8_t *)ring + CORTEX_HEAD_BYTES;
+    writer->data = map->data;
     writer->capacity = capacity;
     writer->fd = fd;
+    memset(writer->slots, 0, sizeof writer->slots);
+    cortex_writer_share(writer);
     return 0;
 }
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity) {
     memset(writer, 0, sizeof *writer);
     writer->source = source;
-    return cortex_writer_make(writer, capacity);
+    return cortex_writer_make(writer, capacity, 0, 0);
 }
 
 /* Tell a reader where the ring is. */
 static inline int cortex_welcome(const CortexWriter *writer, int socket, uint64_t first) {
-    const uint64_t said[5] = {CORTEX_RING_MAGIC, writer->capacity, writer->source, writer->head, first};
+    const uint64_t said[7] = {CORTEX_RING_MAGIC, writer->capacity, writer->source, writer->head, first,
+                              writer->map->slot_count, writer->map->slot_bytes};
     return cortex_send(socket, said, sizeof said, &writer->fd, 1);
 }
 
@@ -243,17 +289,18 @@ static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hel
     CortexMember *member = &writer->members[number];
     member->used = 1;
     member->strict = strict;
-    member->late = 0;
+    member->late = member->left = 0;
     member->socket = hello->socket;
     member->bell = hello->bell;
     member->page = (CortexPage *)page;
     member->tail = writer->head;
     __atomic_store_n(&member->page->tail, writer->head, __ATOMIC_RELEASE);
     if (number == writer->count) ++writer->count;
+    cortex_writer_share(writer);
     return number;
 }
 
-static inline void cortex_writer_remove(CortexWriter *writer, int number) {
+static inline void cortex_writer_forget(CortexWriter *writer, int number) {
     CortexMember *member = &writer->members[number];
     if (!member->used) return;
     member->used = 0;
@@ -262,63 +309,88 @@ static inline void cortex_writer_remove(CortexWriter *writer, int number) {
     close(member->socket);
 }
 
-/* Go on in a larger ring: each reader gets it through its socket, and looks there after what is in the old one. */
-static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {
-    if (capacity > (uint64_t)1 << 32 || sysconf(_SC_AVPHYS_PAGES) < (long)(capacity / CORTEX_PAGE_BYTES)) return -1;
-    CortexWriter larger = *writer;
-    larger.head += CORTEX_ENTRY_BYTES;
-    if (cortex_writer_make(&larger, capacity) < 0) return -1;
+static inline void cortex_writer_remove(CortexWriter *writer, int number) {
+    writer->members[number].left = 1;
+    cortex_writer_tidy(writer);
+    cortex_writer_share(writer);
+}
+
+/* Go on in another ring: each reader gets it through its socket, and looks there after what is in the old one. Nothing
+   is written to the old one any more, slots included. */
+static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes) {
+    errno = EINVAL;
+    if (capacity > (uint64_t)1 << 32 || slots > CORTEX_SLOTS || slot_bytes > (uint64_t)1 << 32) return -1;
+    CortexMap *before = writer->map;
+    CortexRing *ring = writer->ring;
+    const int fd = writer->fd;
+    const uint64_t head = writer->head, old_capacity = writer->capacity;
+    writer->head = head + CORTEX_ENTRY_BYTES;
+    if (cortex_writer_make(writer, capacity, slots, slot_bytes) < 0) {
+        writer->head = head;
+        return -1;
+    }
     for (int index = 0; index < writer->count; ++index) {
-        CortexMember *member = &larger.members[index];
-        if (!member->used || cortex_welcome(&larger, member->socket, 0) == 0) continue;
+        CortexMember *member = &writer->members[index];
+        if (member->used && member->left) cortex_writer_forget(writer, index);
+        if (!member->used || cortex_welcome(writer, member->socket, 0) == 0) continue;
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
         member->late = 1;
     }
-    cortex_writer_append(writer, CORTEX_MOVED, NULL, 0); /* the spare bytes have room for it */
+    cortex_ring_append(ring, before->data, old_capacity, head, CORTEX_MOVED, NULL, 0); /* the spare bytes have room for it */
     cortex_writer_wake(writer);
-    cortex_unmap(writer->ring, writer->capacity);
-    close(writer->fd);
-    *writer = larger;
+    cortex_map_end(before);
+    close(fd);
     return 0;
 }
 
 static inline void cortex_writer_close(CortexWriter *writer) {
-    for (int index = 0; index < writer->count; ++index) cortex_writer_remove(writer, index);
-    cortex_unmap(writer->ring, writer->capacity);
-    if (writer->ring != NULL) close(writer->fd);
+    for (int index = 0; index < writer->count; ++index) cortex_writer_forget(writer, index);
+    if (writer->map != NULL) close(writer->fd);
+    cortex_map_end(writer->map);
+    writer->map = NULL;
     writer->ring = NULL;
 }
 
 /* Take the ring that the publisher hands over, instead of the one there is; 0 if none has come, -1 if it is none. */
 static inline int cortex_reader_map(CortexReader *reader) {
-    uint64_t said[5];
+    uint64_t said[7];
     int fd;
     if (cortex_receive(reader->socket, said, sizeof said, &fd, 1) < 0) return errno == EAGAIN ? 0 : -1;
-    const uint64_t capacity = said[1];
-    CortexRing *ring = NULL;
+    const uint64_t capacity = said[1], slots = said[5], slot_bytes = said[6];
+    CortexMap *map = NULL;
     if (said[0] == CORTEX_RING_MAGIC && said[2] == reader->source && capacity >= CORTEX_HEAD_BYTES
-        && capacity <= (uint64_t)1 << 32 && !(capacity & (capacity - 1)) && cortex_is_memory(fd, CORTEX_HEAD_BYTES + capacity))
-        ring = cortex_map(fd, capacity, PROT_READ);
+        && capacity <= (uint64_t)1 << 32 && !(capacity & (capacity - 1)) && slots <= CORTEX_SLOTS
+        && slot_bytes <= (uint64_t)1 << 32 && slot_bytes % CORTEX_PAGE_BYTES == 0
+        && cortex_is_memory(fd, CORTEX_HEAD_BYTES + capacity + slots * slot_bytes))
+        map = cortex_map_begin(fd, capacity, slots, slot_bytes, PROT_READ);
     close(fd);
-    if (ring == NULL) return -1;
-    if (reader->ring == NULL) reader->first = said[4];
-    cortex_unmap(reader->ring, reader->capacity);
-    reader->ring = ring;
-    reader->data = (const uint8_t *)ring + CORTEX_HEAD_BYTES;
+    if (map == NULL) return -1;
+    map->generation = __atomic_load_n(&map->ring->generation, __ATOMIC_RELAXED);
+    if (reader->map == NULL) reader->first = said[4];
+    cortex_seat_lock(reader->seat);
+    for (int slot = 0; slot < CORTEX_SLOTS; ++slot) __atomic_store_n(&reader->page->leases[slot], 0, __ATOMIC_RELAXED);
+    __atomic_store_n(&reader->page->generation, map->generation, __ATOMIC_RELEASE);
+    reader->seat->current = map;
+    cortex_seat_unlock(reader->seat);
+    cortex_map_end(reader->map);
+    reader->map = map;
+    reader->ring = map->ring;
+    reader->data = map->data;
     reader->capacity = capacity;
     cortex_reader_move(reader, said[3]);
     return 1;
 }
 
-static inline int cortex_reader_welcomed(CortexReader *reader) { return cortex_reader_map(reader) > 0; }
+static inline int cortex_reader_welcomed(CortexReader *reader) { return cortex_reader_map(reader); }
 static inline int cortex_reader_follow(CortexReader *reader) { return cortex_reader_map(reader) > 0 ? 0 : -1; }
 
 static inline void cortex_reader_close(CortexReader *reader) {
-    cortex_unmap(reader->ring, reader->capacity);
-    if (reader->page != NULL) munmap(reader->page, CORTEX_PAGE_BYTES);
+    cortex_map_end(reader->map);
     cortex_close_fd(reader->bell);
-    cortex_close_fd(reader->socket);
+    cortex_seat_end(reader->seat);
+    reader->map = NULL;
     reader->ring = NULL;
+    reader->seat = NULL;
     reader->page = NULL;
     reader->bell = reader->socket = -1;
 }
@@ -327,14 +399,18 @@ static inline int cortex_reader_open(CortexReader *reader, const char *path, uin
     struct sockaddr_un address;
     memset(reader, 0, sizeof *reader);
     reader->source = source;
-    reader->bell = -1;
-    reader->socket = cortex_socket(path, &address);
+    reader->bell = reader->socket = -1;
+    CortexSeat *seat = reader->seat = (CortexSeat *)calloc(1, sizeof *seat);
+    if (seat == NULL) return -1;
+    seat->users = 1;
+    seat->process = cortex_process();
+    seat->socket = reader->socket = cortex_socket(path, &address);
     const int page = cortex_memory(CORTEX_PAGE_BYTES, 0);
     if (reader->socket < 0 || page < 0) goto failed;
     {
         void *memory = mmap(NULL, CORTEX_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, page, 0);
         if (memory == MAP_FAILED) goto failed;
-        reader->page = (CortexPage *)memory;
+        seat->page = reader->page = (CortexPage *)memory;
     }
     reader->bell = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     if (reader->bell < 0 || connect(reader->socket, (struct sockaddr *)&address, sizeof address) < 0) goto failed;
@@ -371,8 +447,9 @@ static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hel
     return (void)writer, (void)hello, (void)strict, (void)first, cortex_unsupported();
 }
 static inline void cortex_writer_remove(CortexWriter *writer, int member) { (void)writer, (void)member; }
-static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {
-    return (void)writer, (void)capacity, cortex_unsupported();
+static inline void cortex_writer_forget(CortexWriter *writer, int member) { (void)writer, (void)member; }
+static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes) {
+    return (void)writer, (void)capacity, (void)slots, (void)slot_bytes, cortex_unsupported();
 }
 static inline void cortex_writer_close(CortexWriter *writer) { (void)writer; }
 static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number) {
@@ -381,6 +458,10 @@ static inline int cortex_reader_open(CortexReader *reader, const char *path, uin
 static inline int cortex_reader_welcomed(CortexReader *reader) { return (void)reader, 0; }
 static inline int cortex_reader_follow(CortexReader *reader) { return (void)reader, cortex_unsupported(); }
 static inline void cortex_reader_close(CortexReader *reader) { (void)reader; }
+static inline void cortex_map_end(CortexMap *map) { (void)map; }
+static inline void cortex_seat_end(CortexSeat *seat) { (void)seat; }
+static inline int cortex_process(void) { return 0; }
+static inline void cortex_yield(void) {}
 
 #endif
 #endif

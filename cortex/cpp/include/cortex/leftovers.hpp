@@ -9,39 +9,27 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
 
 struct Outlet;
 
-// Of one publisher: the word of readers of its sockets that they have everything, and messages in slots.
+// Of one publisher: the word of readers of its sockets that they have everything.
 struct Leftover {
   struct Reader {
     std::string key;
     Outlet* outlet = nullptr;
-    std::uint32_t column = wire::no_column;
     std::uint64_t number = 0;  // the reader's own
     bool owes = false;         // it has not said yet that it has everything: a socket may lose what it took
   };
 
   std::vector<Reader> readers;
-  std::vector<std::shared_ptr<Ring>> rings;
   std::uint64_t sequence = 0;  // of the message that would have come next
-
-  // Lets the rings go that nobody reads.
-  void deliver() {
-    rings.erase(std::remove_if(rings.begin(), rings.end(), [](const auto& ring) { return !ring->is_leased(); }),
-                rings.end());
-  }
 
   void detach(const std::string& key) noexcept {
     for (auto& reader : readers) {
-      if (reader.key != key) continue;
-      reader.owes = false;
-      if (reader.column == wire::no_column) continue;
-      for (const auto& ring : rings) ring->free_column(reader.column);
+      if (reader.key == key) reader.owes = false;
     }
   }
 
@@ -52,7 +40,7 @@ struct Leftover {
   }
 
   bool empty() const noexcept {
-    return rings.empty() && std::none_of(readers.begin(), readers.end(), [](const auto& reader) { return reader.owes; });
+    return std::none_of(readers.begin(), readers.end(), [](const auto& reader) { return reader.owes; });
   }
 };
 
@@ -60,7 +48,6 @@ struct Leftover {
 class Leftovers {
  public:
   void add(Leftover leftover) {
-    leftover.deliver();
     if (!leftover.empty()) list_.push_back(std::move(leftover));
   }
 
@@ -76,7 +63,6 @@ class Leftovers {
 
   // Lets go of what nobody needs any more.
   void deliver() {
-    for (auto& leftover : list_) leftover.deliver();
     list_.erase(std::remove_if(list_.begin(), list_.end(), [](const auto& leftover) { return leftover.empty(); }),
                 list_.end());
   }

@@ -15,7 +15,6 @@
 #include "cortex/pace.hpp"
 #include "cortex/broadcast.hpp"
 #include "cortex/policy.hpp"
-#include "cortex/ring_view.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
@@ -31,8 +30,6 @@ struct Item {
   std::int64_t publish_ns = 0;  // by this host's clock
   zmq::message_t frame;
   std::shared_ptr<const void> owner;  // of a slot's lease, or of a frame that several messages share
-  std::shared_ptr<RingView> unleased;  // where the body is to be copied from when it is wanted
-  std::uint32_t slot = 0;
 };
 
 struct TypeId {
@@ -64,11 +61,9 @@ class Link {
     secure(socket_);
     socket_.connect(address_);
     for (const char kind : {'M', 'B', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
-    if (shared_memory) socket_.set(zmq::sockopt::subscribe, prefix('S'));
     attach(shared_memory);
   }
 
-  ~Link() { close_rings(); }  // before the end of the socket tells the publisher to free the column
   Link(const Link&) = delete;
   Link& operator=(const Link&) = delete;
 
@@ -100,15 +95,14 @@ class Link {
     for (; budget > 0; --budget) {
       if (in_ring_) {
         const auto bytes = end_->next();
+        if (end_->is_crowded()) return true;
         if (!bytes.empty()) {
           pace.count(bytes.size());
           take_in({bytes, nullptr}, queue);
           continue;
         }
-        if (end_->broken()) {
-          reject("something in the ring is no frame");
-          go_without_memory("its ring cannot be read");
-        }
+        if (end_->state() == CORTEX_BROKEN) reject("something in the ring is no frame");
+        if (end_->state() != CORTEX_SOUND) go_without_memory("nothing more comes through its ring");
       }
       zmq::message_t message;
       if (!socket_.recv(message, zmq::recv_flags::dontwait)) return true;
@@ -118,6 +112,10 @@ class Link {
     }
     return false;
   }
+
+  // Whether the next message waits, because too many large ones are kept; it may be left out.
+  bool is_crowded() const noexcept { return in_ring_ && end_->is_crowded(); }
+  void pass_over() noexcept { end_->pass_over(); }
 
   void reject(const std::string& reason) {
     ++counters_->rejected;
@@ -180,7 +178,7 @@ class Link {
       throw MalformedMessage("a frame in the ring that belongs into the socket");
     }
     if (header.kind == 'A') return on_answer(arrival.bytes, queue);
-    if (in_ring_ && arrival.message != nullptr && header.kind != 'L') return;  // it came through the ring
+    if (in_ring_ && arrival.message != nullptr) return;  // it came through the ring
     if (header.fingerprint != type_.fingerprint) throw MalformedMessage("a message of another type");
     if (header.body_size > wire::body_limit) throw MalformedMessage("a body over the limit of 1 GiB");
     switch (header.kind) {
@@ -197,7 +195,7 @@ class Link {
       case 'L':
         return on_large(header, *arrival.message, queue);  // none comes through a ring
       case 'S':
-        return on_slot(header, arrival.bytes, queue);
+        return on_slot(header, arrival, queue);
       default:
         throw MalformedMessage(std::string("kind '") + header.kind + "' is unknown");
     }
@@ -209,7 +207,6 @@ class Link {
     if (known_ && sequence > expected_) {
       if (sequence - expected_ > wire::jump_max) throw MalformedMessage("a sequence number from nowhere");
       counters_->lost += sequence - expected_;
-      for (auto& ring : rings_) ring.second->heal(sequence);
       if (policy_.is_reliable) confirm(sequence);  // the publisher may have given us up
     }
     known_ = true;
@@ -278,104 +275,14 @@ class Link {
     }
   }
 
-  void on_slot(const wire::Header& header, Span<const std::uint8_t> bytes, std::deque<Item>& queue) {
-    if (bytes.size() != wire::slot_frame_size) throw MalformedMessage("a descriptor of another size");
-    const auto mask = wire::load<std::uint64_t>(bytes.data() + wire::header_size);
-    const auto number = static_cast<std::uint32_t>(header.aux >> 32);
-    const auto slot = static_cast<std::uint32_t>(header.aux);
-    const auto view = ring_of(number, bytes.data() + wire::header_size + 8);
-    if (rings_.size() > 1) forget_rings(number);
-    if (view == nullptr || (mask >> column_ & 1) == 0) {
-      // While `L` is subscribed the message comes that way.
-      if (large_subscribed_ || (known_ && header.sequence < expected_)) {
-        reached_ = std::max(reached_, header.sequence + 1);  // lost if the publisher ends before
-        return;
-      }
-      if (view != nullptr && !view->has(slot, header.body_size)) {
-        throw MalformedMessage("a descriptor of slot " + std::to_string(slot) + ": the ring has no such");
-      }
-      if (!advance(header.sequence, 1)) return;
-      if (view == nullptr || policy_.is_reliable) {  // left out on purpose: the publisher held us to our share
-        ++counters_->lost;
-        return;
-      }
-      Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
-      item.body = {nullptr, static_cast<std::size_t>(header.body_size)};
-      item.unleased = view;
-      item.slot = slot;
-      return;
-    }
-    std::shared_ptr<const void> owner;
-    const auto body = view->take(slot, header.sequence, header.body_size, owner);
-    if (!advance(header.sequence, 1)) return;  // it was latched, or came as `L`: `owner` gives the slot back
+  void on_slot(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
+    Span<const std::uint8_t> body;
+    auto owner = arrival.message == nullptr ? end_->take_body(body) : nullptr;
+    if (owner == nullptr) throw MalformedMessage("a slot that does not hold its message");
+    if (!advance(header.sequence, 1)) return;  // it was latched: `owner` gives the slot back
     Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
     item.body = body;
     item.owner = std::move(owner);
-  }
-
-  // The ring of a descriptor, mapped if need be; null where that cannot be done.
-  std::shared_ptr<RingView> ring_of(std::uint32_t number, const std::uint8_t* place_at) {
-    if (column_ == wire::no_column) return nullptr;
-    const auto known = rings_.find(number);
-    if (known != rings_.end()) return known->second;
-    const wire::RingPlace place = wire::load_place(place_at);
-    if (place.ring != number) throw MalformedMessage("a descriptor that places another ring");
-    try {
-      return map_ring(place);
-    } catch (const RingGone& error) {  // the lease of a message keeps its ring; that of one that was left out may be gone
-      if (number >= newest_ring_) go_without_memory(error.what());
-    } catch (const ShmUnavailable& error) {
-      go_without_memory(error.what());
-    }
-    return nullptr;
-  }
-
-  std::shared_ptr<RingView> map_ring(const wire::RingPlace& place) {
-    auto view = std::make_shared<RingView>(source_, place, column_);
-    rings_[place.ring] = view;
-    newest_ring_ = std::max(newest_ring_, static_cast<std::int64_t>(place.ring));
-    return view;
-  }
-
-  // Maps the newest ring that is announced, and forgets those that are given up; false if there is no shared memory
-  // from now on. An announcement comes through the socket, descriptors through the ring: it may be old news.
-  bool take_rings(const std::vector<wire::RingPlace>& places) {
-    const auto by_number = [](const wire::RingPlace& a, const wire::RingPlace& b) { return a.ring < b.ring; };
-    const auto [oldest, newest] = std::minmax_element(places.begin(), places.end(), by_number);
-    given_up_ = std::max(given_up_, oldest->ring);
-    if (newest->ring > newest_ring_) {
-      try {
-        map_ring(*newest);
-      } catch (const RingGone&) {  // replaced meanwhile: descriptors say which ring there is
-      } catch (const ShmUnavailable& error) {
-        go_without_memory(error.what());
-        return false;
-      }
-    }
-    forget_rings(newest_ring_);
-    return true;
-  }
-
-  // Unmaps older rings that are not in use; one that is needed after all is mapped again. Of a ring that the publisher
-  // has given up only messages on their way are waited for: those in use become private copies.
-  void forget_rings(std::int64_t newest) {
-    for (auto entry = rings_.begin(); entry != rings_.end();) {
-      const auto& [number, view] = *entry;
-      const bool surplus = rings_.size() > rings_max;  // whoever lets us wait for so many sends us nonsense
-      const bool given_up = number < given_up_ && !view->is_awaited();
-      if (number < newest && (surplus || given_up || view->idle())) {
-        view->close();
-        entry = rings_.erase(entry);
-      } else {
-        ++entry;
-      }
-    }
-  }
-
-  void close_rings() noexcept {
-    for (auto& ring : rings_) ring.second->close();
-    rings_.clear();
-    newest_ring_ = -1;
   }
 
   void on_answer(Span<const std::uint8_t> bytes, std::deque<Item>& queue) {
@@ -386,24 +293,14 @@ class Link {
     const bool first = !attached_;
     attached_ = true;
     reached_ = std::max(reached_, answer.sequence);
-    column_ = answer.column;
-    if (column_ == wire::no_column) {
-      subscribe_large(true);  // the publisher cannot share memory any more
-    } else {
-      if (!answer.rings.empty() && !take_rings(answer.rings)) return;
-      subscribe_large(false);
+    if (first && !use_ring()) {
+      attached_ = false;
+      return;  // it is asked again
     }
-    if (first && end_ != nullptr && end_->welcomed()) use_ring();
     if (!first || known_) return;
     if (!answer.latched.empty()) latched(answer.latched, queue);
     known_ = true;
     expected_ = answer.sequence;
-  }
-
-  void subscribe_large(bool wanted) {
-    if (large_subscribed_ == wanted) return;
-    large_subscribed_ = wanted;
-    subscribe('L', wanted);
   }
 
   void subscribe(char kind, bool wanted) {
@@ -414,10 +311,14 @@ class Link {
     }
   }
 
-  // The publisher sends all that follows through its ring.
-  void use_ring() {
+  // If the publisher has taken us in, it sends all that follows through its ring; false if we cannot read it.
+  bool use_ring() {
+    const int welcomed = end_ == nullptr ? 0 : end_->welcomed();
+    if (welcomed < 0) go_without_memory("its ring cannot be mapped");
+    if (welcomed <= 0) return welcomed == 0;
     in_ring_ = true;
-    for (const char kind : {'M', 'B', 'S'}) subscribe(kind, false);
+    for (const char kind : {'M', 'B', 'L'}) subscribe(kind, false);
+    return true;
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
@@ -436,22 +337,16 @@ class Link {
   // Attaches anew, as another reader: what follows comes through the socket.
   void go_without_memory(const std::string& why) {
     complaints_->once("memory " + address_, "cannot share memory with " + address_ + ": " + why);
-    close_rings();  // before the publisher can learn that our column is free
-    if (!in_ring_) {
-      subscribe('S', false);
-    } else {
-      for (const char kind : {'M', 'B'}) subscribe(kind, true);
+    if (in_ring_) {
+      for (const char kind : {'M', 'B', 'L'}) subscribe(kind, true);
     }
-    subscribe_large(true);
     in_ring_ = false;
     end_.reset();
-    socket_.set(zmq::sockopt::unsubscribe, key_);
-    column_ = wire::no_column;
+    const std::string key = key_;
     attached_ = false;
     attach(false);
+    socket_.set(zmq::sockopt::unsubscribe, key);  // after that, so that the publisher counts us all the time
   }
-
-  static constexpr std::size_t rings_max = 8;  // most rings of one publisher that are kept mapped
 
   std::string address_;
   std::uint64_t source_;
@@ -460,20 +355,15 @@ class Link {
   std::int64_t clock_offset_ns_;
   std::shared_ptr<SubscriberCounters> counters_;
   std::shared_ptr<net::Complaints> complaints_;
-  zmq::socket_t socket_;  // closes after `~Link` has given the leases back
+  zmq::socket_t socket_;
   int fd_ = -1;
   std::string key_;
   std::uint64_t reader_ = 0;
   bool attached_ = false;
-  bool large_subscribed_ = true;
   bool known_ = false;  // whether `expected_` is
   std::uint64_t expected_ = 0;
   std::uint64_t reached_ = 0;  // the highest number below which all has been given away
   std::uint64_t sample_ = 0;
-  std::uint32_t column_ = wire::no_column;
-  std::map<std::uint32_t, std::shared_ptr<RingView>> rings_;
-  std::int64_t newest_ring_ = -1;  // the highest number of a ring that was mapped
-  std::uint32_t given_up_ = 0;     // the publisher writes to no ring of a lower number any more
   std::unique_ptr<RingReader> end_;  // of the ring, if we have asked for it
   bool in_ring_ = false;             // else everything comes through the socket
 };

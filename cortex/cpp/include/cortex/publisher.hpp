@@ -67,7 +67,7 @@ class Loan {
     Codec<T>::draft(measure, message_);
     tail_ = measure.size();
     const std::size_t size = tail_ + reserve;
-    slot_ = size <= core_->inline_max() ? detail::private_slot(size) : core_->acquire(size);
+    slot_ = size <= core_->inline_max() ? detail::private_slot(size) : core_->acquire(size, true);
     if (slot_.buffer.data() == nullptr) {
       core_.reset();
       throw std::runtime_error("every slot is out on loan; publish or drop one first");
@@ -98,8 +98,7 @@ class Publisher {
       return core_->publish_inline(std::move(frame), Codec<T>::stamp(message));
     }
     const std::lock_guard<std::mutex> lock(core_->large_mutex);
-    const detail::Slot slot = core_->acquire(size);
-    if (slot.buffer.data() == nullptr) return false;
+    const detail::Slot slot = core_->acquire(size, false);
     try {
       encode_into(message, slot.buffer);
     } catch (...) {

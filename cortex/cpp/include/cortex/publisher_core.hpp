@@ -19,8 +19,6 @@
 #include "cortex/outlet.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/readers.hpp"
-#include "cortex/ring.hpp"
-#include "cortex/rings.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/slot.hpp"
 #include "cortex/socket.hpp"
@@ -42,8 +40,8 @@ class PublisherCore {
         latch_(latch),
         inline_max_(inline_max),
         max_wait_ms_(max_wait_ms),
-        complaints_(std::move(complaints)),
-        rings_(source, exact) {
+        exact_(exact),
+        complaints_(std::move(complaints)) {
     const Lock lock(outlets_->mutex);
     outlets_->publishers[source] = this;
   }
@@ -82,21 +80,28 @@ class PublisherCore {
     counters_.bytes += size;
     if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
-    bool on_time = !is_late_;
+    bool on_time = !is_late_ && !readers_.is_moving(true);
     if (has_sockets(outlets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
     on_time &= send_to_ring(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
     return on_time;
   }
 
-  // Memory for a message; without a buffer if every slot is out on loan.
-  Slot acquire(std::size_t size) {
+  // Memory for a message; for a loan without a buffer if every slot is out on loan.
+  Slot acquire(std::size_t size, bool for_loan) {
     Lock lock(outlets_->mutex);
     prepare(lock, true);
-    const std::shared_ptr<Ring> ring = ring_for(size);
-    if (ring == nullptr) return private_slot(size);
-    const int index = ring->acquire();
-    if (index >= 0) return {ring->buffer(index), ring, index, nullptr};
+    if (!provide(lock, size)) return private_slot(size);
+    Slot slot = readers_.ring().acquire();
+    if (slot.index < 0) {
+      wait_for_readers(lock, 0, [&] {
+        if (!readers_.has_members()) return true;
+        slot = readers_.ring().acquire();
+        return slot.index >= 0;
+      });
+    }
+    if (slot.index >= 0) return slot;
+    if (!for_loan) return private_slot(size);
     ++sequence_;
     ++counters_.published;
     ++counters_.skipped;
@@ -104,20 +109,15 @@ class PublisherCore {
   }
 
   void abandon(const Slot& slot) noexcept {
-    if (slot.ring == nullptr) return;
+    if (slot.index < 0) return;
     const Lock lock(outlets_->mutex);
-    slot.ring->abandon(slot.index);
+    if (readers_.has_members()) readers_.ring().abandon(slot);
   }
 
   // Sends what was written into a slot; false if a reliable subscriber lost it.
   bool publish_slot(const Slot& slot, std::size_t size, std::int64_t stamp_ns) {
     Lock lock(outlets_->mutex);
     prepare(lock, true);
-    bool on_time = await_strict(lock, slot);
-    if (closed_) {
-      if (slot.ring != nullptr) slot.ring->abandon(slot.index);
-      return false;
-    }
     const std::uint64_t sequence = sequence_++;
     ++counters_.published;
     counters_.bytes += size;
@@ -128,22 +128,12 @@ class PublisherCore {
       latched_ = head;
       latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
     }
-    on_time = on_time && !is_late_;
+    bool on_time = !is_late_ && !readers_.is_moving(true);
     bool passed_over = false;
-    if (slot.ring == nullptr) {
-      on_time &= send_body_to_ring(lock, slot, sequence, stamp_ns, size);
-    } else {
-      const std::uint64_t mask = readers_.grant(*slot.ring, passed_over);
-      slot.ring->pin(slot.index);  // until it has been handed to ZeroMQ below
-      slot.ring->commit(slot.index, sequence, size, mask);
-      on_time &= send_descriptor(lock, slot, sequence, stamp_ns, size, mask);
-    }
     for (Outlet* outlet : {&outlets_->lossy, &outlets_->strict}) {
-      if (outlets_->closed) break;  // while we waited for a reader
-      const bool wanted = slot.ring == nullptr ? has_sockets(*outlet) : readers_.any_inline(*outlet);
-      if (wanted) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
+      if (!outlets_->closed && has_sockets(*outlet)) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
     }
-    if (slot.ring != nullptr) slot.ring->unpin(slot.index);
+    on_time &= send_large_to_ring(lock, slot, sequence, stamp_ns, size);
     if (passed_over) ++counters_.skipped;
     if (!on_time) ++counters_.timeouts;
     return on_time;
@@ -166,7 +156,7 @@ class PublisherCore {
   void attach(Outlet& outlet, const std::string& key, wire::AttachKey request) {
     if (closed_ || readers_.size() >= 1024) return;
     request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
-    const auto& reader = readers_.add(outlet, key, request, sequence_, !unavailable_, outlets_->listener);
+    const auto& reader = readers_.add(outlet, key, request, sequence_, outlets_->listener);
     answer(*reader, latched_);
   }
 
@@ -174,7 +164,6 @@ class PublisherCore {
   void detach(const std::string& key) {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
-    if (reader->column != wire::no_column) rings_.free_column(reader->column);
     if (reader->outlet->strict && reader->member < 0) is_late_ = false;
   }
 
@@ -212,14 +201,13 @@ class PublisherCore {
       leave_behind();
     } catch (...) {  // no memory to keep it: it is lost, as with the end of the process
       readers_.release();
-      rings_.release();
     }
   }
 
  private:
   static constexpr std::int64_t refresh_ns = 1'000'000;
   static constexpr std::int64_t silence_ns = 100'000'000;
-  static constexpr std::size_t private_bytes_max = 64u << 20;  // outside of rings, waiting to be sent
+  static constexpr std::uint32_t move_ms = 100;
 
   void write_header(std::uint8_t* out, char kind, std::uint64_t sequence, std::int64_t stamp_ns, std::uint64_t size,
                     std::uint64_t aux) const noexcept {
@@ -238,17 +226,15 @@ class PublisherCore {
     if (!now && time_ns < refresh_at_ns_) return;
     refresh_at_ns_ = time_ns + refresh_ns;
     outlets_->refresh();
-    rings_.tidy();
   }
 
-  // Tells readers that this was all, and gives the node what they have not read of sockets and slots.
+  // Tells readers that this was all; the node waits for the word of those that read sockets.
   void leave_behind() {
     Leftover leftover;
     std::uint8_t last[wire::header_size];
     write_header(last, 'B', sequence_, 0, 0, 0);
     readers_.end({last, sizeof last});  // what is in the ring stays the readers'
     leftover.sequence = sequence_;
-    leftover.rings = rings_.release();
     if (!outlets_->closed && told_ != sequence_) {
       zmq::message_t frame(last, sizeof last);
       if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
@@ -257,7 +243,7 @@ class PublisherCore {
     for (const auto& reader : readers_.release()) {
       const bool owes = reader->request.confirms && reader->outlet->strict && reader->member < 0 &&
                         reader->confirmed < sequence_;
-      leftover.readers.push_back({reader->key, reader->outlet, reader->column, reader->request.reader, owes});
+      leftover.readers.push_back({reader->key, reader->outlet, reader->request.reader, owes});
     }
     if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
   }
@@ -265,9 +251,7 @@ class PublisherCore {
   void answer(const Reader& reader, const std::string& latched) {
     wire::AttachAnswer answer;
     answer.sequence = sequence_;
-    answer.column = reader.column;
     answer.latched = {reinterpret_cast<const std::uint8_t*>(latched.data()), latched.size()};
-    if (reader.column != wire::no_column) answer.rings = rings_.places();
     zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
     if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
   }
@@ -313,59 +297,59 @@ class PublisherCore {
 
   // Writes into the ring, waiting for reliable readers; false if one of those lost the frame.
   bool send_to_ring(Lock& lock, Span<const std::uint8_t> frame) {
+    return send_to_ring(lock, frame.size(), [&] { return readers_.put(frame); });
+  }
+
+  template <class Put>
+  bool send_to_ring(Lock& lock, std::size_t frame_size, Put put) {
     int found = CORTEX_FULL;
-    const auto attempt = [&] {
-      found = readers_.put(frame);
+    const bool sent = wait_for_readers(lock, frame_size, [&] {
+      found = put();
       return found != CORTEX_FULL;
-    };
+    });
+    return sent && found == CORTEX_WRITTEN;
+  }
+
+  // Attempts something until it works, or nobody is in its way; false if it did not. Gives up readers whose time is over.
+  template <class Attempt>
+  bool wait_for_readers(Lock& lock, std::size_t frame_size, Attempt attempt) {
     const std::int64_t begin_ns = monotonic_ns();
     while (!attempt()) {
-      const std::int64_t end_ns = begin_ns + std::int64_t{readers_.patience_ms(frame.size())} * 1'000'000;
+      const std::uint32_t patience_ms = readers_.patience_ms(frame_size);
+      if (patience_ms == UINT32_MAX) return attempt();
+      const std::int64_t end_ns = begin_ns + std::int64_t{patience_ms} * 1'000'000;
       const std::int64_t left_ms = std::max<std::int64_t>((end_ns - monotonic_ns() + 999'999) / 1'000'000, 0);
       if (await_room(lock, static_cast<std::uint32_t>(left_ms), attempt)) break;
       if (closed_ || outlets_->closed) return false;
-      readers_.give_up(frame.size(), monotonic_ns() - begin_ns);
+      readers_.give_up(frame_size, monotonic_ns() - begin_ns);
     }
-    return found == CORTEX_WRITTEN;
+    return true;
   }
 
   // A body that found no slot travels through the ring as a message.
-  bool send_body_to_ring(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
+  bool send_large_to_ring(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
     if (!readers_.has_members()) return true;
+    if (readers_.ring().has(slot)) {
+      std::uint8_t header[wire::header_size];
+      write_header(header, 'S', sequence, stamp_ns, size, static_cast<std::uint64_t>(slot.index));
+      return send_to_ring(lock, sizeof header, [&] {
+        if (!readers_.has_members()) return static_cast<int>(CORTEX_WRITTEN);
+        return readers_.ring().commit(slot, sequence, {header, sizeof header});
+      });
+    }
     std::vector<std::uint8_t> frame(wire::header_size + size);
     write_header(frame.data(), 'M', sequence, stamp_ns, size, 0);
     std::memcpy(frame.data() + wire::header_size, slot.buffer.data(), size);
     return send_to_ring(lock, {frame.data(), frame.size()});
   }
 
-  bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
-                       std::uint64_t mask) {
-    zmq::message_t frame(wire::header_size + 8 + wire::place_size);
-    auto* out = static_cast<std::uint8_t*>(frame.data());
-    const std::uint64_t aux =
-        static_cast<std::uint64_t>(slot.ring->number()) << 32 | static_cast<std::uint32_t>(slot.index);
-    write_header(out, 'S', sequence, stamp_ns, size, aux);
-    wire::store(out + wire::header_size, mask);
-    wire::store_place(out + wire::header_size + 8, slot.ring->place());
-    bool lossy = false;
-    bool strict = false;
-    for (const auto& reader : readers_.all()) {
-      if (reader->column != wire::no_column && reader->member < 0) (reader->outlet->strict ? strict : lossy) = true;
-    }
-    if (lossy) outlets_->lossy.try_send(share(frame));
-    bool on_time = !strict || send_strict(lock, frame, zmq::send_flags::none);
-    on_time &= send_to_ring(lock, net::bytes(frame));
-    return on_time;
-  }
-
   // Header and body, the body from where it lies.
   bool send_large(Lock& lock, Outlet& outlet, const Slot& slot, const std::string& head, std::size_t size,
                   bool& passed_over) {
-    if (slot.ring == nullptr || slot.ring->pinned() > readers_.quota(*slot.ring)) {
-      if (*private_bytes_ + size > std::max<std::size_t>(private_bytes_max, 4 * size)) {
-        passed_over = true;
-        return !outlet.strict;
-      }
+    const auto fits = [&] { return *private_bytes_ + size <= std::max<std::size_t>(private_bytes_max, 4 * size); };
+    if (!fits() && !(outlet.strict && await_room(lock, readers_.timeout_ms(outlet), fits))) {
+      passed_over = true;
+      return !outlet.strict;
     }
     zmq::message_t header = message_of(head);
     bool on_time = true;
@@ -375,76 +359,20 @@ class PublisherCore {
       outlet.try_send(std::move(header), zmq::send_flags::sndmore);
     }
     // The second part goes where the first went: it must not be refused.
-    outlet.send_anyway(body_message(slot, size));
+    outlet.send_anyway(private_message(slot, size, private_bytes_));
     return on_time;
   }
 
-  zmq::message_t body_message(const Slot& slot, std::size_t size) {
-    if (slot.ring != nullptr && slot.ring->pinned() <= readers_.quota(*slot.ring)) return pinned_message(slot, size);
-    return private_message(slot, size, private_bytes_);
-  }
-
-  // Waits until every reliable reader can take one more; false if one could not in its time.
-  bool await_strict(Lock& lock, const Slot& slot) {
-    const auto timeout_ms = [&] {
-      std::int64_t longest = -1;
-      for (const auto& reader : readers_.all()) {
-        if (reader->request.strict && is_full(*reader, slot)) {
-          longest = std::max<std::int64_t>(longest, reader->request.timeout_ms);
-        }
-      }
-      return longest;
-    };
-    const std::int64_t first_ms = timeout_ms();
-    if (first_ms < 0) return true;
-    Backoff backoff(first_ms * 1'000'000);
-    bool in_time = true;
-    blocked_ = true;
-    while (in_time && !closed_ && !outlets_->closed && timeout_ms() >= 0) {
-      lock.unlock();
-      in_time = backoff.wait();
-      lock.lock();
-      if (!outlets_->closed) outlets_->refresh();
-    }
-    blocked_ = false;
-    if (outlets_->closed) closed_ = true;
-    if (!in_time) say_late();
-    return in_time;
-  }
-
-  bool is_full(const Reader& reader, const Slot& slot) {
-    if (slot.ring == nullptr) return reader.member < 0 && *private_bytes_ > private_bytes_max / 2;
-    if (reader.column != wire::no_column) return !readers_.has_room(reader, *slot.ring);
-    return slot.ring->pinned() >= readers_.quota(*slot.ring);
-  }
-
-  // Where a message of this size is written; null where there is no shared memory.
-  std::shared_ptr<Ring> ring_for(std::size_t size) {
-    if (unavailable_) return nullptr;
-    try {
-      const std::shared_ptr<Ring> before = rings_.newest();
-      std::shared_ptr<Ring> ring = rings_.with_room_for(size, readers_.shares());
-      for (const auto& reader : readers_.all()) {
-        if (ring != before && reader->column != wire::no_column) answer(*reader, "");
-      }
-      return ring;
-    } catch (const ShmUnavailable& error) {
-      complaints_->once("memory " + topic_, topic_ + ": no shared memory, large messages go through sockets: " +
-                                                error.what());
-      do_without_memory();
-      return nullptr;
-    }
-  }
-
-  // Large messages go through rings and sockets from now on, also to those that had a column.
-  void do_without_memory() {
-    unavailable_ = true;
-    for (const auto& reader : readers_.all()) {
-      if (reader->column == wire::no_column || reader->member >= 0) continue;
-      rings_.free_column(reader->column);
-      reader->column = wire::no_column;
-      answer(*reader, "");
-    }
+  // Whether there are slots for bodies of a size, made if need be. Where there is no memory for them readers are sent to
+  // their sockets, and waited for a little.
+  bool provide(Lock& lock, std::size_t size) {
+    if (!readers_.has_members()) return false;
+    if (readers_.ring().provide(size, exact_, readers_.member_count())) return true;
+    complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
+    readers_.dissolve();
+    const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(outlets_->lossy), readers_.timeout_ms(outlets_->strict)});
+    await_room(lock, timeout_ms, [&] { return !readers_.is_moving(false); });
+    return false;
   }
 
   std::shared_ptr<Outlets> outlets_;
@@ -454,11 +382,10 @@ class PublisherCore {
   const bool latch_;
   const std::size_t inline_max_;
   const std::uint32_t max_wait_ms_;
+  const bool exact_;
   std::shared_ptr<net::Complaints> complaints_;
   Readers readers_;
-  Rings rings_;
   std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);
-  bool unavailable_ = false;
   std::uint64_t sequence_ = 0;
   std::uint64_t told_ = 0;  // what readers know that `sequence_` was
   std::string latched_;

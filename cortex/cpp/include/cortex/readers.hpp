@@ -12,7 +12,6 @@
 
 #include "cortex/outlet.hpp"
 #include "cortex/broadcast.hpp"
-#include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
@@ -22,9 +21,9 @@ struct Reader {
   std::string key;
   wire::AttachKey request;
   Outlet* outlet = nullptr;
-  std::uint32_t column = wire::no_column;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the outlet
   std::uint64_t confirmed = 0;  // it has accounted for all below this
+  bool is_moving = false;       // it was sent from the ring to its socket, and has not come there yet
 };
 
 // Calls are made under the publisher's lock. Readers are shared so that one may leave while the publisher, having let
@@ -40,16 +39,15 @@ class Readers {
   // Those that the outlet itself serves.
   std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
 
-  // Takes a reader in; with a column of the lease table, and through the ring, if it asks for that and there is room.
-  // `first` is the sequence of the first message for it.
+  // Takes a reader in; through the ring, if it asks for that and there is room. `first` is the sequence of the first
+  // message for it.
   const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
-                                     std::uint64_t first, bool shared_memory, Listener& listener) {
+                                     std::uint64_t first, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
     reader->outlet = &outlet;
-    if (request.shared_memory && shared_memory) reader->column = free_column();
-    if (reader->column != wire::no_column) join(*reader, first, listener);
+    if (request.shared_memory) join(*reader, first, listener);
     ++(reader->member >= 0 ? members_ : outlet.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -72,7 +70,32 @@ class Readers {
     if (has_members()) ring_->end(frame);
   }
 
-  // The shortest time for which a reliable reader that has no room in the ring may hold up the publisher.
+  // Sends all members of the ring to their sockets, for good.
+  void dissolve() noexcept {
+    ring_->dissolve();
+    ring_.reset();
+    is_dissolved_ = true;
+    for (const auto& reader : all_) {
+      if (reader->member < 0) continue;
+      reader->member = -1;
+      reader->is_moving = true;
+      --members_;
+      ++(reader->outlet->strict ? strict_ : lossy_);
+    }
+  }
+  // Whether some reader has still to come to its socket; a reliable one misses what is sent meanwhile.
+  bool is_moving(bool strict_only) const noexcept {
+    return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
+      return reader->is_moving && (reader->request.strict || !strict_only);
+    });
+  }
+
+  // The ring; there is one if it has members.
+  Broadcast& ring() noexcept { return *ring_; }
+  std::size_t member_count() const noexcept { return members_; }
+
+  // The shortest time for which a reliable reader that has no room in the ring, or with size 0 has not come to all slots,
+  // may hold up the publisher; UINT32_MAX: there is none.
   std::uint32_t patience_ms(std::size_t frame_size) const noexcept {
     std::uint32_t shortest = UINT32_MAX;
     for (const auto& reader : all_) {
@@ -96,45 +119,6 @@ class Readers {
     return std::exchange(all_, {});
   }
 
-  // Readers that share the slots, so that one slow reader cannot take the ring from the others.
-  std::uint32_t shares() const noexcept {
-    std::uint32_t columns = 0;
-    for (const auto& reader : all_) columns += reader->column == wire::no_column ? 0 : 1;
-    return std::max<std::uint32_t>(1, columns + (columns < all_.size() ? 1 : 0));
-  }
-
-  // The slots of a ring that may be pinned, or leased to one reader.
-  std::uint32_t quota(const Ring& ring) const noexcept {
-    return std::max<std::uint32_t>(1, (ring.slots() - 1) / shares());
-  }
-
-  bool has_room(const Reader& reader, Ring& ring) const noexcept {
-    std::uint32_t slots = quota(ring);
-    if (reader.request.quota != 0) slots = std::min<std::uint32_t>(slots, reader.request.quota);
-    return ring.outstanding(reader.column, slots) < slots;
-  }
-
-  // The columns that get a lease of the next message of a ring, and whether some reader is passed over.
-  std::uint64_t grant(Ring& ring, bool& passed_over) const noexcept {
-    std::uint64_t mask = 0;
-    for (const auto& reader : all_) {
-      if (reader->column == wire::no_column) continue;
-      if (has_room(*reader, ring)) {
-        mask |= std::uint64_t{1} << reader->column;
-      } else {
-        passed_over = true;
-      }
-    }
-    return mask;
-  }
-
-  // Whether some reader of this outlet has no part in shared memory.
-  bool any_inline(const Outlet& outlet) const noexcept {
-    return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
-      return reader->outlet == &outlet && reader->column == wire::no_column;
-    });
-  }
-
   // The longest that a reader which this outlet itself serves may hold up the publisher.
   std::uint32_t timeout_ms(const Outlet& outlet) const noexcept {
     std::uint32_t longest = 0;
@@ -146,13 +130,14 @@ class Readers {
 
  private:
   bool is_full(const Reader& reader, std::size_t frame_size) const noexcept {
-    return reader.member >= 0 && ring_->is_full(reader.member, frame_size);
+    if (reader.member < 0) return false;
+    return frame_size == 0 ? ring_->is_behind(reader.member) : ring_->is_full(reader.member, frame_size);
   }
 
   void join(Reader& reader, std::uint64_t first, Listener& listener) {
     CortexHello hello;
     if (!listener.take(reader.request.source, reader.request.reader, hello)) return;
-    if (ring_ == nullptr) ring_ = Broadcast::open(reader.request.source);
+    if (ring_ == nullptr && !is_dissolved_) ring_ = Broadcast::open(reader.request.source);
     if (ring_ == nullptr) {
       cortex_hello_close(&hello);
     } else {
@@ -160,17 +145,9 @@ class Readers {
     }
   }
 
-  std::uint32_t free_column() const noexcept {
-    for (std::uint32_t column = 0; column < wire::column_count; ++column) {
-      if (std::none_of(all_.begin(), all_.end(), [&](const auto& other) { return other->column == column; })) {
-        return column;
-      }
-    }
-    return wire::no_column;
-  }
-
   List all_;
   std::unique_ptr<Broadcast> ring_;
+  bool is_dissolved_ = false;
   std::size_t members_ = 0;
   std::size_t lossy_ = 0;
   std::size_t strict_ = 0;

@@ -12,33 +12,21 @@
 #include <zmq.hpp>
 
 #include "cortex/array.hpp"
-#include "cortex/ring.hpp"
+#include "cortex/broadcast.h"
 
 namespace cortex::detail {
 
-// Where a large message is written: a slot of a ring, or private memory where there is none.
+// Where a large message is written: a slot of the ring, or private memory where there is none.
 struct Slot {
   Span<std::uint8_t> buffer;
-  std::shared_ptr<Ring> ring;
-  int index = -1;
+  int index = -1;                  // of the slot; -1: there is none
+  std::shared_ptr<CortexMap> map;  // the ring's memory
   std::shared_ptr<std::vector<std::uint8_t>> memory;
 };
 
 inline Slot private_slot(std::size_t size) {
   auto memory = std::make_shared<std::vector<std::uint8_t>>(size);
-  return {{memory->data(), size}, nullptr, -1, std::move(memory)};
-}
-
-// The body where it lies in its ring; the slot is not written again before ZeroMQ's thread has let go of it.
-inline zmq::message_t pinned_message(const Slot& slot, std::size_t size) {
-  struct Pin {
-    std::shared_ptr<Ring> ring;
-    int index;
-    ~Pin() { ring->unpin(index); }
-  };
-  slot.ring->pin(slot.index);
-  auto* held = new Pin{slot.ring, slot.index};
-  return {slot.buffer.data(), size, [](void*, void* hint) { delete static_cast<Pin*>(hint); }, held};
+  return {{memory->data(), size}, -1, nullptr, std::move(memory)};
 }
 
 // The body in memory of its own, which counts in `total` as long as ZeroMQ has it.

@@ -177,21 +177,6 @@ class SubscriptionCore {
     }
   }
 
-  // Copies a message that is not leased to us; false if its slot was written again meanwhile.
-  static bool fetch(Item& item) {
-    if (item.unleased == nullptr) return true;
-    auto copy = std::make_shared<std::vector<std::uint8_t>>(item.body.size());
-    if (!item.unleased->copy(item.slot, item.sequence, copy->size(), copy->data())) return false;
-    item.body = {copy->data(), copy->size()};
-    item.owner = std::move(copy);
-    return true;
-  }
-
-  void count_lost() {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    --counters_->received;
-    ++counters_->lost;
-  }
   void count_rejected(std::uint64_t source, const std::string& reason) {
     const std::lock_guard<std::mutex> lock(mutex_);
     --counters_->received;
@@ -307,9 +292,17 @@ class SubscriptionCore {
         queue_.pop_front();
         ++counters_->overtaken;
       }
-      if (empty) return true;
+      if (empty && !link.is_crowded()) return true;
+      if (link.is_crowded()) make_room(link);
     }
     return false;
+  }
+
+  // The oldest message gives way to a large one, or that one, if the user keeps all the memory.
+  void make_room(Link& link) {
+    if (queue_.empty()) return link.pass_over();
+    queue_.pop_front();
+    ++counters_->overtaken;
   }
 
   void complain(const Source& source) {
@@ -360,10 +353,6 @@ class Subscription {
   std::optional<Received<T>> receive(std::chrono::nanoseconds timeout) {
     const std::int64_t deadline_ns = detail::deadline(timeout);
     while (auto item = core_->take(deadline_ns)) {
-      if (!detail::SubscriptionCore::fetch(*item)) {
-        core_->count_lost();
-        continue;
-      }
       std::optional<Received<T>> result(Received<T>{});
       try {
         decode_into(item->body, result->message_);

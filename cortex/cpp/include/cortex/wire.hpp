@@ -34,10 +34,7 @@ constexpr std::uint64_t jump_max = std::uint64_t{1} << 32;  // no source loses m
 constexpr std::uint8_t flag_stamp = 1;
 constexpr std::uint64_t body_limit = std::uint64_t{1} << 30;
 constexpr std::uint64_t control_limit = 16u << 20;
-constexpr std::uint32_t no_column = 0xFFFFFFFFu;
-constexpr std::uint32_t column_count = 64;
 constexpr std::size_t record_head = 24;
-constexpr std::uint32_t rings_alive = 4;
 
 template <class T>
 T load(const std::uint8_t* from) noexcept {
@@ -204,51 +201,17 @@ inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
   return true;
 }
 
-struct RingPlace {
-  std::uint32_t ring = 0;
-  std::uint32_t slots = 0;
-  std::uint64_t slot_bytes = 0;
-  std::uint32_t pid = 0;
-  std::int32_t fd = -1;
-};
-
 struct AttachAnswer {
   std::uint64_t sequence = 0;
-  std::uint32_t column = no_column;
-  std::vector<RingPlace> rings;
   Span<const std::uint8_t> latched;
 };
 
-constexpr std::size_t place_size = 32;
-constexpr std::size_t slot_frame_size = header_size + 8 + place_size;  // of a descriptor: header, mask, place
-
-inline void store_place(std::uint8_t* out, const RingPlace& ring) noexcept {
-  store(out, ring.ring);
-  store(out + 4, ring.slots);
-  store(out + 8, ring.slot_bytes);
-  store(out + 16, ring.pid);
-  store(out + 20, ring.fd);
-  store(out + 24, std::uint64_t{0});
-}
-
-inline RingPlace load_place(const std::uint8_t* at) noexcept {
-  return {load<std::uint32_t>(at), load<std::uint32_t>(at + 4), load<std::uint64_t>(at + 8),
-          load<std::uint32_t>(at + 16), load<std::int32_t>(at + 20)};
-}
-
 inline std::string pack_answer(const std::string& key, const AttachAnswer& answer) {
-  std::string frame(header_size + 32 * answer.rings.size(), '\0');
+  std::string frame(header_size, '\0');
   std::memcpy(frame.data(), key.data(), key_size);
   auto* out = reinterpret_cast<std::uint8_t*>(frame.data()) + key_size;
   store(out, answer.sequence);
-  store(out + 8, answer.column);
-  store(out + 12, static_cast<std::uint32_t>(answer.rings.size()));
   store(out + 16, static_cast<std::uint64_t>(answer.latched.size()));
-  out += 32;
-  for (const auto& ring : answer.rings) {
-    store_place(out, ring);
-    out += place_size;
-  }
   frame.append(reinterpret_cast<const char*>(answer.latched.data()), answer.latched.size());
   return frame;
 }
@@ -258,21 +221,11 @@ inline AttachAnswer read_answer(Span<const std::uint8_t> frame) {
   const std::uint8_t* at = frame.data() + key_size;
   AttachAnswer answer;
   answer.sequence = load<std::uint64_t>(at);
-  answer.column = load<std::uint32_t>(at + 8);
-  const auto rings = load<std::uint32_t>(at + 12);
   const auto latched = load<std::uint64_t>(at + 16);
-  if (rings > rings_alive || latched > body_limit + header_size ||
-      frame.size() != header_size + 32u * rings + latched) {
-    throw MalformedMessage("an attach answer cannot hold its rings and its latched message");
+  if (latched > body_limit + header_size || frame.size() != header_size + latched) {
+    throw MalformedMessage("an attach answer cannot hold its latched message");
   }
-  if (answer.column != no_column && answer.column >= column_count) {
-    throw MalformedMessage("column " + std::to_string(answer.column) + " is not below 64");
-  }
-  at += 32;
-  for (std::uint32_t index = 0; index < rings; ++index, at += 32) {
-    answer.rings.push_back(load_place(at));
-  }
-  answer.latched = {at, static_cast<std::size_t>(latched)};
+  answer.latched = {at + 32, static_cast<std::size_t>(latched)};
   return answer;
 }
 

@@ -92,12 +92,12 @@ impl Publisher {
         match (if ours { key[3] } else { 0 }, on) {
             (b'A', true) => {
                 let next = self.next.lock().unwrap(); // nothing is published meanwhile
-                let (mut wishes, options, no_column) = (peer.wishes.lock().unwrap(), number(key, 24), u32::MAX as u64);
+                let (mut wishes, options) = (peer.wishes.lock().unwrap(), number(key, 24));
                 wishes.wait = Duration::from_millis(options >> 32).min(MAX_WAIT);
                 (wishes.reader, wishes.confirms) = (number(key, 16), options & CONFIRMS != 0);
                 wishes.prefixes.push(key.to_vec());
                 drop(wishes);
-                let rest = [next.0, no_column, 0, 0].map(u64::to_le_bytes).concat();
+                let rest = [next.0, 0, 0, 0].map(u64::to_le_bytes).concat();
                 peer.push(&Arc::new(vec![[key, &rest].concat()]), next.0);
             }
             (b'R', true) => {

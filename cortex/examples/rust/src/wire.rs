@@ -73,13 +73,9 @@ pub fn records(mut rest: &[u8], count: u64) -> Result<Vec<&[u8]>> {
 /// Sequence and latched message of an answer [A4].
 pub fn parse_answer(frame: &[u8]) -> Result<(u64, &[u8])> {
     ensure!(frame.len() >= 64, "an answer of {} bytes", frame.len());
-    let (sequence, places, latched) = (number(frame, 32), number(frame, 40) >> 32, number(frame, 48));
-    let start = 64 + 32 * places.min(4) as usize;
-    ensure!(
-        places <= 4 && frame.len() as u64 == start as u64 + latched.min(BODY_MAX),
-        "an answer: {places}, {latched}"
-    );
-    Ok((sequence, &frame[start..]))
+    let (sequence, latched) = (number(frame, 32), number(frame, 48));
+    ensure!(frame.len() as u64 == 64 + latched.min(BODY_MAX), "an answer: {latched}");
+    Ok((sequence, &frame[64..]))
 }
 
 /// Schemas and fingerprints of the control messages.
