@@ -113,30 +113,3 @@ def normal4(bits: wp.vec4ui) -> wp.vec4:
         radius_1 * wp.cos(_TWO_PI_32 * u[3]),
         radius_1 * wp.sin(_TWO_PI_32 * u[3]),
     )
-
-
-@wp.kernel
-def _draw_normal(
-    # In:
-    seed: wp.uint64,
-    stream: wp.uint32,
-    step: wp.int64,
-    # Out:
-    normal_out: wp.array[wp.vec2d],
-) -> None:
-    element = wp.tid()
-    normal_out[element] = normal2(random_bits(seed, stream, step, element))
-
-
-def draw_normal(seed: int, stream: int, step: int, *, out: wp.array[wp.vec2d]) -> None:
-    """Fill an array with standard normal numbers, two per element.
-
-    Element i gets those of the address (seed, stream, step, i).
-
-    Args:
-        seed: Seed of the run, 0 <= seed < 2^64.
-        stream: What the numbers are for, 0 <= stream < 2^32; see `stream_id`.
-        step: Tick or stamp, int64.
-        out: Pairs of numbers, shape [element], vec2d; overwritten.
-    """
-    wp.launch(_draw_normal, dim=out.shape[0], inputs=[seed, stream, step], outputs=[out], device=out.device)

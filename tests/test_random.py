@@ -23,6 +23,7 @@ def _draws(
     step: wp.int64,
     bits: wp.array[wp.vec4ui],
     uniform: wp.array[wp.vec2d],
+    normal: wp.array[wp.vec2d],
     uniform_32: wp.array[wp.vec4],
     normal_32: wp.array[wp.vec4],
 ):
@@ -30,21 +31,22 @@ def _draws(
     word = random.random_bits(seed, stream, step, element)
     bits[element] = word
     uniform[element] = random.uniform2(word)
+    normal[element] = random.normal2(word)
     uniform_32[element] = random.uniform4(word)
     normal_32[element] = random.normal4(word)
 
 
 def draws(seed: int, stream: int, step: int, count: int, device: str) -> dict[str, Any]:
-    types = {"bits": wp.vec4ui, "uniform": wp.vec2d, "uniform_32": wp.vec4, "normal_32": wp.vec4}
+    types = {
+        "bits": wp.vec4ui,
+        "uniform": wp.vec2d,
+        "normal": wp.vec2d,
+        "uniform_32": wp.vec4,
+        "normal_32": wp.vec4,
+    }
     arrays = {name: wp.zeros(count, dtype=dtype, device=device) for name, dtype in types.items()}
     wp.launch(_draws, dim=count, inputs=[seed, stream, step, *arrays.values()], device=device)
     return {name: array.numpy() for name, array in arrays.items()}
-
-
-def normals(seed: int, stream: int, step: int, count: int, device: str) -> np.ndarray:
-    out = wp.zeros(count, dtype=wp.vec2d, device=device)
-    random.draw_normal(seed, stream, step, out=out)
-    return out.numpy()
 
 
 def philox_in_integers(counter: tuple[int, ...], key: tuple[int, ...]) -> tuple[int, ...]:
@@ -101,17 +103,19 @@ def test_numbers_are_those_of_the_bits(device):
     radius, angle = np.sqrt(-2.0 * np.log(uniform[:, :1])), 2.0 * np.pi * uniform[:, 1:]
     expected = np.hstack([radius * np.cos(angle), radius * np.sin(angle)])
     # float64 roundings of log, sqrt, cos and the angle
-    np.testing.assert_allclose(normals(7, 1, 2, 1000, device), expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(draws(7, 1, 2, 1000, device)["normal"], expected, rtol=1e-12, atol=1e-14)
 
 
 def test_values_do_not_depend_on_the_size_of_the_batch(device):
-    np.testing.assert_array_equal(normals(3, 4, 5, 10, device), normals(3, 4, 5, 1000, device)[:10])
+    np.testing.assert_array_equal(
+        draws(3, 4, 5, 10, device)["normal"], draws(3, 4, 5, 1000, device)["normal"][:10]
+    )
 
 
 @pytest.mark.parametrize("change", [(1, 0, 0), (2**32, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 2**32)])
 def test_addresses_that_differ_are_independent(change, device):
     """Correlation of 2^17 pairs of independent normals is N(0, 1 / n): 5 sigma is a false alarm of 6e-7."""
-    first, second = normals(0, 0, 0, 2**16, device), normals(*change, 2**16, device)
+    first, second = draws(0, 0, 0, 2**16, device)["normal"], draws(*change, 2**16, device)["normal"]
     correlation = np.mean(first * second)
     assert abs(correlation) < 5.0 / np.sqrt(first.size)
 
@@ -121,7 +125,7 @@ def test_normals_are_standard_and_uncorrelated(kind, device):
     """Kolmogorov-Smirnov, and the covariance of the numbers of one block; false alarm below 1e-6."""
     count = 2**17
     z = (
-        normals(11, 12, 13, count, device)
+        draws(11, 12, 13, count, device)["normal"]
         if kind == "float64"
         else draws(11, 12, 13, count, device)["normal_32"]
     )

@@ -23,7 +23,8 @@ INSTANT_OUTPUTS = frozenset({"log_radiance"})
 """Those that all instants have, whether they have an image slot or not."""
 RADIANCE = ("log_radiance", "rgb", "radiance")
 """Those of the light of a pixel."""
-_GEOMETRY = ("depth", "range", "normal", "instance", "returns")
+_PLAIN_GEOMETRY = ("depth", "range", "normal", "instance")
+_GEOMETRY = (*_PLAIN_GEOMETRY, "returns")
 FACE = "face"
 """The output of a first pass (`antialias.py`), which all instants have."""
 
@@ -41,6 +42,15 @@ class RequestedOutputs(NamedTuple):
     """Log radiance, RGB or radiance is requested."""
     geometry: bool
     """Depth, range, normal, instance or returns are requested."""
+
+
+def widened_outputs(outputs: Collection[str]) -> frozenset[str]:
+    """Return outputs and those that the writers for allocated outputs write by the same code.
+
+    Kernels of a CPU check which are allocated, which takes less than to compile a kernel for each set.
+    """
+    alike = (RADIANCE[1:], _PLAIN_GEOMETRY)
+    return frozenset(outputs).union(*(names for names in alike if not set(names).isdisjoint(outputs)))
 
 
 def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
@@ -191,3 +201,36 @@ def allocated_radiance_writer() -> wp.Function:
             write_linear(scene, radiance, 1, instant, slot, row, col, out)
 
     return write_allocated_radiance
+
+
+@cache
+def allocated_geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
+    """Return the function that writes the geometry of a pixel: of `widened_outputs`, what is allocated."""
+    write_depth, write_range, write_normal, write_instance, write_returns = (
+        geometry_writer((name,), terms) for name in _GEOMETRY
+    )
+
+    @wp.func
+    def write_allocated_geometry(
+        scene: SceneData,
+        ray: wp.vec3,
+        cosine: float,
+        spread_rad: float,
+        hit: Hit,
+        slot: int,
+        row: int,
+        col: int,
+        out: RenderOutputs,
+    ) -> None:
+        if out.depth.shape[0] > 0:
+            write_depth(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
+        if out.range.shape[0] > 0:
+            write_range(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
+        if out.normal.shape[0] > 0:
+            write_normal(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
+        if out.instance.shape[0] > 0:
+            write_instance(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
+        if wp.static("returns" in outputs):
+            write_returns(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
+
+    return write_allocated_geometry

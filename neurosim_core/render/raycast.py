@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from neurosim_core.render.outputs import FACE, OUTPUTS, requested_outputs
+from neurosim_core.render.outputs import FACE, OUTPUTS, requested_outputs, widened_outputs
 from neurosim_core.render.raycast_packets import packet_kernel
 from neurosim_core.render.raycast_pixels import pixel_kernel
 from neurosim_core.render.render_terms import RenderTerms
@@ -39,6 +39,8 @@ def raycast_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
         terms = terms._replace(
             textured=False, emissive=False, baked=False, finest_level=False, nearest_texel=False
         )
+    if terms.embree or terms.by_tile:
+        outputs, terms = widened_outputs(outputs), terms._replace(supersampled=False)
     return _kernel(tuple(name for name in (*OUTPUTS, FACE) if name in outputs), terms)
 
 

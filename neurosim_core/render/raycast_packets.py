@@ -14,7 +14,12 @@ from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.candidate_data import TILE, UNRESOLVED, CandidateListData
 from neurosim_core.render.candidate_intersection import intersect_tile
 from neurosim_core.render.embree import packet_caster
-from neurosim_core.render.outputs import RenderOutputs, geometry_writer, radiance_writer, requested_outputs
+from neurosim_core.render.outputs import (
+    RenderOutputs,
+    allocated_geometry_writer,
+    allocated_radiance_writer,
+    requested_outputs,
+)
 from neurosim_core.render.packet_shading import packet_program, packet_shader
 from neurosim_core.render.ray_intersection import (
     FAR_M,
@@ -37,8 +42,8 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     every_instant = requested.log or requested.faces
     locate_tile = tile_locator(terms, images=requested.images, instants=every_instant)
     radiance_of = pixel_shader(terms)
-    write_geometry = geometry_writer(outputs, terms)
-    write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
+    write_geometry = allocated_geometry_writer(outputs, terms)
+    write_radiance = allocated_radiance_writer()
     side = TILE if terms.by_tile else 4
     lanes = side * side
     packets = (TILE // side) ** 2  # of a tile
@@ -112,10 +117,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         origins = wp.zeros(shape=(origin_count,), dtype=wp.vec3)
         spread_rad = wp.zeros(shape=(lanes if packed else 1,), dtype=float)
-        for layer in range(view.rays.shape[0]):
-            if wp.static(terms.supersampled):
-                if layer == 0 and (slot < 0 or wp.static(not requested.geometry)):
-                    continue
+        layers = view.rays.shape[0]
+        for layer in range(layers):
+            if layers > 1 and layer == 0 and (slot < 0 or wp.static(not requested.geometry)):
+                continue
             for y in range(rows):
                 for x in range(columns):
                     ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
@@ -183,10 +188,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                             v[lane] = hit.v
                             normal[lane] = hit.normal
                         if wp.static(requested.faces):
-                            if layer == view.rays.shape[0] - 1:
+                            if layer == layers - 1:
                                 out.face[instant, top + y, left + x] = hit.face
                         if wp.static(requested.radiance and not packed):
-                            if wp.static(not terms.supersampled) or layer > 0:
+                            if layers == 1 or layer > 0:
                                 radiance[lane] += radiance_of(
                                     scene, bodies, pose, body, q, ray[lane], origin, ray_C[3], hit
                                 )
@@ -204,7 +209,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                                     out,
                                 )
             if wp.static(packed):
-                if wp.static(not terms.supersampled) or layer > 0:
+                if layers == 1 or layer > 0:
                     shade_packet(
                         scene,
                         ray,
@@ -217,12 +222,12 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                         radiance,
                     )
         if wp.static(requested.radiance):
+            share = 1.0 / float(wp.max(layers - 1, 1))
             for y in range(rows):
                 for x in range(columns):
                     write_radiance(
                         scene,
-                        radiance[side * y + x],
-                        view.rays.shape[0],
+                        share * radiance[side * y + x],
                         instant,
                         slot,
                         top + y,

@@ -14,11 +14,11 @@ class RenderTerms(NamedTuple):
     textured: bool
     """Some material has a texture."""
     emissive: bool
-    """Some material emits light."""
+    """Some material emits light; always on a CPU, where to add nothing takes less than to compile both."""
     baked: bool
     """Light is baked: interpolated between corners instead of evaluated for each pixel."""
     supersampled: bool
-    """Radiance is the mean over several rays per pixel."""
+    """Radiance is the mean over several rays per pixel; `raycast_packets.py` counts them itself."""
     embree: int = 0
     """Rays per packet of Embree (`embree.packet_width`), on the CPU only; 0: Warp intersects rays."""
     finest_level: bool = False

@@ -163,7 +163,7 @@ def _terms_of(
     textured = bool((packed.material_texture[:, 1] > 0).any())
     return RenderTerms(
         textured=textured,
-        emissive=any(max(m.emission) > 0.0 for m in materials),
+        emissive=wp.get_device(device).is_cpu or any(max(m.emission) > 0.0 for m in materials),
         baked=config.lighting.mode == "baked",
         supersampled=config.samples_per_pixel not in (1, "adaptive"),
         embree=embree,

@@ -2,7 +2,7 @@
 // looked up twice, as `shading.py` says: `slope` [2][N] is the change of us and vs along the footprint [1/rad], 0: once.
 constexpr float COSINE_MIN = 0.05f, SCALE_RG = (float)(1.0 / 2047), SCALE_B = (float)(1.0 / 1023);
 alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
-alignas(64) float light[3][3][N];
+alignas(64) float light[3][3][N], emitted[3][N];
 alignas(64) int face[N], material[N];
 for (int lane = 0; lane < N; ++lane) {
     const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
@@ -32,6 +32,8 @@ for (int lane = 0; lane < different; ++lane) {
     red[lane] = base[0];
     green[lane] = base[1];
     blue[lane] = base[2];
+    for (int channel = 0; channel < 3; ++channel)
+        emitted[channel][lane] = EMISSIVE ? scene.emission.data[material[lane]][channel] : 0.0f;
     const wp::vec3* corner = scene.corner_light.data
                              + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0)
                              + 3 * (size_t)face[lane];
@@ -45,6 +47,7 @@ if (different == 1) {
     repeat(blue);
     for (int tip = 0; tip < 3; ++tip)
         for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
+    for (int channel = 0; channel < 3; ++channel) repeat(emitted[channel]);
 }
 if constexpr (TEXTURED) {
     alignas(64) float x[N], y[N], blend[N], lod[N];
@@ -161,11 +164,7 @@ if constexpr (TEXTURED) {
         blue[lane] = level_count[lane] ? blue[lane] * (each * mean[2][lane]) : blue[lane];
     }
 }
-alignas(64) float radiance[3][N], emitted[3][N];
-for (int channel = 0; channel < 3; ++channel)
-    for (int lane = 0; lane < N; ++lane)
-        emitted[channel][lane] =
-            EMISSIVE ? scene.emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
+alignas(64) float radiance[3][N];
 if constexpr (LIGHT_WITHIN) // no light is extrapolated beyond the face
     for (int lane = 0; lane < N; ++lane) {
         us[lane] = wp::clamp(us[lane], 0.0f, 1.0f);
