@@ -206,6 +206,5 @@ def bad_frames(good: bytes, key: bytes) -> Iterator[list[bytes]]:
     yield [make_frame(b"L", 9, b"", size=2**40), good[64:]]
     yield [make_frame(b"N", 9, b"a body")]
     yield [make_frame(b"N", 9, b"a body", size=0)]
-    yield [make_frame(b"N", 2**64 - 1, b"")]
     yield [key + bytes(31)]
     yield [key + wire._ANSWER.pack(0, 0, 2**64 - 1, 0)]
