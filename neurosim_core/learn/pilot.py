@@ -87,11 +87,6 @@ class Pilot:
         self._memory: NDArray[np.float32] = np.zeros(sizes["memory"], np.float32)
         self.action: NDArray[np.float32] = np.zeros(4, np.float32)
 
-    @property
-    def step_ns(self) -> int:
-        """Length of a step [ns]."""
-        return round(1e9 / self.card["rate_hz"])
-
     def reset(self) -> None:
         """Forget everything."""
         self._memory[:] = 0.0

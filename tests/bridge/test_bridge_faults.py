@@ -253,6 +253,8 @@ def test_noise_on_a_command_topic_is_refused_and_the_next_command_flies(ros, sta
         wait_for(lambda: commands.subscriber_count == 1 and inbox.publisher_count == 1)
         actuators = message_class("actuator_msgs/msg/Actuators")
         route = "/drone/command/motor_speeds <- /drone/actuators"
+        # We know the bridge; until it knows us, what we send is lost.
+        wait_for(lambda: diagnostics(health).get(route, {}).get("listeners") == "1")
         commands.publish(cdr.encode(actuators(velocity=[float("nan")])))
         wait_for(lambda: diagnostics(health).get(route, {}).get("refused") == "1")
         commands.publish(cdr.encode(actuators(velocity=[7.0])))

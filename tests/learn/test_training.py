@@ -52,7 +52,7 @@ CONDITIONS = (
     "thresholds 3 to 4 times",
     "lens of 0.8 times the angle",
     "mass 0.9 to 1.1 times, wind up to 1 m/s",
-    "clock 30 % slower",
+    "clock 36 % slower",
     "actions one step later",
     "three tenths of the actions lost",
 )

@@ -59,12 +59,14 @@ def own_directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
     if sys.platform == "linux":
         monkeypatch.setattr(registry, "_spawn", forks(_SPAWN))
-    threads, files = _threads(), _shared_files()
+    threads, files, mappings = _threads(), _shared_files(), set(shared_mappings())
     try:
         yield base
         _end_registries(base)
         wait_for(lambda: not _threads() - threads)
-        wait_for(lambda: not shared_mappings() or (gc.collect() and not shared_mappings()), every_s=0.1)
+        if set(shared_mappings()) - mappings:
+            gc.collect()  # of all that the process has imported: a tenth of a second and more
+        wait_for(lambda: not set(shared_mappings()) - mappings)
         wait_for(lambda: not _shared_files() - files)
         for domain in base.iterdir():
             wait_for(lambda domain=domain: not _left(domain))
