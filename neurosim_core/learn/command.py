@@ -104,6 +104,12 @@ def add_parsers(commands: _Commands) -> None:
         choices=("auto", "rclpy", "dds"),
         help="the vehicle is in ROS 2: events and odometry come from there, AttitudeTarget goes there",
     )
+    deploy.add_argument(
+        "--max-thrust",
+        type=float,
+        metavar="N",
+        help="--ros: what a thrust of 1 is [N] (default: all of the vehicle it was trained with)",
+    )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
     predict = commands.add_parser(
@@ -284,4 +290,5 @@ def _deploy(arguments: argparse.Namespace) -> int:
         events=arguments.events,
         duration_s=arguments.duration,
         ros=arguments.ros,
+        max_thrust_n=arguments.max_thrust,
     )

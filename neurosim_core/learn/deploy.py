@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,6 +29,7 @@ def deploy(
     events: str = CAMERA,
     duration_s: float | None = None,
     ros: str | None = None,
+    max_thrust_n: float | None = None,
     say: Callable[[str], None] = print,
 ) -> int:
     """Fly a vehicle by a policy until its simulator ends; in lockstep it answers every odometry.
@@ -44,6 +44,8 @@ def deploy(
         ros: The vehicle is in ROS 2: nav_msgs/Odometry and event_camera_msgs/EventPacket come in from topics
             of these names, mavros_msgs/AttitudeTarget goes out, through a bridge that is started, with
             the backend auto, rclpy or dds.
+        max_thrust_n: What a thrust of 1 in AttitudeTarget is [N]; None: all that the vehicle has which the
+            policy was trained with.
         say: Told what happens, line by line.
 
     Returns:
@@ -59,7 +61,10 @@ def deploy(
         domain = None if ros is None else _BRIDGED_DOMAIN
         node = stack.enter_context(Node("policy", domain=domain))
         if ros is not None:
-            stack.enter_context(_bridge(pilot.card, node, backend=ros, events=f"/{vehicle}/{events}"))
+            thrust_n = max_thrust_n or card_airframe(pilot.card).thrust_max_n
+            rate_hz = float(pilot.card["rate_hz"])
+            bridge = _bridge(node, ros, rate_hz=rate_hz, events=f"/{vehicle}/{events}", max_thrust_n=thrust_n)
+            stack.enter_context(bridge)
         commands = node.publisher(f"/{vehicle}/command/rates", RateThrustCommand)
         last_ns, count = -1, 0
         try:
@@ -104,7 +109,7 @@ _BRIDGED_DOMAIN = 1 + os.getpid() % 200
 
 
 @contextlib.contextmanager
-def _bridge(card: dict[str, Any], node: Node, *, backend: str, events: str) -> Iterator[None]:
+def _bridge(node: Node, backend: str, *, rate_hz: float, events: str, max_thrust_n: float) -> Iterator[None]:
     """Run a bridge to a vehicle in ROS; the node is closed if it ends by itself.
 
     Raises:
@@ -116,9 +121,9 @@ def _bridge(card: dict[str, Any], node: Node, *, backend: str, events: str) -> I
         "node": "policy",
         "robot": True,
         "routes.events.cortex": events,
-        "routes.events.options.packet_rate_hz": float(card["rate_hz"]),
+        "routes.events.options.packet_rate_hz": rate_hz,
         "routes.thrust.cortex": "*/command/rates",
-        "routes.thrust.options.max_thrust_n": card_airframe(card).thrust_max_n,
+        "routes.thrust.options.max_thrust_n": max_thrust_n,
     }
     words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
     command = [sys.executable, "-m", "cortex_ros2_bridge", "--ros-args", *words]
