@@ -8,7 +8,7 @@ RUN pip wheel --no-cache-dir --no-deps -w /wheels /src
 
 FROM python:3.12-slim
 COPY --from=build /wheels /wheels
-RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[view,record,video,ros2]" && rm -r /wheels
+RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[view,record,log,video,ros2]" && rm -r /wheels
 ENV WARP_CACHE_PATH=/var/cache/warp
 RUN mkdir -m 1777 /var/cache/warp && neurosim run --duration 0.05 --device cpu --out /tmp/first && rm -r /tmp/first
 WORKDIR /work
