@@ -1,5 +1,5 @@
-/* A `Coder` is made once per message type and publisher. It writes a message as a frame, as a record of a batch or as a
-   bare body, and reads a frame or a body back: what `packer.py` does, in a fifth of the time.
+/* A `Coder` is made once per message type and publisher. It writes a message as a frame or as a bare body,
+   and reads a frame or a body back: what `packer.py` does, in a fifth of the time.
 
    It is strict: of whatever is not exactly as usual (another class, a number of NumPy, a wrong dtype or shape, a
    malformed body) it returns None, and the Python code does the work, or says what is wrong. So it never raises for a
@@ -51,39 +51,6 @@ static PyObject *coder_frame(Coder *coder, PyObject *const *arguments, Py_ssize_
     if (size < 0 || size > limit) Py_RETURN_NONE;
     PyObject *frame = make_frame(coder, arguments[0], size, sequence, publish_ns);
     return frame == NULL ? none_or_error(NULL) : frame;
-}
-
-PyObject *make_record(const Coder *coder, PyObject *message, int64_t publish_ns, Py_ssize_t limit) {
-    const Py_ssize_t size = measure_body(coder, message);
-    if (size < 0 || size > limit) return NULL;
-    const Py_ssize_t padded = align_to(size, 8);
-    PyObject *record = PyBytes_FromStringAndSize(NULL, RECORD_SIZE + padded);
-    if (record == NULL) return NULL;
-    char *out = PyBytes_AS_STRING(record);
-    Pack pack;
-    if (!write_body(coder, message, &pack, out + RECORD_SIZE, size, 0)) {
-        Py_DECREF(record);
-        return NULL;
-    }
-    memset(out + RECORD_SIZE + size, 0, (size_t)(padded - size));
-    memcpy(out, &pack.stamp_ns, 8);
-    memcpy(out + 8, &publish_ns, 8);
-    const uint32_t sizes[2] = {(uint32_t)size, 0};
-    memcpy(out + 16, sizes, sizeof sizes);
-    return record;
-}
-
-PyDoc_STRVAR(record_doc,
-"record($self, message, publish_ns, limit, /)\n--\n\n"
-"A record of a batch, padded to 8 bytes; None as for `frame`.");
-
-static PyObject *coder_record(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 3)) return NULL;
-    const int64_t publish_ns = PyLong_AsLongLong(arguments[1]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[2]);
-    if (PyErr_Occurred()) return NULL;
-    PyObject *record = make_record(coder, arguments[0], publish_ns, limit);
-    return record == NULL ? none_or_error(NULL) : record;
 }
 
 PyDoc_STRVAR(encode_doc,
@@ -310,39 +277,6 @@ static PyObject *coder_gather(Coder *coder, PyObject *const *arguments, Py_ssize
     return Py_BuildValue("LNnN", (long long)source.expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
-PyDoc_STRVAR(records_doc,
-"records($self, frame, count, /)\n--\n\n"
-"The messages of a batch's records, as a list; None if they are not as usual, or do not fill the frame.");
-
-static PyObject *coder_records(Coder *coder, PyObject *const *arguments, Py_ssize_t argument_count) {
-    if (!arguments_are(argument_count, 2)) return NULL;
-    PyObject *frame = arguments[0];
-    const Py_ssize_t count = PyLong_AsSsize_t(arguments[1]);
-    if (count == -1 && PyErr_Occurred()) return NULL;
-    if (!PyBytes_CheckExact(frame) || count < 0) Py_RETURN_NONE;
-    const char *bytes = PyBytes_AS_STRING(frame);
-    const Py_ssize_t end = PyBytes_GET_SIZE(frame);
-    if (end < HEADER_SIZE || count > (end - HEADER_SIZE) / RECORD_SIZE) Py_RETURN_NONE;
-    PyObject *messages = PyList_New(count);
-    Py_ssize_t offset = HEADER_SIZE;
-    for (Py_ssize_t index = 0; messages != NULL && index < count; ++index) {
-        uint32_t sizes[2];
-        PyObject *message = NULL;
-        if (end - offset >= RECORD_SIZE) {
-            memcpy(sizes, bytes + offset + 16, sizeof sizes);
-            offset += RECORD_SIZE;
-            if (sizes[1] == 0 && align_to(sizes[0], 8) <= end - offset) {
-                message = read_body(coder, frame, bytes + offset, sizes[0]);
-                offset += align_to(sizes[0], 8);
-            }
-        }
-        if (message == NULL) return none_or_error(messages);
-        PyList_SET_ITEM(messages, index, message);
-    }
-    if (messages != NULL && offset != end) return none_or_error(messages);
-    return messages;
-}
-
 PyDoc_STRVAR(decode_doc,
 "decode($self, buffer, offset, size, /)\n--\n\n"
 "The message of `size` bytes of a bytes object, or of an array of bytes, from an offset on; None if they are not as\n"
@@ -426,12 +360,10 @@ static void coder_dealloc(Coder *coder) {
 
 static PyMethodDef coder_methods[] = {
     {"frame", (PyCFunction)(void (*)(void))coder_frame, METH_FASTCALL, frame_doc},
-    {"record", (PyCFunction)(void (*)(void))coder_record, METH_FASTCALL, record_doc},
     {"encode", (PyCFunction)(void (*)(void))coder_encode, METH_FASTCALL, encode_doc},
     {"read", (PyCFunction)coder_read, METH_O, read_doc},
     {"drain", (PyCFunction)(void (*)(void))coder_drain, METH_FASTCALL, drain_doc},
     {"gather", (PyCFunction)(void (*)(void))coder_gather, METH_FASTCALL, gather_doc},
-    {"records", (PyCFunction)(void (*)(void))coder_records, METH_FASTCALL, records_doc},
     {"decode", (PyCFunction)(void (*)(void))coder_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };

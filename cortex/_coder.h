@@ -52,10 +52,8 @@ int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_
 void copy_deferred(const Pack *pack);
 void hold_deferred(const Pack *pack, int hold);
 
-/* A whole frame, or a record of a batch; NULL without error if the message is not as usual. A record's body has at most
-   `limit` bytes. */
+/* A whole frame; NULL without error if the message is not as usual. */
 PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns);
-PyObject *make_record(const Coder *coder, PyObject *message, int64_t publish_ns, Py_ssize_t limit);
 
 /* The message of a body within `owner`, which its arrays keep; NULL without error if it is malformed. */
 PyObject *read_body(const Coder *coder, PyObject *owner, const char *body, Py_ssize_t size);

@@ -22,16 +22,11 @@ typedef struct {
     int64_t refresh_ns;
     PyObject *ring; /* a Broadcast, into whose slots larger bodies go; NULL or None: the long way */
     PyObject *prepare, *large_acquire, *large_release, *finish;
-    /* A batch that is being collected: its first record is put in by Python, which starts the clock. */
-    PyObject *records; /* a list; NULL or None: messages are not collected */
-    PyObject *flush;
-    int64_t batch_bytes, batch_start_ns, last_ns;
-    int64_t batch_count_max, batch_bytes_max, batch_ns_max;
 } Gate;
 
 PyDoc_STRVAR(gate_doc,
-"Gate(coder, acquire, release, slowly, retry, again, limit, flush)\n--\n\n"
-"Called with a message, it sends it, or adds it to a batch that has begun; see `gate.py`.\n\n"
+"Gate(coder, acquire, release, slowly, retry, again, limit)\n--\n\n"
+"Called with a message, it sends it; see `gate.py`.\n\n"
 "Args:\n"
 "    coder: Makes the frames; has a head.\n"
 "    acquire: Takes the lock.\n"
@@ -39,26 +34,7 @@ PyDoc_STRVAR(gate_doc,
 "    slowly: Called without the lock with a message that has to go the long way.\n"
 "    retry: Called with the lock held, a frame, and that of `sends` which had no room for it.\n"
 "    again: What that raised.\n"
-"    limit: Most bytes of a body.\n"
-"    flush: Called with the lock held when a batch is full; sends it.\n");
-
-/* Add to the batch that is being collected, with the lock held; NULL as below. */
-static PyObject *gate_collect(Gate *gate, PyObject *message) {
-    const int64_t now_ns = monotonic_ns();
-    if (now_ns >= gate->refresh_ns) return NULL;
-    PyObject *record = make_record(gate->coder, message, now_ns, gate->limit);
-    if (record == NULL) return NULL;
-    gate->batch_bytes += PyBytes_GET_SIZE(record);
-    const int failed = PyList_Append(gate->records, record);
-    Py_DECREF(record);
-    if (failed) return NULL;
-    gate->sequence += 1;
-    gate->last_ns = now_ns;
-    if (PyList_GET_SIZE(gate->records) >= gate->batch_count_max || gate->batch_bytes >= gate->batch_bytes_max
-        || now_ns - gate->batch_start_ns >= gate->batch_ns_max)
-        return PyObject_CallNoArgs(gate->flush);
-    Py_RETURN_TRUE;
-}
+"    limit: Most bytes of a body.\n");
 
 /* See who has come and gone, now and then; 0 with an error set, or if nobody is there to do it. */
 static int gate_prepare(Gate *gate, int64_t now_ns) {
@@ -190,7 +166,7 @@ static void gate_unlock_large(Gate *gate) {
 
    While much is copied others may have the lock: then that of large messages keeps other large ones away. */
 static PyObject *gate_send_slot(Gate *gate, PyObject *message, Py_ssize_t size, int64_t now_ns) {
-    if (gate->ring == NULL || gate->ring == Py_None || gate->records != NULL) return NULL;
+    if (gate->ring == NULL || gate->ring == Py_None) return NULL;
     const int unlocked = size >= UNLOCKED_BYTES;
     PyObject *ring = Py_NewRef(gate->ring), *sent = NULL;
     if (!unlocked || gate_lock_large(gate)) {
@@ -203,8 +179,6 @@ static PyObject *gate_send_slot(Gate *gate, PyObject *message, Py_ssize_t size, 
 
 /* Send with the lock held; NULL without error if the message has to go the long way. */
 static PyObject *gate_send(Gate *gate, PyObject *message) {
-    if (gate->records != NULL && PyList_CheckExact(gate->records) && PyList_GET_SIZE(gate->records))
-        return gate_collect(gate, message);
     const int64_t now_ns = monotonic_ns();
     if (now_ns >= gate->refresh_ns && !gate_prepare(gate, now_ns)) return NULL;
     if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
@@ -258,7 +232,7 @@ static PyObject *gate_send_slot_method(Gate *gate, PyObject *const *arguments, P
     if (!arguments_are(count, 2)) return NULL;
     PyObject *message = arguments[0], *slot = arguments[1];
     const int64_t now_ns = monotonic_ns();
-    if (now_ns >= gate->refresh_ns || gate->ring == NULL || gate->ring == Py_None || gate->records != NULL) Py_RETURN_NONE;
+    if (now_ns >= gate->refresh_ns || gate->ring == NULL || gate->ring == Py_None) Py_RETURN_NONE;
     Py_ssize_t room;
     char *memory = slot_memory(slot, gate->ring, &room);
     const Py_ssize_t size = memory == NULL ? -1 : measure_in_place(gate->coder, message, memory, room);
@@ -274,11 +248,11 @@ static PyMethodDef gate_methods[] = {
 };
 
 static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", "flush", NULL};
-    PyObject *coder, *acquire, *release, *slowly, *retry, *again, *flush;
+    static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", NULL};
+    PyObject *coder, *acquire, *release, *slowly, *retry, *again;
     Py_ssize_t limit;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOnO:Gate", names, &CoderType, &coder, &acquire, &release,
-                                     &slowly, &retry, &again, &limit, &flush))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOn:Gate", names, &CoderType, &coder, &acquire, &release,
+                                     &slowly, &retry, &again, &limit))
         return NULL;
     Gate *gate = (Gate *)type->tp_alloc(type, 0);
     if (gate == NULL) return NULL;
@@ -289,7 +263,6 @@ static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *key
     gate->slowly = Py_NewRef(slowly);
     gate->retry = Py_NewRef(retry);
     gate->again = Py_NewRef(again);
-    gate->flush = Py_NewRef(flush);
     gate->limit = limit;
     return (PyObject *)gate;
 }
@@ -307,8 +280,6 @@ static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
     Py_VISIT(gate->large_acquire);
     Py_VISIT(gate->large_release);
     Py_VISIT(gate->finish);
-    Py_VISIT(gate->records);
-    Py_VISIT(gate->flush);
     return 0;
 }
 
@@ -325,8 +296,6 @@ static int gate_clear(Gate *gate) {
     Py_CLEAR(gate->large_acquire);
     Py_CLEAR(gate->large_release);
     Py_CLEAR(gate->finish);
-    Py_CLEAR(gate->records);
-    Py_CLEAR(gate->flush);
     return 0;
 }
 
@@ -343,13 +312,6 @@ static PyMemberDef gate_members[] = {
     {"large_acquire", T_OBJECT, offsetof(Gate, large_acquire), 0, "Called with False, takes the lock of large messages."},
     {"large_release", T_OBJECT, offsetof(Gate, large_release), 0, "Gives it back."},
     {"finish", T_OBJECT, offsetof(Gate, finish), 0, "Sends a written slot: slot, size, stamp_ns, publish_ns."},
-    {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
-    {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
-    {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},
-    {"batch_count_max", T_LONGLONG, offsetof(Gate, batch_count_max), 0, "A batch of so many messages is full."},
-    {"batch_bytes_max", T_LONGLONG, offsetof(Gate, batch_bytes_max), 0, "A batch of so many bytes is full."},
-    {"batch_ns_max", T_LONGLONG, offsetof(Gate, batch_ns_max), 0, "A batch that is so old is sent."},
-    {"last_ns", T_LONGLONG, offsetof(Gate, last_ns), 0, "When the last message was published."},
     {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
     {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},
     {"refresh_ns", T_LONGLONG, offsetof(Gate, refresh_ns), 0, "When the next message goes the long way."},

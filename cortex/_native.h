@@ -12,8 +12,7 @@
 
 enum {
     HEADER_SIZE = 64,
-    HEAD_SIZE = 24,   /* of a header: what all frames of a publisher begin with */
-    RECORD_SIZE = 24, /* what precedes each body of a batch */
+    HEAD_SIZE = 24, /* of a header: what all frames of a publisher begin with */
 };
 
 /* Each adds its names to the module; 0, or -1 with an error set. */

@@ -14,9 +14,9 @@ from cortex.large import LargeSender
 from cortex.outlet import DONTWAIT, SNDMORE, Outlet, Outlets
 from cortex.patience import Patience
 from cortex.wire import (
-    BATCH,
     LARGE,
     MESSAGE,
+    NEXT,
     REST,
     SLOT,
     AttachAnswer,
@@ -45,9 +45,7 @@ class Fanout:
         outlets: Tell who has come and gone.
         patience: Waits for reliable readers.
         latching: Whether who comes gets the last message.
-        plain: Whether the gate may send messages.
         max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
-        next_sequence: Says with which sequence a reader that comes now begins.
         expected_bytes: See `Broadcast`.
     """
 
@@ -62,23 +60,19 @@ class Fanout:
         outlets: Outlets,
         patience: Patience,
         latching: bool,
-        plain: bool,
         max_wait_s: float,
-        next_sequence: Callable[[], int],
         expected_bytes: int,
     ) -> None:
         self._topic = topic
-        self._message_head, self._batch_head, self._slot_head, self._large_head = (
-            message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, BATCH, SLOT, LARGE)
+        self._message_head, self._next_head, self._slot_head, self._large_head = (
+            message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, NEXT, SLOT, LARGE)
         )
         self._gate = gate
         self._large = LargeSender()
         self._outlets = outlets
         self._patience = patience
         self.latching = latching
-        self._plain = plain
         self._max_wait_ms = round(max_wait_s * 1000.0)
-        self._next_sequence = next_sequence
         self.readers: dict[bytes, Reader] = {}
         self.ring = Broadcast(
             source,
@@ -121,7 +115,7 @@ class Fanout:
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
-        sequence = self._next_sequence()
+        sequence = self._gate.sequence
         reader = self.readers[key] = Reader(key, request, outlet)
         if request.shared_memory and outlet.local:
             self.ring.admit(reader, sequence)
@@ -159,7 +153,7 @@ class Fanout:
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
         self._lossy_sends = tuple(sends)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        usual = self._plain and not self.late and not self.ring.has_lost
+        usual = not (self.latching or self.late or self.ring.has_lost)
         retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
         self._retries = retries | self.ring.sends
         self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
@@ -171,14 +165,14 @@ class Fanout:
         return bool(self._lossy_sends or self._strict_outlets)
 
     def tick(self, now_ns: int) -> None:
-        """Let go of what was sent, and end a burst; called now and then."""
+        """Let go of what was sent, and tell readers how many messages there were; called now and then."""
         self._large.prune()
         if self._patience.is_waiting:
             return
         sequence, silent_ns = self._gate.sequence, now_ns - self._gate.refresh_ns
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
-        if self.readers and silent_ns > self._tell_after_ns and self._next_sequence() == sequence:
+        if self.readers and silent_ns > self._tell_after_ns:
             self.tell()
             # After ever longer times again: where the queue is full, it gets lost like what it tells of.
             self._tell_after_ns = min(2 * self._tell_after_ns, silent_ns + SILENCE_MAX_NS)
@@ -286,8 +280,8 @@ class Fanout:
     # Telling readers how many messages there have been
 
     def _news(self, sequence: int) -> bytes:
-        """A batch of nothing, with the sequence that comes next."""
-        return self._batch_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, 0)
+        """A frame that says which sequence comes next."""
+        return self._next_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, 0)
 
     def tell(self) -> None:
         """Tell all that have room which sequence comes next, so that they learn of a loss before it."""

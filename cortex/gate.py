@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import zmq
 
 from cortex.native import NativeGate
-
-monotonic_ns = time.monotonic_ns
-
-BATCH_NS = 150_000
-"""Longest time that a message of a burst waits for others."""
-BATCH_COUNT = 64
-BATCH_BYTES = 128 * 1024
 
 
 class Gate(Protocol):
@@ -41,14 +33,6 @@ class Gate(Protocol):
     """Sends what was written into a slot, where something has changed meanwhile; both locks are held.
 
     The slot, size of the body, its stamp and when it was published [ns]."""
-    records: list[Any] | None
-    """Those of the batch that is being collected; None where none ever is."""
-    batch_bytes: int
-    """Their bytes."""
-    batch_start_ns: int
-    """When the first of them was published, on the monotonic clock."""
-    last_ns: int
-    """When the last message was published."""
 
     def __call__(self, message: Any, /) -> bool:
         """Send a message; False if a reliable subscriber lost it."""
@@ -76,10 +60,6 @@ class LongGate:
         self.large_acquire: Callable[[bool], bool]
         self.large_release: Callable[[], None]
         self.finish: Callable[[Any, int, int, int], bool]
-        self.records: list[Any] | None = None
-        self.batch_bytes = 0
-        self.batch_start_ns = 0
-        self.last_ns = 0
         self._slowly = slowly
 
     def __call__(self, message: Any, /) -> bool:
@@ -97,7 +77,6 @@ def make_gate(
     slowly: Callable[[Any], bool],
     retry: Callable[[bytes, Callable[..., Any]], bool],
     limit: int,
-    flush: Callable[[], bool],
 ) -> Gate:
     """Build the gate of one publisher.
 
@@ -107,11 +86,9 @@ def make_gate(
         slowly: Called without the lock with a message that has to go the long way.
         retry: Called with the lock held, a frame, and that of `sends` which had no room for it.
         limit: Most bytes of a body that is sent so.
-        flush: Called with the lock held when a batch is full; sends it.
     """
     if coder is None:
         return LongGate(slowly)
-    gate: Any = NativeGate(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)
+    gate: Any = NativeGate(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
     gate.sends = ()
-    gate.batch_count_max, gate.batch_bytes_max, gate.batch_ns_max = BATCH_COUNT, BATCH_BYTES, BATCH_NS
     return gate  # type: ignore[no-any-return]

@@ -11,12 +11,12 @@ import zmq
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.inlet import make_inlet
-from cortex.link import WHOLE_BATCH, Item, Link, make
+from cortex.link import Item, Link, make
 from cortex.outlet import DONTWAIT
 from cortex.policy import Policy
 from cortex.stats import SubscriberCounters, note_latency
 from cortex.turn import Turn
-from cortex.wire import HEAD_SIZE, HEADER_SIZE, PREFIX_SIZE, REST
+from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST
 
 monotonic_ns = time.monotonic_ns
 unpack_rest = REST.unpack_from
@@ -39,8 +39,6 @@ class Intake:
         """The short way past all this."""
         self.drained_ns = 0
         """When the sockets were last read as a whole."""
-        self.whole_batches = False
-        """Whether batches are queued in one piece."""
         self._policy = policy
         self._counters = counters
         self._turn = turn
@@ -105,7 +103,8 @@ class Intake:
     def _make_room(self, link: Link) -> None:
         """Let the oldest message give way to a large one, or that one, if the user keeps all the memory."""
         if self.queue:
-            self._counters.overtaken += _count(self.queue.popleft())
+            self.queue.popleft()
+            self._counters.overtaken += 1
         else:
             link.pass_over()
 
@@ -152,9 +151,6 @@ class Intake:
 
     def _take_decoded(self, link: Link, frame: bytes, messages: deque[Any]) -> None:
         """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
-        if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
-            link.read_batch(frame, messages)
-            return
         self.accept(link, frame, timed=True)
         while self.queue:
             item = self.queue.popleft()
@@ -224,23 +220,6 @@ class Intake:
     def _enqueue(self, item: Item) -> None:
         queue, depth = self.queue, self._policy.depth
         queue.append(item)
-        if self._policy.reliable:
-            return
-        if not self.whole_batches:
-            if len(queue) > depth:
-                queue.popleft()
-                self._counters.overtaken += 1
-            return
-        surplus = sum(_count(waiting) for waiting in queue) - depth
-        while surplus > 0:
-            oldest = queue.popleft()
-            dropped = min(_count(oldest), surplus)
-            if dropped < _count(oldest):
-                queue.appendleft(oldest.link.cut(oldest, dropped))
-            self._counters.overtaken += dropped
-            surplus -= dropped
-
-
-def _count(item: Item) -> int:
-    """Messages of an item."""
-    return item.size if item.offset == WHOLE_BATCH else 1
+        if not self._policy.reliable and len(queue) > depth:
+            queue.popleft()
+            self._counters.overtaken += 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 import secrets
-from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,17 +21,15 @@ from cortex.schema import Schema
 from cortex.stats import SubscriberCounters
 from cortex.wire import (
     ATTACH,
-    BATCH,
     BODY_LIMIT,
     HEADER_SIZE,
     LARGE,
     MESSAGE,
-    RECORD,
+    NEXT,
     SLOT,
     TAIL,
     AttachKey,
     attach_key,
-    batch_records,
     message_head,
     parse_answer,
     prefix,
@@ -47,7 +44,6 @@ BLOCK_MS = 20
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
-WHOLE_BATCH = -1
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
 
@@ -55,8 +51,7 @@ make = tuple.__new__
 class Item(NamedTuple):
     """A message that has arrived and waits: where its body is.
 
-    A leased slot is the buffer itself, so that dropping the item gives the slot back. An offset of
-    `WHOLE_BATCH` marks the records of a batch that was not taken apart; the size is then their number.
+    A leased slot is the buffer itself, so that dropping the item gives the slot back.
     """
 
     link: Link
@@ -91,7 +86,6 @@ class Link:
         self.counters = counters
         self.expected = -1
         self.attached = False
-        self.whole_batches = False
         self.clock_offset_ns = clock_offset_ns
         """What to add to this publisher's clock to read it on ours [ns]."""
         self._policy = policy
@@ -99,16 +93,16 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain, self.gather, self.records, self.coder = make_reader(codec, self.message_head)
+        self.read, self.drain, self.gather, self.coder = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
             prefix(SLOT, self.source, stamped=stamped): self._on_slot,
-            prefix(BATCH, self.source, stamped=stamped): self._on_batch,
+            prefix(NEXT, self.source, stamped=stamped): self._on_next,
             prefix(ATTACH, self.source, stamped=stamped): self._on_answer,
         }
-        large_head, _, self.batch_head = list(self._handlers)[:3]
-        self._socket_heads = (self._message_prefix, self.batch_head, large_head)
+        large_head, _, next_head = list(self._handlers)[:3]
+        self._socket_heads = (self._message_prefix, next_head, large_head)
         """What comes through the socket while there is no ring."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
@@ -267,82 +261,13 @@ class Link:
             return []  # `data` gives the slot back
         return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns))]
 
-    def _on_batch(self, frame: bytes) -> list[Item]:
-        fingerprint, first, _, publish_ns, size, count = TAIL.unpack_from(frame, 16)
+    def _on_next(self, frame: bytes) -> list[Item]:
+        fingerprint, sequence, _, _, size, _ = TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
-        if size != len(frame) - HEADER_SIZE or (count == 0) != (size == 0):
-            raise MalformedMessage(f"a batch of {len(frame)} bytes that says its records have {size}")
-        if not count:
-            self._count_to(first)
-            return []
-        fixed = self.codec.fixed_size
-        if self.whole_batches and fixed is not None:
-            stride = RECORD.size + fixed + (-fixed % 8)
-            if count * stride != size:
-                raise MalformedMessage(f"a batch of {size} bytes cannot hold {count} records of {stride}")
-            if not self.advance(first, count):
-                return []
-            return [Item(self, frame[HEADER_SIZE:], WHOLE_BATCH, count, first, 0, publish_ns)]
-        records = self._records(frame, first, count)
-        return records if self.advance(first, count) else []
-
-    def read_batch(self, frame: bytes, messages: deque[Any]) -> None:
-        """Decode the messages of a batch; a frame that is not whole is rejected as a whole."""
-        try:
-            fingerprint, first, _, _, size, count = TAIL.unpack_from(frame, 16)
-            self._check(fingerprint, size)
-            end, offset = len(frame), HEADER_SIZE
-            if size != end - HEADER_SIZE or (count == 0) != (size == 0) or count > size // RECORD.size:
-                raise MalformedMessage(f"a batch of {end} bytes that says {count} records of {size}")
-            quickly = self.records(frame, count) if self.records is not None and count else None
-            if quickly is not None:
-                if self.advance(first, count):
-                    messages.extend(quickly)
-                return
-            decode, unpack = self.codec.decode, RECORD.unpack_from
-            decoded: list[Any] = []
-            while offset + RECORD.size <= end and len(decoded) < count:
-                _, _, length, reserved = unpack(frame, offset)
-                offset += RECORD.size
-                if reserved:
-                    raise MalformedMessage("a record with reserved bits")
-                decoded.append(decode(frame, offset, length))
-                offset += (length + 7) & -8
-            if offset != end or len(decoded) != count:
-                raise MalformedMessage(f"a batch of {end} bytes whose {count} records do not fill it")
-        except MalformedMessage as error:
-            self.reject(str(error))
-            return
-        if not count:
-            self._count_to(first)
-        elif self.advance(first, count):
-            messages.extend(decoded)
-
-    def _records(self, frame: bytes, first: int, count: int) -> list[Item]:
-        return [
-            Item(self, frame, record.offset, record.size, first + k, record.stamp_ns, record.publish_ns)
-            for k, record in enumerate(batch_records(frame, count))
-        ]
-
-    def take_apart(self, item: Item) -> list[Item]:
-        """The messages of a whole batch."""
-        assert self.codec.fixed_size is not None
-        assert isinstance(item.buffer, bytes)
-        size, stride = self.codec.fixed_size, len(item.buffer) // item.size
-        items = []
-        for k in range(item.size):
-            stamp_ns, publish_ns, _, _ = RECORD.unpack_from(item.buffer, k * stride)
-            offset = k * stride + RECORD.size
-            items.append(Item(self, item.buffer, offset, size, item.sequence + k, stamp_ns, publish_ns))
-        return items
-
-    def cut(self, item: Item, count: int) -> Item:
-        """A whole batch without its first messages."""
-        assert isinstance(item.buffer, bytes)
-        stride = len(item.buffer) // item.size
-        return item._replace(
-            buffer=item.buffer[count * stride :], size=item.size - count, sequence=item.sequence + count
-        )
+        if len(frame) != HEADER_SIZE or size:
+            raise MalformedMessage(f"a frame of {len(frame)} bytes that should have no body")
+        self._count_to(sequence)
+        return []
 
     def _on_answer(self, frame: bytes) -> list[Item]:
         if frame[: len(self._key)] != self._key:

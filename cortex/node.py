@@ -24,7 +24,6 @@ from cortex.codec import MalformedMessage, codec_of
 from cortex.context import LINGER_MS, Closed, context
 from cortex.control import control_types
 from cortex.discovery import Directory
-from cortex.flusher import Flusher
 from cortex.host import domain_id, host_id
 from cortex.liveliness import Liveliness, Watch
 from cortex.matching import Matcher
@@ -108,7 +107,6 @@ class Node:
         self._watches: list[Watch] = []
         self._clients: weakref.WeakSet[Client[Any, Any]] = weakref.WeakSet()
         self._callbacks = CallbackThread(name)
-        self._flusher = Flusher(name)
         self._server = Server(self._callbacks.submit)
         self._wakeup = Wakeup()
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
@@ -147,7 +145,6 @@ class Node:
         message_type: type[T],
         *,
         latch: bool = False,
-        coalesce: bool = False,
         inline_max: int = INLINE_MAX,
         expected_bytes: int = 0,
         max_wait_s: float | None = None,
@@ -158,8 +155,6 @@ class Node:
             topic: Like "/front/image".
             message_type: A class made by `@message`.
             latch: Give the last message to subscribers that come later.
-            coalesce: Send messages that follow each other within 15 us together: more of them per second,
-                each up to a millisecond later.
             inline_max: Bodies over this size go through shared memory where that is possible [bytes].
             expected_bytes: Bodies will hardly be larger than this: shared memory for them is made when the
                 first local subscriber comes, and not while messages grow, which takes milliseconds then
@@ -181,14 +176,11 @@ class Node:
                 codec_of(message_type),
                 self._open_outlets(),
                 latch=latch,
-                coalesce=coalesce,
                 inline_max=inline_max,
                 expected_bytes=expected_bytes,
                 max_wait_s=max_wait_s,
-                on_batch=self._flusher.wake,
                 on_close=self._drop_publisher,
-            ),
-            coalesce=coalesce,
+            )
         )
 
     def raw_publisher(self, topic: str, schema: Schema, *, latch: bool = False) -> Publisher[RawMessage]:
@@ -200,8 +192,7 @@ class Node:
                 self._open_outlets(),
                 latch=latch,
                 on_close=self._drop_publisher,
-            ),
-            coalesce=False,
+            )
         )
 
     def subscriber(
@@ -371,7 +362,6 @@ class Node:
                 return
             self._closed = True
             publishers, subscribers = list(self._publishers), list(self._subscribers)
-        self._flusher.close()
         close_publishers(publishers, longest_s=LINGER_MS * 1e-3)  # as long as the sockets
         for subscriber in subscribers:
             subscriber.close()
@@ -411,19 +401,16 @@ class Node:
         self._check_open()
         return self._outlets
 
-    def _add_publisher(self, publisher: Publisher[T], *, coalesce: bool) -> Publisher[T]:
+    def _add_publisher(self, publisher: Publisher[T]) -> Publisher[T]:
         with self._lock:
             self._publishers.append(publisher)
             for subscriber in self._subscribers:
                 if matches(subscriber.topic, publisher.topic):
                     self._match(subscriber)
-        if coalesce:
-            self._flusher.add(publisher)
         self._announce()
         return publisher
 
     def _drop_publisher(self, publisher: Publisher[Any]) -> None:
-        self._flusher.remove(publisher)
         with self._lock:
             if publisher in self._publishers:
                 self._publishers.remove(publisher)

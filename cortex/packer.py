@@ -25,11 +25,9 @@ class Reader(NamedTuple):
     drain: Callable[..., tuple[int, int, bytes | None]]
     """Read what waits in a socket; see `drain` below."""
     gather: Callable[..., tuple[int, bytes, int, bytes | None]] | None
-    """Read what waits and join the bodies, for types of fixed size; see `gather` below."""
-    records: Callable[[bytes, int], list[Any] | None] | None
-    """The messages of a batch's frame with so many records; None: not as it should be."""
+    """Read what waits and join the bodies, for types of fixed size, in C; see `Coder.gather`."""
     coder: Any
-    """None in Python. Its `slots` may be a `SlotView`: then descriptors of that ring are read as messages."""
+    """None in Python. Its `slots` may be a `RingReader`: then frames that name slots of it are read, too."""
 
 
 def coder_of(codec: Codec, head: bytes) -> Any:
@@ -47,7 +45,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
     coder = coder_of(codec, head)
     if coder is not None:
         gather_fixed = None if codec.fixed_size is None else coder.gather
-        return Reader(coder.read, coder.drain, gather_fixed, coder.records, coder)
+        return Reader(coder.read, coder.drain, gather_fixed, coder)
     decode, unpack = codec.decode, REST.unpack_from
 
     def read(frame: bytes) -> tuple[int, int, Any] | None:
@@ -61,10 +59,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
         except MalformedMessage:
             return None
 
-    gatherer = None
-    if codec.fixed_size is not None:
-        gatherer = functools.partial(gather, head, codec.fixed_size)
-    return Reader(read, functools.partial(drain, read), gatherer, None, None)
+    return Reader(read, functools.partial(drain, read), None, None)
 
 
 def drain(
@@ -109,48 +104,3 @@ def drain(
         if not count & 7:
             note_latency(latency, monotonic_ns() - found[1] - clock_offset_ns)
     return expected, limit, None
-
-
-def gather(
-    head: bytes,
-    size: int,
-    receive: Callable[[int], bytes],
-    again: type[BaseException],
-    expected: int,
-    limit: int,
-    latency: list[int],
-    clock_offset_ns: int,
-) -> tuple[int, bytes, int, bytes | None]:
-    """Read plain frames that follow one another, and join their bodies.
-
-    Args:
-        head: What the frames begin with.
-        size: Of a body [bytes].
-        receive: As for `drain`, and the next ones, too.
-        again: What it raises when there is none.
-        expected: Sequence of the next message.
-        limit: Most messages to read.
-        latency: As for `drain`.
-        clock_offset_ns: Likewise.
-
-    Returns:
-        The sequence expected next, the bodies one after the other, how many they are, and what ended it, as
-        for `drain`.
-    """
-    bodies: list[bytes] = []
-    frame = None
-    while len(bodies) < limit:
-        try:
-            frame = receive(DONTWAIT)
-        except again:
-            break
-        if len(frame) != HEADER_SIZE + size or frame[:HEAD_SIZE] != head:
-            break
-        sequence, _, publish_ns, said, _ = REST.unpack_from(frame, HEAD_SIZE)
-        if sequence != expected or said != size:
-            break
-        if not len(bodies) & 7:
-            note_latency(latency, monotonic_ns() - publish_ns - clock_offset_ns)
-        bodies.append(frame[HEADER_SIZE:])
-        expected, frame = expected + 1, None
-    return expected, b"".join(bodies), len(bodies), frame

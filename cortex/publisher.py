@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from cortex.batch import Batch
 from cortex.codec import Codec
 from cortex.context import Closed
 from cortex.fanout import Fanout
@@ -23,7 +22,7 @@ from cortex.outlet import Backoff, Outlets
 from cortex.packer import coder_of
 from cortex.patience import Patience
 from cortex.stats import PublisherCounters
-from cortex.wire import BATCH, MESSAGE, RECORD, REST, message_head
+from cortex.wire import MESSAGE, REST, message_head
 
 monotonic_ns = time.monotonic_ns
 
@@ -39,9 +38,6 @@ MAX_WAIT_S = 1.0
 COMMAND_MAX_WAIT_S = 0.1
 """Default of `max_wait_s` for the types of `cortex.messages.commands`: a controller must not stand still."""
 
-BURST_NS = 15_000
-"""Two messages closer than this are a burst."""
-
 
 class Publisher(Generic[T]):
     """Sends messages of one type; made by `Node.publisher`. Every method may be called from any thread."""
@@ -53,11 +49,9 @@ class Publisher(Generic[T]):
         outlets: Outlets,
         *,
         latch: bool = False,
-        coalesce: bool = False,
         inline_max: int = INLINE_MAX,
         expected_bytes: int = 0,
         max_wait_s: float = MAX_WAIT_S,
-        on_batch: Callable[[], None] | None = None,
         on_close: Callable[[Publisher[T]], None] | None = None,
     ) -> None:
         self.topic = topic
@@ -69,28 +63,20 @@ class Publisher(Generic[T]):
         self._stamp_of = codec.stamp_of
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
-        batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
-        coder = coder_of(codec, self._head)
-        self._pack_record = None if coder is None else coder.record
-        self._gathers = coalesce and not latch
         self._outlets = outlets
         self._lock = outlets.lock
         self._gate: Gate = make_gate(
-            coder,
+            coder_of(codec, self._head),
             outlets.lock,
             slowly=self._publish_slowly,
             retry=lambda frame, send: self._fanout.retry(frame, send),
             limit=inline_max,
-            flush=self._flush,
         )
         """Sends small messages if nothing special is to be done."""
         self._gate.prepare, self._gate.finish = self._prepare, self._finish
         self._large_lock = threading.Lock()
         self._gate.large_acquire = self._large_lock.acquire
         self._gate.large_release = self._large_lock.release
-        self._batch = Batch(batch_head, self._gate, on_batch)
-        if self._gathers:
-            self._gate.records = self._batch.records
         self._patience = Patience(outlets, self._gate, self._check_open)
         self._fanout = Fanout(
             topic,
@@ -101,9 +87,7 @@ class Publisher(Generic[T]):
             outlets=outlets,
             patience=self._patience,
             latching=latch,
-            plain=not latch and not coalesce,
             max_wait_s=max_wait_s,
-            next_sequence=self._next_sequence,
             expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
         )
         self._was_large = False
@@ -136,14 +120,9 @@ class Publisher(Generic[T]):
             now_ns = monotonic_ns()
             if now_ns >= self._gate.refresh_ns:
                 self._prepare(now_ns)
-            if self._gathers and (self._batch.records or now_ns - self._gate.last_ns < BURST_NS):
-                record = self._pack_record and self._pack_record(message, now_ns, self._inline_max)
-                if record is not None:
-                    return self._collect(record, now_ns)
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._fanout.readers and not self.latch:
-                self._flush()
                 self._gate.sequence += 1
                 return True
             if self._was_large:  # the next is most likely large, too
@@ -283,7 +262,6 @@ class Publisher(Generic[T]):
         if self._patience.is_waiting:
             self._prepare(now_ns)
         self._check_open()
-        self._flush()
         body = buffer[:size].data
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current
@@ -295,12 +273,8 @@ class Publisher(Generic[T]):
         return self._fanout.send_large(body, slot, sequence, stamp_ns, now_ns, size)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
-        """Send or collect a small message; the lock is held."""
+        """Send a small message; the lock is held."""
         size = len(body)
-        if self._gathers:
-            if self._batch.records or now_ns - self._gate.last_ns < BURST_NS:
-                return self._collect(RECORD.pack(stamp_ns, now_ns, size, 0) + body + bytes(-size % 8), now_ns)
-            self._gate.last_ns = now_ns
         self._gate.bytes += size
         sequence = self._gate.sequence
         self._gate.sequence = sequence + 1
@@ -309,37 +283,8 @@ class Publisher(Generic[T]):
             self._fanout.latched = frame
         return self._fanout.send(frame)
 
-    def _collect(self, record: bytes, now_ns: int) -> bool:
-        """Add a message of a burst to the batch, and send that when it is full or old; the lock is held."""
-        return not self._batch.add(record, now_ns) or self._flush()
-
-    def _flush(self) -> bool:
-        """Send the batch; the lock is held."""
-        return not self._batch.records or self._fanout.send(self._batch.take())
-
-    def _next_sequence(self) -> int:
-        """The first message that a reader gets that comes now; the lock is held."""
-        return self._batch.sequence if self._batch.records else self._gate.sequence
-
-    def flush_old(self, now_ns: int) -> bool:
-        """Send a batch that has waited long enough; called by the node's flusher, which holds no lock.
-
-        Returns:
-            Whether a batch still waits.
-        """
-        with self._lock:
-            if self._batch.records and not self._patience.is_waiting and self._batch.is_old(now_ns):
-                self._flush()
-            return bool(self._batch.records)
-
-    def flush(self) -> bool:
-        """Send what a coalescing publisher holds back; False if a reliable subscriber lost some of it."""
-        with self._lock:
-            return self._flush()
-
     def _skip(self) -> bool:
         """Count a message that finds no slot: its readers see the gap. The lock is held."""
-        self._flush()
         self._gate.sequence += 1
         self._fanout.skipped += 1
         return False
@@ -368,7 +313,7 @@ class Publisher(Generic[T]):
         return self._send_written(np.frombuffer(slot, np.uint8), slot, size, stamp_ns, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        """Free what the sockets have sent, end a burst; called by the node now and then."""
+        """Free what the sockets have sent, tell readers what there was; called by the node now and then."""
         if self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
@@ -405,7 +350,6 @@ class Publisher(Generic[T]):
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old ones may have been held at the fork
         self._large_lock = threading.Lock()
-        self._batch.records.clear()  # the parent sends them
         self._gate = LongGate(self._publish_slowly)
         self._patience.is_waiting = False  # who was held up at the fork is not here
         self._closing = self._closed = True
@@ -418,7 +362,7 @@ class Publisher(Generic[T]):
         self._patience.until_s = 0.0
 
     def close(self, linger_s: float = LINGER_S) -> None:
-        """Send what is held back, tell readers how many messages there were, and leave the topic.
+        """Tell readers how many messages there were, and leave the topic.
 
         What `publish` has taken is there for local subscribers to read, however long they take. What goes
         through sockets reaches reliable subscribers that confirm it within their `timeout_s`.
@@ -435,14 +379,11 @@ class Publisher(Generic[T]):
         return claimed
 
     def _stop(self, by_s: float) -> None:
-        """Send what is held back, until a time of the monotonic clock [s]; publish no more."""
+        """Publish no more; nobody is waited for after a time of the monotonic clock [s]."""
         with self._lock:
             self._patience.until_s = min(self._patience.until_s, by_s)
             try:
-                while self._batch.records and self._patience.is_waiting and time.monotonic() < by_s:
-                    self._sleep_unlocked()
                 if not self._outlets.closed and not self._patience.is_waiting:
-                    self._flush()
                     self._fanout.tell()
             finally:
                 self._closed = True

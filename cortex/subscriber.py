@@ -23,14 +23,13 @@ from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
 from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, make_arrivals
 from cortex.intake import DRAIN_MAX, Intake
-from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link
+from cortex.link import BLOCK_MS, Item, Link
 from cortex.loop_reader import LoopReader
 from cortex.policy import Policy
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
 from cortex.turn import Turn
 from cortex.wakeup import Wakeup
-from cortex.wire import RECORD
 
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
@@ -172,7 +171,7 @@ class Subscriber(Generic[T]):
         """Take all messages that are there, at least one, as a structured array; for types of a fixed size.
 
         Returns:
-            A read-only array with the type's fields; of a batch that a coalescing publisher sent, a view.
+            A read-only array with the type's fields.
 
         Raises:
             TypeError: The type's size is not fixed.
@@ -180,14 +179,11 @@ class Subscriber(Generic[T]):
         """
         if self.codec is None or self.codec.record_dtype is None:
             raise TypeError(f"{self.topic}: only a type of fixed size can be received as an array")
-        self._intake.whole_batches = True
         with self._turn:
-            for link in self._links:
-                link.whole_batches = True
             simple = not (self._queue or self._closed or self._problems) and self.policy.reliable
             records = self._intake.gather(self.codec) if simple else None
         if records is None:
-            records = self._receive(timeout_s, self._join, whole=True)
+            records = self._receive(timeout_s, self._join)
         return records
 
     def __iter__(self) -> Iterator[T]:
@@ -283,13 +279,13 @@ class Subscriber(Generic[T]):
         if fd == self.wakeup.fd:
             self.wakeup.clear()
 
-    def _receive(self, timeout_s: float | None, use: Callable[[Item], Any], *, whole: bool = False) -> Any:
+    def _receive(self, timeout_s: float | None, use: Callable[[Item], Any]) -> Any:
         if self.callback is not None:
             raise RuntimeError(f"{self.topic}: the messages of this subscriber go to its callback")
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         left_s = WAIT_MAX_S if timeout_s is None else timeout_s
         while True:
-            item = self._take(whole=whole, block=left_s >= BLOCK_S)
+            item = self._take(block=left_s >= BLOCK_S)
             if item is not None:
                 result = self._open(item, use)
                 if result is not NOTHING:
@@ -303,11 +299,10 @@ class Subscriber(Generic[T]):
                 if deadline_s is not None:
                     left_s = deadline_s - time.monotonic()
 
-    def _take(self, *, whole: bool = False, block: bool = False) -> Item | None:
+    def _take(self, *, block: bool = False) -> Item | None:
         """The next item, or None if nothing is there.
 
         Args:
-            whole: Leave a batch in one piece.
             block: Wait up to `BLOCK_S` for a message if there is one socket only.
         """
         with self._lock:
@@ -322,16 +317,11 @@ class Subscriber(Generic[T]):
                 is_old = monotonic_ns() - self._intake.drained_ns > FRESH_NS
                 if not queue or self.policy.depth < DRAIN_MAX or is_old:
                     self._intake.drain()
-            if not queue and whole:
-                self._intake.drain()
             if not queue:
                 self._intake.receive_one(block=block)
             if not queue:
                 return None
             item = queue.popleft()
-            if item.offset == WHOLE_BATCH and not whole:
-                queue.extendleft(reversed(item.link.take_apart(item)))
-                item = queue.popleft()
             self.counters.received += 1
             return item
 
@@ -362,20 +352,15 @@ class Subscriber(Generic[T]):
         )
 
     def _join(self, item: Item) -> np.ndarray:
-        """The records of one batch, or of all single messages that wait, as one array."""
+        """All messages that wait, this one first, as one array."""
         assert self.codec is not None
         fixed, dtype = self.codec.fixed_size, self.codec.record_dtype
         assert fixed is not None
         assert dtype is not None
-        if item.offset == WHOLE_BATCH:
-            stride = RECORD.size + fixed + (-fixed % 8)
-            with self._turn:
-                self.counters.received += item.size - 1
-            records: np.ndarray = np.ndarray((item.size,), dtype, item.buffer, RECORD.size, (stride,))
-            return records
         bodies: list[Any] = [self._record(item, item.buffer)]
         with self._turn:
-            while self._queue and self._queue[0].offset != WHOLE_BATCH:
+            self._intake.drain()
+            while self._queue:
                 more = self._queue.popleft()
                 bodies.append(self._record(more, more.buffer))
                 self.counters.received += 1
@@ -536,7 +521,6 @@ class Subscriber(Generic[T]):
             if self._closed:
                 link.close()
                 return
-            link.whole_batches = self._intake.whole_batches
             self._links.append(link)
             self._inlet.exhausted = False  # a descriptor shows nothing until its socket was found empty once
             self._links_changed()

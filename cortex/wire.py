@@ -1,9 +1,9 @@
-"""The frames of WIRE.md: the 64-byte header, kinds, batches, attaching, control."""
+"""The frames of WIRE.md: the 64-byte header, kinds, attaching, control."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from cortex.codec import MalformedMessage, codec_of
@@ -13,7 +13,7 @@ HEADER_SIZE = 64
 PREFIX_SIZE = 16
 """Bytes of a header that ZeroMQ subscriptions match: magic, kind, version, flags, header length, source."""
 
-MESSAGE, LARGE, SLOT, BATCH, ATTACH, RESUME = b"M", b"L", b"S", b"B", b"A", b"R"
+MESSAGE, LARGE, SLOT, NEXT, ATTACH, RESUME = b"M", b"L", b"S", b"N", b"A", b"R"
 CONTROL, REQUEST, REPLY, ERROR = b"C", b"Q", b"P", b"E"
 
 FLAG_STAMP = 1
@@ -28,8 +28,6 @@ HEAD_SIZE = PREFIX_SIZE + 8
 """Prefix and fingerprint: constant for the messages of one source."""
 REST = struct.Struct("<QqqQQ")
 """What follows the head: sequence, stamp_ns, publish_ns, body length, aux."""
-RECORD = struct.Struct("<qqII")
-"""Head of a batch's record: stamp_ns, publish_ns, body length, reserved."""
 _KEY = struct.Struct("<QQ")
 _ANSWER = struct.Struct("<QQQQ")
 
@@ -138,38 +136,6 @@ def check_body(header: Header, frame_size: int, limit: int = CONTROL_LIMIT) -> N
         raise MalformedMessage(
             f"a frame of {frame_size} bytes says that its body has {header.body_size} (limit {limit})"
         )
-
-
-class Record(NamedTuple):
-    """One message of a batch: where its body lies in the frame."""
-
-    stamp_ns: int
-    publish_ns: int
-    offset: int
-    size: int
-
-
-def batch_records(frame: bytes, count: int) -> Iterator[Record]:
-    """Walk a batch's records; all are checked against the frame before the first is yielded.
-
-    Raises:
-        MalformedMessage: The records do not fill the frame exactly.
-    """
-    end, offset, records = len(frame), HEADER_SIZE, []
-    if count > (end - HEADER_SIZE) // RECORD.size:
-        raise MalformedMessage(f"{count} records cannot fit a batch of {end} bytes")
-    for _ in range(count):
-        if offset + RECORD.size > end:
-            raise MalformedMessage("a batch ends within the head of a record")
-        stamp_ns, publish_ns, size, reserved = RECORD.unpack_from(frame, offset)
-        offset += RECORD.size
-        if reserved or size > end - offset:
-            raise MalformedMessage(f"a batch's record of {size} bytes does not fit")
-        records.append(Record(stamp_ns, publish_ns, offset, size))
-        offset += size + (-size % 8)
-    if offset != end:
-        raise MalformedMessage(f"a batch has {end - offset} bytes after its last record")
-    return iter(records)
 
 
 class AttachKey(NamedTuple):

@@ -120,24 +120,13 @@ def _small(name: str, size: str) -> Case:
     )
 
 
-def _burst(name: str, size: str) -> Case:
-    return Case(
-        name,
-        f"{_LABELS[size]} in bursts, the publisher coalesces, callback",
-        _SAMPLE,
-        SIZES[size],
-        (_cortex(coalesce=True), _ONE),
-        (Bar("cortex", (_ONE.name,), ">=", 1.15),),
-    )
-
-
 def _batch(name: str, size: str, bound: float) -> Case:
     return Case(
         name,
         f"{_LABELS[size]}, type of fixed size, recv_batch as an array of structures",
         f"stamp_ns: int64, data: float32[{SIZES[size]}]",
         SIZES[size],
-        (_cortex(coalesce=True, fixed=True, how="batch"), _ONE),
+        (_cortex(fixed=True, how="batch"), _ONE),
         (Bar("cortex", (_ONE.name,), ">=", bound),),
     )
 
@@ -225,8 +214,6 @@ _RTT = ("rtt_p50_us", "rtt_p99_us")
 CASES: tuple[Case, ...] = (
     _small("typed-40", "40"),
     _small("typed-4k", "4k"),
-    _burst("burst-40", "40"),
-    _burst("burst-4k", "4k"),
     _batch("batch-40", "40", 1.25),
     _batch("batch-4k", "4k", 1.5),
     Case(

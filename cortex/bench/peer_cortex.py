@@ -33,7 +33,7 @@ __all__ = [
 
 
 def sender(job: Job) -> Sender:
-    """Make a node with one publisher; options: ``fixed``, ``coalesce``, ``loan``, ``inline_max``, ``tcp``."""
+    """Make a node with one publisher; options: ``fixed``, ``loan``, ``inline_max``, ``tcp``."""
     return _Sender(job)
 
 
@@ -288,7 +288,7 @@ def _type(job: Job) -> Any:
 
 
 def _publisher_options(job: Job) -> dict[str, Any]:
-    return {key: job.options[key] for key in ("coalesce", "inline_max") if key in job.options}
+    return {key: job.options[key] for key in ("inline_max",) if key in job.options}
 
 
 def _listening_node(name: str, job: Job) -> Node:

@@ -9,10 +9,9 @@ from cortex.messages import Events
 from cortex.records import Describe
 from cortex.schema import schema_of
 from cortex.wire import (
-    BATCH,
     LARGE,
     MESSAGE,
-    RECORD,
+    NEXT,
     SLOT,
     AttachAnswer,
     AttachKey,
@@ -45,12 +44,7 @@ def frames() -> list[Frame]:
     """Return one frame of each kind that carries messages, and those by which readers attach and resume."""
     stamped = Header(MESSAGE, SOURCE, FINGERPRINT, 7, -5, 2**62, len(BODY), 0)
     plain = stamped._replace(stamp_ns=None)
-    records = b"".join(
-        RECORD.pack(stamp, 100 + stamp, size, 0) + BODY[:size] + bytes(-size % 8)
-        for stamp, size in ((1, 12), (2, 0), (3, 8))
-    )
-    batch = stamped._replace(kind=BATCH, stamp_ns=0, body_size=len(records), aux=3)
-    nothing = batch._replace(body_size=0, aux=0)
+    following = stamped._replace(kind=NEXT, stamp_ns=0, body_size=0)
     slot = stamped._replace(kind=SLOT, body_size=50_000, aux=5)
     asked = AttachKey(SOURCE, READER, True, True, 66, 1500, True)
     key = attach_key(asked, stamped=True)
@@ -66,12 +60,7 @@ def frames() -> list[Frame]:
             (pack_header(plain._replace(kind=LARGE)) + BODY).hex(),
             _shown(plain._replace(kind=LARGE)) | {"body": BODY.hex()},
         ),
-        Frame(
-            "batch",
-            (pack_header(batch) + records).hex(),
-            _shown(batch) | {"body": records.hex(), "records": [BODY.hex(), "", BODY[:8].hex()]},
-        ),
-        Frame("batch of nothing", pack_header(nothing).hex(), _shown(nothing) | {"body": "", "records": []}),
+        Frame("next", pack_header(following).hex(), _shown(following) | {"body": ""}),
         Frame("slot", pack_header(slot).hex(), _shown(slot)),
         Frame("attach key", key.hex(), shown_key),
         Frame(
@@ -100,7 +89,7 @@ def frames() -> list[Frame]:
 def malformed() -> list[dict[str, str]]:
     """Return frames that a subscriber of the source and type of `frames` must reject."""
     good = {frame.name: frame.frame for frame in frames()}
-    message, batch, answer = good["message"], good["batch"], good["answer"]
+    message, following, answer = good["message"], good["next"], good["answer"]
 
     def put(frame: str, offset: int, data: str) -> str:
         return frame[: 2 * offset] + data + frame[2 * offset + len(data) :]
@@ -115,12 +104,7 @@ def malformed() -> list[dict[str, str]]:
         "body shorter than it says": message[:-2],
         "body longer than it says": message + "00",
         "other fingerprint": put(message, 16, "00"),
-        "more records than it says": put(batch, 56, "02"),
-        "fewer records than it says": put(batch, 56, "04"),
-        "a record beyond the frame": put(batch, 64 + 16, "ff"),
-        "reserved bytes of a record": put(batch, 64 + 20, "01"),
-        "records that do not fill the batch": put(batch[:-16], 48, f"{len(batch) // 2 - 72:02x}"),
-        "a batch of nothing that has a body": put(batch, 56, "00"),
+        "a body where there is none": put(following, 48, "08") + "00" * 8,
         "an answer with more than its latched message": answer + "00",
         "an answer whose latched message is cut off": answer[:-2],
     }

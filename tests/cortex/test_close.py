@@ -12,8 +12,6 @@ import pytest
 from peer import Block, Number, make_block
 from processes import SOON_S, wait_for
 
-import cortex.batch
-import cortex.gate
 import cortex.link
 import cortex.publisher
 import cortex.subscriber
@@ -87,34 +85,6 @@ def test_what_was_taken_outlives_the_publisher(make_node, start_child, readers):
     assert not sent.refused
 
 
-def test_a_batch_that_finds_no_room_is_sent(make_node, start_child, monkeypatch):
-    """Held back by a publisher that coalesces, for a reader that has no room."""
-    for module, name in [
-        (cortex.publisher, "BURST_NS"),
-        (cortex.batch, "BATCH_NS"),
-        (cortex.gate, "BATCH_NS"),
-    ]:
-        monkeypatch.setattr(module, name, 10**15)
-    node = make_node()
-    publisher = node.publisher("/blocks", Block, coalesce=True)
-    (child,) = subscribe(publisher, start_child, PATIENT)
-    sent = Sent(publisher, 208)
-    with child.stopped():
-        fill(publisher, lambda: sum(sent() for _ in range(64)))
-        while len(publisher._batch.records) < 3:
-            sent()
-        thread = threading.Thread(target=publisher.close)
-        thread.start()
-        wait_for(lambda: publisher._closing)
-        thread.join(0.2)
-    wait_for(lambda: arrives(child, sent.count))
-    thread.join(SOON_S)
-    assert not thread.is_alive()
-    assert not sent.refused
-    assert publisher.source not in node._outlets._publishers
-    assert publisher not in node._publishers
-
-
 @pytest.mark.parametrize("size", [8_000, 100_000])
 def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, size):
     """Not who publishes already, nor later; what the reader loses is counted. Through the ring and slots."""
@@ -158,11 +128,10 @@ def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
     assert not thread.is_alive()
 
 
-@pytest.mark.parametrize("coalesce", [False, True], ids=["single", "coalesce"])
-def test_nobody_holds_up_a_node_for_long(make_node, start_child, coalesce):
+def test_nobody_holds_up_a_node_for_long(make_node, start_child):
     """A reader that stands still, and may hold up `publish` for a day."""
     node = make_node()
-    publisher = node.publisher("/blocks", Block, coalesce=coalesce)
+    publisher = node.publisher("/blocks", Block)
     (child,) = subscribe(publisher, start_child, ["reliable", {"timeout_s": 86_400.0}])
     before = len(os.listdir("/proc/self/fd"))
     with child.stopped():
@@ -211,31 +180,26 @@ def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node
-@pytest.mark.parametrize("use", ["lend", "flush", "count"])
+@pytest.mark.parametrize("use", ["lend", "count"])
 def test_a_forked_child_leaves_a_publisher_alone(make_node, use):
-    """Also where a large message is written, or a batch waits, at the moment of the fork."""
+    """Also where a large message is written at the moment of the fork."""
     node = make_node(registry="off")
-    publisher = node.publisher("/blocks", Block, coalesce=True)
+    publisher = node.publisher("/blocks", Block)
     subscriber = node.subscriber("/blocks", Block)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with publisher._large_lock, publisher._lock:
-        publisher._batch.records.append(b"of the parent")
         child = os.fork()
         if child == 0:
             signal.alarm(int(SOON_S))
             try:
-                publisher._fanout.send = lambda frame: os._exit(1)
                 if use == "lend":
                     with pytest.raises(Closed):
                         publisher.try_loan(n=100_000)
-                elif use == "flush":
-                    publisher.flush()
                 else:
                     assert publisher.subscriber_count == 1
                 os._exit(0)
             except BaseException:
                 os._exit(2)
-        publisher._batch.records.clear()
         assert os.waitpid(child, 0)[1] == 0
     subscriber.close()
 

@@ -21,12 +21,10 @@ from cortex.records import PublisherRecord
 from cortex.subscriber import Subscriber
 from cortex.wire import (
     ATTACH,
-    BATCH,
     BODY_LIMIT,
-    HEADER_SIZE,
     LARGE,
     MESSAGE,
-    RECORD,
+    NEXT,
     AttachAnswer,
     Header,
     answer_frame,
@@ -101,9 +99,8 @@ class Feed:
             return [self.header(kind, len(body)) + body]
         if kind == LARGE:
             return [self.header(kind, len(body)), body]
-        if kind == BATCH:
-            record = RECORD.pack(0, 0, len(body), 0) + body + bytes(-len(body) % 8)
-            return [self.header(kind, len(record), 1) + record]
+        if kind == NEXT:
+            return [self.header(kind, 0)]
         return [self.answer]
 
     def drain(self):
@@ -116,7 +113,7 @@ class Feed:
 
     def still_lives(self, value):
         """The next good messages arrive, one of each kind."""
-        for kind in (MESSAGE, LARGE, BATCH):
+        for kind in (MESSAGE, LARGE):
             self.socket.send_multipart(self.frames(kind, value))
             assert self.drain() == [value], kind
 
@@ -139,7 +136,7 @@ def test_the_feed_is_what_a_publisher_sends(runtime):
     try:
         feed.still_lives(7)
         counters = feed.subscriber.counters
-        assert (counters.received, counters.lost, counters.rejected) == (3, 0, 0)
+        assert (counters.received, counters.lost, counters.rejected) == (2, 0, 0)
     finally:
         feed.close()
 
@@ -156,15 +153,9 @@ BAD = {
     "large of another size": lambda f: [f.header(LARGE, 10), b"123"],
     "large over the limit": lambda f: [f.header(LARGE, BODY_LIMIT + 1), b"123"],
     "large that does not decode": lambda f: [f.header(LARGE, 5), b"12345"],
-    "batch of records that are not there": lambda f: [f.header(BATCH, 0, 2)],
-    "batch of records not counted": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 0)],
-    "batch of too many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2)],
-    "batch of a great many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2**63)],
-    "batch that ends early": lambda f: [f.frames(BATCH, 1)[0][:-8]],
-    "batch with a reserved number": lambda f: [_with(f.frames(BATCH, 1)[0], HEADER_SIZE + 20, "<I", 1)],
-    "batch with a record too long": lambda f: [
-        _with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)
-    ],
+    "next with a body": lambda f: [f.header(NEXT, 8) + bytes(8)],
+    "next with a body that it does not say": lambda f: [f.header(NEXT, 0) + bytes(8)],
+    "next from nowhere": lambda f: [_with(f.frames(NEXT, 1)[0], 24, "<Q", 2**63)],
     "answer with more than it says": lambda f: [f.answer + b"x"],
     "answer cut short": lambda f: [f.answer[:50]],
 }
@@ -197,7 +188,7 @@ def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
         feed.close()
 
 
-@pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
+@pytest.mark.parametrize("kind", [MESSAGE, LARGE])
 def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog):
     """Or somebody who sends rubbish would fill the log."""
     feed = Feed(Scan)
@@ -212,7 +203,7 @@ def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog
         feed.close()
 
 
-@pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
+@pytest.mark.parametrize("kind", [MESSAGE, LARGE])
 def test_frames_that_follow_a_good_one_are_junk(runtime, kind):
     """A message has its frames and no more; what is behind them is not taken for another message."""
     feed = Feed(Number)
@@ -258,7 +249,7 @@ def test_mutated_frames_never_hurt(runtime, type_):
     """Whatever comes, the next good message arrives."""
     feed = Feed(type_)
     generator = np.random.Generator(np.random.Philox(key=[0, len(feed.codec.schema.fields[1].name)]))
-    kinds = (MESSAGE, LARGE, BATCH, ATTACH)
+    kinds = (MESSAGE, LARGE, NEXT, ATTACH)
     try:
         for count in range(FRAMES // 4):
             kind = kinds[count % len(kinds)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import sys
 import threading
-import time
 from collections import deque
 from fractions import Fraction
 
@@ -19,7 +18,7 @@ from cortex import gate, native, packer
 from cortex.codec import codec_of
 from cortex.message import Array, Float32, Int8, UInt64, message
 from cortex.schema import schema_of
-from cortex.wire import MESSAGE, RECORD, REST, message_head
+from cortex.wire import MESSAGE, REST, message_head
 
 if native.NativeGate is None:  # frames are made while this is imported
     pytest.skip("cortex._native was not compiled", allow_module_level=True)
@@ -70,14 +69,11 @@ def test_bodies_are_those_of_the_general_code(value):
 
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 4000])
-def test_frames_and_records_are_header_and_body(count):
+def test_frames_are_header_and_body(count):
     coder, value = coder_of(Sample, HEAD), sample(count=count)
     body = codec_of(Sample).encode(value, 1 << 20)
     assert coder.frame(value, 3, 4, 1 << 20) == HEAD + REST.pack(3, 5, 4, len(body), 0) + body
-    padded = body + bytes(-len(body) % 8)
-    assert coder.record(value, 4, 1 << 20) == RECORD.pack(5, 4, len(body), 0) + padded
     assert coder.frame(value, 3, 4, len(body) - 1) is None
-    assert coder.record(value, 4, len(body) - 1) is None
     assert coder.read(coder.frame(value, 3, 4, 1 << 20)) == (3, 4, value)
 
 
@@ -148,7 +144,6 @@ def test_nothing_is_leaked():
     def use():
         for _ in range(2000):
             coder.read(coder.frame(value, 3, 4, 1 << 20))
-            coder.record(value, 4, 1 << 20)
             numbers.decode(text, 0, len(text))
             numbers.decode(text[:-1], 0, len(text) - 1)
 
@@ -210,26 +205,27 @@ def test_drain_is_that_of_python(frames, expected, limit, may_wait):
     assert drain(coder.drain) == drain(lambda *rest: packer.drain(reader.read, *rest))
 
 
-@pytest.mark.parametrize("case", range(4))
-def test_gather_is_that_of_python(case):
+@pytest.mark.parametrize(
+    ("kept", "more", "limit", "count", "left"),
+    [
+        (range(20), [], 64, 20, 0),
+        (range(20), [], 7, 7, 13),
+        ([0, 1, 2, 5, 6], [], 64, 3, 1),
+        ([0, 1], [b"x"], 64, 2, 0),
+    ],
+)
+def test_gather_joins_the_bodies_that_follow_one_another(kept, more, limit, count, left):
+    """What ends it is handed back; every eighth message is timed."""
     coder, codec = coder_of(Numbers3, HEAD), codec_of(Numbers3)
-    frames = [coder.frame(Numbers3(s, float(s)), s, 0, 1000) for s in range(20)]
-    frames, expected, limit = [
-        (frames, 0, 64),
-        (frames, 0, 7),
-        (frames[:3] + frames[5:], 0, 64),
-        ([*frames[:2], b"other"], 0, 64),
-    ][case]
-
-    def gather(reader):
-        latency, script = [0] * 8, Script(frames)
-        return reader(script, zmq.Again, expected, limit, latency, 10**12), latency, len(script.frames)
-
-    reader = packer.make_reader(codec, HEAD)
-    found = gather(reader.gather)
-    assert found == gather(lambda *rest: packer.gather(HEAD, codec.fixed_size, *rest))
-    records = np.frombuffer(found[0][1], codec.record_dtype)
-    assert records["value"].tolist() == list(range(found[0][2]))
+    frames = [coder.frame(Numbers3(s, float(s)), s, 0, 1000) for s in kept]
+    script, latency = Script([*frames, *more]), [0] * 8
+    expected, bodies, found, frame = packer.make_reader(codec, HEAD).gather(
+        script, zmq.Again, 0, limit, latency, 10**12
+    )
+    assert (expected, found, len(script.frames)) == (count, count, left)
+    assert frame == ([*frames, *more][count] if len(frames) + len(more) > count + left else None)
+    assert np.frombuffer(bodies, codec.record_dtype)["value"].tolist() == list(range(count))
+    assert sum(latency) == (count + 7) // 8
 
 
 def test_drain_passes_errors_on():
@@ -248,14 +244,13 @@ class Taken:
 
     def __init__(self):
         self.lock = threading.Lock()
-        self.sent, self.slow, self.retried, self.flushed = [], [], [], 0
+        self.sent, self.slow, self.retried = [], [], []
         self.gate = gate.make_gate(
             coder_of(Sample, HEAD),
             self.lock,
             slowly=self.slowly,
             retry=self.retry,
             limit=1000,
-            flush=self.flush,
         )
         self.gate.sends = (self.send,)
         self.gate.refresh_ns = 2**62
@@ -268,13 +263,6 @@ class Taken:
     def slowly(self, value):
         assert not self.lock.locked()
         self.slow.append(value)
-        return True
-
-    def flush(self):
-        assert self.lock.locked()
-        self.flushed += 1
-        self.gate.records.clear()
-        self.gate.batch_bytes = 0
         return True
 
     def retry(self, frame, send):
@@ -292,51 +280,6 @@ def test_a_gate_sends_frames_and_counts_them():
     assert (taken.gate.sequence, taken.gate.bytes) == (3, sum(map(len, taken.sent)) - 3 * 64)
     assert not taken.slow
     assert not taken.lock.locked()
-
-
-def test_a_gate_adds_to_a_batch_that_has_begun():
-    """The first record of a batch is put in by Python; a full batch is flushed."""
-    taken, coder = Taken(), coder_of(Sample, HEAD)
-    first = coder.record(sample(0), 1, 1000)
-    taken.gate.records, taken.gate.batch_start_ns = [first], time.monotonic_ns() + 10**12
-    for k in range(1, gate.BATCH_COUNT - 1):
-        assert taken.gate(sample(k)) is True
-    records = taken.gate.records
-    assert [len(record) for record in records] == [len(first)] * (gate.BATCH_COUNT - 1)
-    assert taken.gate.batch_bytes == len(first) * (gate.BATCH_COUNT - 2)
-    frame = bytes(64) + b"".join(records)
-    assert coder.records(frame, len(records)) == [sample(k) for k in range(len(records))]
-    assert taken.flushed == 0
-    assert taken.gate(sample(63)) is True
-    assert (taken.flushed, taken.sent, taken.slow) == (1, [], [])
-    taken.gate.records.append(first)
-    taken.gate.batch_start_ns = time.monotonic_ns() - gate.BATCH_NS
-    taken.gate(sample())
-    assert taken.flushed == 2
-    taken.gate.records.append(first)
-    taken.gate.batch_start_ns = time.monotonic_ns() + 10**12
-    taken.gate.batch_bytes = gate.BATCH_BYTES - 50
-    taken.gate(sample())
-    assert taken.flushed == 3
-
-
-@pytest.mark.parametrize("damage", ["short", "long", "reserved", "count", "body"])
-def test_batches_that_are_not_as_they_should_be(damage):
-    coder = coder_of(Sample, HEAD)
-    records = [coder.record(sample(k), 1, 1000) for k in range(3)]
-    frame, count = bytes(64) + b"".join(records), 3
-    assert coder.records(frame, count) == [sample(k) for k in range(3)]
-    if damage == "short":
-        frame = frame[:-8]
-    elif damage == "long":
-        frame += bytes(8)
-    elif damage == "reserved":
-        frame = frame[: 64 + 20] + b"x" + frame[64 + 21 :]
-    elif damage == "count":
-        count = 4
-    else:
-        frame = frame[: 64 + 24 + 8] + b"\xff" * 16 + frame[64 + 24 + 24 :]
-    assert coder.records(frame, count) is None
 
 
 def test_what_goes_the_long_way():

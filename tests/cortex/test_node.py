@@ -280,7 +280,7 @@ def test_what_is_closed_is_forgotten(make_node):
     node = make_node(registry="off")
     gone = []
     for _ in range(3):
-        publisher = node.publisher("/numbers", Number, coalesce=True)
+        publisher = node.publisher("/numbers", Number)
         subscribers = [
             node.subscriber("/numbers", Number),
             node.subscriber("/numbers", Number, lambda message: None),

@@ -1,4 +1,4 @@
-"""Publishing: order, snapshots, latching, coalescing, loans of small messages, threads, and the end."""
+"""Publishing: order, snapshots, latching, loans of small messages, threads, and the end."""
 
 from __future__ import annotations
 
@@ -6,20 +6,14 @@ import itertools
 import logging
 import threading
 import time
-from typing import NamedTuple
 
 import numpy as np
 import pytest
-import zmq
 from peer import Number, Scan
 from processes import SOON_S, in_time, wait_for
 
-import cortex.link
 from cortex import keep_last, reliable
-from cortex.context import new_socket
-from cortex.gate import BATCH_COUNT, BATCH_NS
-from cortex.publisher import BURST_NS, Closed
-from cortex.wire import BATCH, HEADER_SIZE, MESSAGE, RECORD, batch_records, unpack_header
+from cortex.publisher import Closed
 
 LARGE = 100_000
 
@@ -118,9 +112,8 @@ def test_arrays_that_are_not_contiguous(node):
         np.testing.assert_array_equal(subscriber.recv(SOON_S).ranges, ranges)
 
 
-@pytest.mark.parametrize("coalesce", [False, True])
-def test_small_and_large_messages_keep_their_order(node, coalesce):
-    publisher = node.publisher("/scans", Scan, coalesce=coalesce)
+def test_small_and_large_messages_keep_their_order(node):
+    publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan, policy=reliable(8, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
@@ -140,10 +133,9 @@ def test_small_and_large_messages_keep_their_order(node, coalesce):
     assert received == [(k, k, sizes[k % len(sizes)]) for k in range(240)]
 
 
-@pytest.mark.parametrize("coalesce", [False, True])
-def test_several_threads_publish(node, coalesce):
+def test_several_threads_publish(node):
     """Numbers are given in the order in which the messages go, whoever publishes; none is lost."""
-    publisher = node.publisher("/scans", Scan, coalesce=coalesce)
+    publisher = node.publisher("/scans", Scan)
     received = []
     subscriber = node.subscriber(
         "/scans", Scan, lambda m: received.append((m.stamp_ns, len(m.ranges))), policy=reliable(8, 60.0)
@@ -223,140 +215,6 @@ def test_a_loan_is_latched_too(node):
         assert (message.ranges == 7.0).all()
 
 
-# Coalescing
-
-
-@pytest.fixture
-def without_rings(monkeypatch):
-    """Subscribers read sockets, so that others can see what comes there."""
-    monkeypatch.setattr(cortex.link, "native", None)
-
-
-def listen(node):
-    """All frames of a node's lossy socket, as they are."""
-    endpoint = node.nodes()[0].endpoints[0]
-    socket = new_socket(zmq.SUB, high_water_mark=0)
-    for kind in (MESSAGE, BATCH):
-        socket.subscribe(b"CTX" + kind)
-    socket.connect(endpoint.lossy)
-    return socket
-
-
-class Sent(NamedTuple):
-    """A frame, and when each of its messages was published."""
-
-    kind: bytes
-    first: int
-    times_ns: list[int]
-    size: int
-
-
-def read_until(socket, count):
-    """The frames that carry messages, up to the one that completes `count` of them since the publisher began.
-
-    A batch of nothing, which tells how many messages there were, comes whenever a publisher was silent.
-    """
-    frames = []
-    while not frames or frames[-1].first + len(frames[-1].times_ns) < count:
-        assert socket.poll(1e3 * SOON_S)
-        frame = socket.recv()
-        header = unpack_header(frame)
-        times_ns = [header.publish_ns]
-        if header.kind == BATCH:
-            times_ns = [record.publish_ns for record in batch_records(frame, header.aux)]
-        if times_ns:
-            frames.append(Sent(header.kind, header.sequence, times_ns, len(frame)))
-    return frames
-
-
-def connect(publisher, socket):
-    """Publish until what is published comes, and read it."""
-    wait_for(lambda: publisher.publish(Number(-1, -1)) and socket.poll(1))
-    publisher.flush()
-    return read_until(socket, publisher.counters.published)
-
-
-def test_a_burst_travels_together(node, without_rings):
-    """Frames are as full as the times of publishing let them be; every message comes, in order."""
-    publisher = node.publisher("/numbers", Number, coalesce=True)
-    subscriber = node.subscriber("/numbers", Number, policy=keep_last(20_000))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    socket = listen(node)
-    try:
-        before = connect(publisher, socket)[-1:]
-        for value in range(1000):
-            publisher.publish(Number(value, value))
-        publisher.flush()
-        frames = read_until(socket, publisher.counters.published)
-    finally:
-        socket.close(0)
-    for last, frame in itertools.pairwise(before + frames):
-        assert (frame.kind == BATCH) == (frame.times_ns[0] - last.times_ns[-1] < BURST_NS)
-        if last.kind == BATCH and last is not before[0]:
-            assert len(last.times_ns) == BATCH_COUNT or frame.times_ns[0] - last.times_ns[0] >= BATCH_NS
-    for frame in frames:
-        assert frame.kind in (MESSAGE, BATCH)
-        assert len(frame.times_ns) <= BATCH_COUNT
-        assert frame.size >= HEADER_SIZE + (frame.kind == BATCH) * len(frame.times_ns) * RECORD.size
-        assert frame.times_ns[-2:][0] - frame.times_ns[0] < BATCH_NS  # nothing is added to one that is old
-    messages = [subscriber.recv_with_info(SOON_S)]
-    while messages[-1][0].value < 999:
-        messages.append(subscriber.recv_with_info(SOON_S))
-    messages = [pair for pair in messages if pair[0].value >= 0]
-    assert [message.value for message, _ in messages] == list(range(1000))
-    times = [info.publish_ns for _, info in messages]
-    assert times == sorted(times) == [time_ns for frame in frames for time_ns in frame.times_ns]
-    assert len(set(times)) > 900
-    first = messages[0][1].sequence
-    assert [info.sequence for _, info in messages] == list(range(first, first + 1000))
-
-
-@pytest.mark.alone
-def test_the_tail_of_a_burst_does_not_wait(node):
-    """It is sent when nothing more comes: within 0.15 ms, when the machine lets it."""
-    publisher = node.publisher("/numbers", Number, coalesce=True)
-    subscriber = node.subscriber("/numbers", Number, policy=keep_last(2000))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    delays_s = []
-    for burst in range(30):
-        for k in range(7):
-            publisher.publish(Number(burst, k))
-        begin = time.monotonic()
-        while subscriber.recv(SOON_S) != Number(burst, 6):
-            pass
-        delays_s.append(time.monotonic() - begin)
-    assert min(delays_s) < 2e-3  # a busy machine makes some of them late, but not each
-
-
-def test_a_lone_message_is_not_held_back(node, without_rings):
-    """It goes as a plain message, and not in a batch that waits for others."""
-    publisher = node.publisher("/numbers", Number, coalesce=True)
-    node.subscriber("/numbers", Number)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    socket = listen(node)
-    try:
-        connect(publisher, socket)
-        for value in range(10):
-            time.sleep(2 * BURST_NS * 1e-9)  # at least: or it would not be alone
-            publisher.publish(Number(0, value))
-            assert [frame.kind for frame in read_until(socket, publisher.counters.published)] == [MESSAGE]
-    finally:
-        socket.close(0)
-
-
-def test_closing_sends_what_is_held_back(make_node):
-    receiver = make_node("receiver")
-    subscriber = receiver.subscriber("/numbers", Number, policy=keep_last(100))
-    for close_node in (False, True):
-        node = make_node("sender")
-        publisher = node.publisher("/numbers", Number, coalesce=True)
-        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        for value in range(50):
-            publisher.publish(Number(0, value))
-        (node if close_node else publisher).close()
-        assert [subscriber.recv(SOON_S).value for _ in range(50)] == list(range(50))
-
-
 # Coming and going
 
 
@@ -392,7 +250,7 @@ def test_counters(node):
     assert 4 * (10 + LARGE) <= counters.bytes < 4 * (10 + LARGE) + 300
 
 
-@pytest.mark.parametrize("options", [{}, {"latch": True}, {"coalesce": True}])
+@pytest.mark.parametrize("options", [{}, {"latch": True}])
 def test_use_after_close(node, options):
     publisher = node.publisher("/scans", Scan, **options)
     subscriber = node.subscriber("/scans", Scan)

@@ -160,8 +160,8 @@ def test_reliable_from_python(start, make_node, over):
 
 
 @pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_batches_and_large_messages_from_python(start, make_node, over):
-    publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, coalesce=True, max_wait_s=SOON_S)
+def test_small_and_large_messages_from_python(start, make_node, over):
+    publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, max_wait_s=SOON_S)
     reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
     assert publisher.wait_for_subscribers(1, SOON_S)
     blocks = [make_block(number, 20_000 if number % 10 == 9 else number) for number in range(100)]

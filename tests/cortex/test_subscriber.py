@@ -74,7 +74,7 @@ def test_what_is_left_of_a_timeout_is_not_waited_for_twice(node, monkeypatch, ti
 
     monkeypatch.setattr("cortex.subscriber.time", SimpleNamespace(monotonic=lambda: now_s))
     monkeypatch.setattr(subscriber, "_wait", wait)
-    monkeypatch.setattr(subscriber, "_take", lambda *, whole, block: wait(BLOCK_S) if block else None)
+    monkeypatch.setattr(subscriber, "_take", lambda *, block: wait(BLOCK_S) if block else None)
     with pytest.raises(TimeoutError):
         subscriber.recv(timeout_s)
     assert now_s == pytest.approx(timeout_s)
@@ -271,16 +271,14 @@ def test_several_threads_share_a_stream(numbers):
 # Batches
 
 
-@pytest.mark.parametrize("coalesce", [False, True])
-def test_a_batch_holds_what_is_there(node, coalesce):
-    publisher = node.publisher("/numbers", Number, coalesce=coalesce)
+def test_a_batch_holds_what_is_there(node):
+    publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     values, stamps, sizes = [], [], []
     for start in range(0, 1000, 200):
         for value in range(start, start + 200):
             publisher.publish(Number(10 * value, value))
-        publisher.flush()
         while len(values) < start + 200:
             batch = subscriber.recv_batch(SOON_S)
             assert batch.dtype == codec_of(Number).record_dtype
@@ -298,14 +296,13 @@ def test_a_batch_holds_what_is_there(node, coalesce):
 
 def test_single_messages_after_batches(node):
     """Who has asked for batches may go on one by one, in order."""
-    publisher = node.publisher("/numbers", Number, coalesce=True)
+    publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv_batch(0.0)
     for value in range(100):
         publisher.publish(Number(value, value))
-    publisher.flush()
     first = subscriber.recv_batch(SOON_S)["value"].tolist()
     rest = [subscriber.recv_with_info(SOON_S) for _ in range(100 - len(first))]
     assert first + [message.value for message, _ in rest] == list(range(100))
@@ -315,15 +312,14 @@ def test_single_messages_after_batches(node):
 
 @pytest.mark.parametrize("depth", [1, 10])
 def test_batches_are_bounded_by_the_policy(node, depth):
-    """keep_last counts messages, not frames: of a thousand, the last ones wait."""
-    publisher = node.publisher("/numbers", Number, coalesce=True)
+    """Of a thousand, the last ones wait."""
+    publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=keep_last(depth))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv_batch(0.0)
     for value in range(1000):
         publisher.publish(Number(value, value))
-    publisher.flush()
     values = []
     while not values or values[-1] < 999:
         values += subscriber.recv_batch(SOON_S)["value"].tolist()
@@ -503,7 +499,7 @@ def test_use_after_close(numbers):
 def test_what_was_sent_before_a_publisher_left_still_comes(node):
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     for round_ in range(3):
-        with node.publisher("/numbers", Number, coalesce=True) as publisher:
+        with node.publisher("/numbers", Number) as publisher:
             assert publisher.wait_for_subscribers(timeout_s=SOON_S)
             for value in range(100):
                 publisher.publish(Number(round_, value))

@@ -112,7 +112,7 @@ def test_between_processes(pair, transport, policy):
 def test_a_stream_is_complete(pair, transport):
     """Ten thousand messages as fast as they go, with back-pressure: each comes once, in order."""
     node, child = pair(transport)
-    child.ask(do="publisher", topic="/numbers", type="Number", coalesce=True)
+    child.ask(do="publisher", topic="/numbers", type="Number")
     subscriber = node.subscriber("/numbers", Number, policy=reliable(64, 60.0))
     assert subscriber.wait_for_publisher(SOON_S)
     child.say(do="publish", topic="/numbers", count=10_000)

@@ -14,17 +14,14 @@ from cortex.records import Heartbeat, Leave
 from cortex.registry import control_types
 from cortex.wire import (
     ATTACH,
-    BATCH,
     CONTROL,
     HEADER_SIZE,
     MESSAGE,
-    RECORD,
     AttachAnswer,
     AttachKey,
     Header,
     answer_frame,
     attach_key,
-    batch_records,
     check_body,
     control_frame,
     pack_header,
@@ -39,7 +36,7 @@ u8, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 32, 64))
 i64 = st.integers(-(2**63), 2**63 - 1)
 headers = st.builds(
     Header,
-    kind=st.sampled_from([b"M", b"L", b"S", b"B", b"A", b"C", b"Q", b"P", b"E"]),
+    kind=st.sampled_from([b"M", b"L", b"S", b"N", b"A", b"C", b"Q", b"P", b"E"]),
     source=u64,
     fingerprint=u64,
     sequence=u64,
@@ -174,45 +171,6 @@ def mutated(frame):
         st.binary(min_size=1, max_size=64).map(lambda more: frame + more),
         st.integers(0, len(frame)).map(lambda n: frame[:n] + frame),
     )
-
-
-def batch(bodies, *, source=1, fingerprint=2, sequence=0, padding=b"\0"):
-    records = b"".join(
-        RECORD.pack(k, k, len(body), 0) + body + padding * (-len(body) % 8) for k, body in enumerate(bodies)
-    )
-    return (
-        pack_header(Header(BATCH, source, fingerprint, sequence, 0, 0, len(records), len(bodies))) + records
-    )
-
-
-@given(st.lists(st.binary(max_size=40), max_size=10))
-def test_a_batch_survives(bodies):
-    frame = batch(bodies)
-    records = list(batch_records(frame, len(bodies)))
-    assert [frame[r.offset : r.offset + r.size] for r in records] == bodies
-    assert [r.stamp_ns for r in records] == list(range(len(bodies)))
-
-
-@given(st.lists(st.binary(max_size=40), max_size=6), st.integers(-2, 2), st.data())
-def test_a_batch_fills_its_frame_or_is_refused(bodies, more, data):
-    frame = data.draw(mutated(batch(bodies)))
-    count = max(len(bodies) + more, 0)
-    try:
-        records = list(batch_records(frame, count))
-    except MalformedMessage:
-        return
-    assert len(records) == count
-    end = HEADER_SIZE
-    for record in records:
-        assert record.offset == end + RECORD.size
-        end = record.offset + -(-record.size // 8) * 8
-    assert end == len(frame)
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 2**32, 2**64 - 1])
-def test_a_batch_of_another_count_is_refused(count):
-    with pytest.raises(MalformedMessage, match="batch"):
-        batch_records(batch([b"12345678", b"1"]), count)
 
 
 # Control frames

@@ -60,7 +60,7 @@ class Link {
     fd_ = socket_.get(zmq::sockopt::fd);
     secure(socket_);
     socket_.connect(address_);
-    for (const char kind : {'M', 'B', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
+    for (const char kind : {'M', 'N', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
     attach(shared_memory);
   }
 
@@ -174,7 +174,7 @@ class Link {
 
   void accept(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
     if (header.source != source_ || header.flags != flags()) throw MalformedMessage("not a frame of this publisher");
-    if (arrival.message == nullptr && std::strchr("MBS", header.kind) == nullptr) {
+    if (arrival.message == nullptr && std::strchr("MNS", header.kind) == nullptr) {
       throw MalformedMessage("a frame in the ring that belongs into the socket");
     }
     if (header.kind == 'A') return on_answer(arrival.bytes, queue);
@@ -190,8 +190,8 @@ class Link {
         item.body = {net::bytes(item.frame).data() + wire::header_size, static_cast<std::size_t>(header.body_size)};
         return;
       }
-      case 'B':
-        return on_batch(header, arrival, queue);
+      case 'N':
+        return on_next(header, arrival);
       case 'L':
         return on_large(header, *arrival.message, queue);  // none comes through a ring
       case 'S':
@@ -258,21 +258,10 @@ class Link {
     }
   }
 
-  void on_batch(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
-    wire::body_of(header, arrival.bytes, wire::body_limit);
-    if (header.aux == 0) {  // tells which number comes next, so that a loss at the end of a burst is known
-      if (header.body_size != 0) throw MalformedMessage("a batch of bytes without records");
-      if (advance(header.sequence, 0) && policy_.is_reliable && !in_ring_) confirm(header.sequence);
-      return;
-    }
-    const auto shared = std::make_shared<zmq::message_t>(arrival.keep());
-    const auto records = wire::batch_records(header, net::bytes(*shared));
-    if (!advance(header.sequence, header.aux)) return;
-    for (std::size_t index = 0; index < records.size(); ++index) {
-      Item& item = append(queue, header.sequence + index, records[index].stamp_ns, records[index].publish_ns);
-      item.body = records[index].body;
-      item.owner = shared;
-    }
+  // Tells which number comes next, so that a loss at the end of a burst is known.
+  void on_next(const wire::Header& header, const Arrival& arrival) {
+    if (header.body_size != 0 || arrival.bytes.size() != wire::header_size) throw MalformedMessage("a body where there is none");
+    if (advance(header.sequence, 0) && policy_.is_reliable && !in_ring_) confirm(header.sequence);
   }
 
   void on_slot(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
@@ -317,7 +306,7 @@ class Link {
     if (welcomed < 0) go_without_memory("its ring cannot be mapped");
     if (welcomed <= 0) return welcomed == 0;
     in_ring_ = true;
-    for (const char kind : {'M', 'B', 'L'}) subscribe(kind, false);
+    for (const char kind : {'M', 'N', 'L'}) subscribe(kind, false);
     return true;
   }
 
@@ -338,7 +327,7 @@ class Link {
   void go_without_memory(const std::string& why) {
     complaints_->once("memory " + address_, "cannot share memory with " + address_ + ": " + why);
     if (in_ring_) {
-      for (const char kind : {'M', 'B', 'L'}) subscribe(kind, true);
+      for (const char kind : {'M', 'N', 'L'}) subscribe(kind, true);
     }
     in_ring_ = false;
     end_.reset();

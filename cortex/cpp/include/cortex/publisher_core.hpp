@@ -145,7 +145,7 @@ class PublisherCore {
     if (!lock.owns_lock() || closed_ || outlets_->closed) return;
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame(wire::header_size);
-    write_header(static_cast<std::uint8_t*>(frame.data()), 'B', sequence_, 0, 0, 0);
+    write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, 0);
     bool sent = !is_late_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
     if (has_sockets(outlets_->strict)) sent &= outlets_->strict.try_send(std::move(frame));
@@ -232,7 +232,7 @@ class PublisherCore {
   void leave_behind() {
     Leftover leftover;
     std::uint8_t last[wire::header_size];
-    write_header(last, 'B', sequence_, 0, 0, 0);
+    write_header(last, 'N', sequence_, 0, 0, 0);
     readers_.end({last, sizeof last});  // what is in the ring stays the readers'
     leftover.sequence = sequence_;
     if (!outlets_->closed && told_ != sequence_) {

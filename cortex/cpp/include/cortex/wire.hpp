@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The frames of WIRE.md: header, kinds, batches, attaching. Everything is little-endian.
+// The frames of WIRE.md: header, kinds, attaching. Everything is little-endian.
 #pragma once
 
 #include <cstddef>
@@ -34,7 +34,6 @@ constexpr std::uint64_t jump_max = std::uint64_t{1} << 32;  // no source loses m
 constexpr std::uint8_t flag_stamp = 1;
 constexpr std::uint64_t body_limit = std::uint64_t{1} << 30;
 constexpr std::uint64_t control_limit = 16u << 20;
-constexpr std::size_t record_head = 24;
 
 template <class T>
 T load(const std::uint8_t* from) noexcept {
@@ -114,36 +113,6 @@ inline Span<const std::uint8_t> body_of(const Header& header, Span<const std::ui
                            std::to_string(header.body_size) + " (limit " + std::to_string(limit) + ")");
   }
   return {frame.data() + header_size, static_cast<std::size_t>(header.body_size)};
-}
-
-// One message of a batch.
-struct Record {
-  std::int64_t stamp_ns = 0;
-  std::int64_t publish_ns = 0;
-  Span<const std::uint8_t> body;
-};
-
-// The records of a batch, which must fill the frame exactly.
-inline std::vector<Record> batch_records(const Header& header, Span<const std::uint8_t> frame) {
-  const auto malformed = [](const char* what) { throw MalformedMessage(std::string("a batch ") + what); };
-  if (header.aux > (frame.size() - header_size) / record_head) malformed("cannot hold its records");
-  if (header.sequence + header.aux < header.sequence) malformed("wraps its sequence number");
-  std::vector<Record> records;
-  records.reserve(static_cast<std::size_t>(header.aux));
-  std::size_t offset = header_size;
-  for (std::uint64_t index = 0; index < header.aux; ++index) {
-    if (frame.size() - offset < record_head) malformed("ends within the head of a record");
-    const std::uint8_t* at = frame.data() + offset;
-    const std::size_t size = load<std::uint32_t>(at + 16);
-    offset += record_head;
-    if (load<std::uint32_t>(at + 20) != 0 || round_up(size, 8) > frame.size() - offset) {
-      malformed("has a record that does not fit");
-    }
-    records.push_back({load<std::int64_t>(at), load<std::int64_t>(at + 8), {frame.data() + offset, size}});
-    offset += static_cast<std::size_t>(round_up(size, 8));
-  }
-  if (offset != frame.size()) malformed("has bytes after its last record");
-  return records;
 }
 
 // What a reader asks for when it attaches to a publisher.

@@ -5,7 +5,7 @@ use std::thread;
 use std::time::Instant;
 
 use crate::json::Json;
-use crate::wire::{BODY_MAX, CONFIRMS, HEADER, Header, STRICT, key, parse_answer, prefix, records};
+use crate::wire::{BODY_MAX, CONFIRMS, HEADER, Header, STRICT, key, parse_answer, prefix};
 use crate::zmtp::{Message, Writer, connect};
 use crate::{Result, ensure, node, schema};
 
@@ -80,7 +80,7 @@ impl Link {
     pub fn attach(&mut self, events: &SyncSender<Event>) -> std::io::Result<()> {
         let (mut reader, writer) = connect(&self.address, "SUB", BODY_MAX + 4096)?;
         self.reader = node::random();
-        let prefixes = b"MBL".map(|kind| prefix(kind, self.stamped, self.source));
+        let prefixes = b"MNL".map(|kind| prefix(kind, self.stamped, self.source));
         for wanted in prefixes.into_iter().chain([self.attach_key()]) {
             writer.send(&[[vec![1], wanted].concat()])?;
         }
@@ -131,7 +131,7 @@ impl Link {
             self.check(frame, message.last().map_or(&[], |last| &last[if is_large { 0 } else { HEADER }..]))?;
         let bodies = match header.kind {
             b'M' | b'L' => vec![body],
-            b'B' => records(body, header.aux)?,
+            b'N' if body.is_empty() => vec![],
             kind => return Err(format!("kind {kind}")),
         };
         let is_new = self.advance(header.sequence, bodies.len() as u64, counters)?;

@@ -141,14 +141,14 @@ impl Publisher {
         Ok(self.push(frames, header.sequence))
     }
 
-    /// A batch of nothing, and the readers to whom it is to be sent.
+    /// Which sequence comes next, and the readers to whom that is to be sent.
     fn news(&self, next: u64) -> (Arc<Message>, Vec<Arc<Peer>>) {
         let peers = self.peers.lock().unwrap().clone();
         let readers = peers.into_iter().filter(|peer| peer.wishes.lock().unwrap().reader != 0).collect();
-        (Arc::new(vec![self.header(b'B', next).pack()]), readers)
+        (Arc::new(vec![self.header(b'N', next).pack()]), readers)
     }
 
-    /// Tell readers after a silence how many messages there have been [G3]; to be called now and then.
+    /// Tell readers after a silence how many messages there have been [G2]; to be called now and then.
     pub fn tell(&self) {
         let mut next = self.next.lock().unwrap();
         if next.1.elapsed() > SILENCE && next.2 != next.0 {

@@ -1,4 +1,4 @@
-//! Frames: the header [H], batches [G], the keys by which readers attach and resume [A, E], control messages [C].
+//! Frames: the header [H], the keys by which readers attach and resume [A, E], control messages [C].
 
 use std::sync::LazyLock;
 
@@ -53,21 +53,6 @@ impl Header {
         let (stamp_ns, publish_ns) = (stamp as i64, publish as i64);
         Ok(Header { kind, stamped, source, fingerprint, sequence, stamp_ns, publish_ns, size, aux })
     }
-}
-
-/// The bodies of a batch's records [G1].
-pub fn records(mut rest: &[u8], count: u64) -> Result<Vec<&[u8]>> {
-    let mut bodies = vec![];
-    while !rest.is_empty() {
-        ensure!(rest.len() >= 24, "a batch that ends within a record");
-        let (size, reserved) = (number(rest, 16) as u32 as usize, number(rest, 16) >> 32);
-        let end = 24 + size.next_multiple_of(8);
-        ensure!(reserved == 0 && end <= rest.len(), "a record of {size} bytes");
-        bodies.push(&rest[24..24 + size]);
-        rest = &rest[end..];
-    }
-    ensure!(bodies.len() as u64 == count, "{} records, said {count}", bodies.len());
-    Ok(bodies)
 }
 
 /// Sequence and latched message of an answer [A4].
