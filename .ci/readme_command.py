@@ -1,4 +1,4 @@
-"""Print a command of README or CONTRIBUTING: the bash block under the comment `<!-- command: NAME -->`.
+"""Print a command of the README: the bash block under the comment `<!-- command: NAME -->`.
 
 Of a document, named by its path: all its bash and Python blocks as one script, for a folder of its own.
 """
@@ -10,13 +10,12 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md")
 
 
 def readme_commands() -> dict[str, str]:
-    """Return every named command of these documents."""
+    """Return every named command of the README."""
     pattern = r"<!-- command: (\w+) -->\s*```bash\n(.*?)```"
-    text = "\n".join(page.read_text("utf-8") for page in PAGES)
+    text = (ROOT / "README.md").read_text("utf-8")
     return {name: body.strip() for name, body in re.findall(pattern, text, flags=re.DOTALL)}
 
 

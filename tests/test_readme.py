@@ -44,7 +44,7 @@ def shell(command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_readme_is_short():
-    assert len(README.splitlines()) <= 145
+    assert len(README.splitlines()) < 150
 
 
 def test_the_readme_is_finished():
