@@ -128,10 +128,13 @@ def _ros1_records(view: memoryview, count: int) -> NDArray[Any]:
 
 
 def _records(view: memoryview, count: int) -> NDArray[Any]:
+    size = 16 * count - 3 if count else 0
+    if len(view) < size:  # before memory is taken for what a damaged count claims
+        raise ValueError(f"{count} events need more")
     records = np.zeros(count, DVS_RECORD)
     if count:
         records[0] = struct.unpack_from("<HHiIB", view)
-        padded = bytes(view[14 : 16 * count - 3]) + bytes(3)
+        padded = bytes(view[14:size]) + bytes(3)
         records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
     return records
 

@@ -160,6 +160,9 @@ def test_dvs_msgs_of_others(tmp_path):
     with pytest.raises(EventFileError, match="/cam/events"):  # the second message is cut off
         list(reader.blocks())
     reader.close()
+    claimed = head(7) + struct.pack("<III", HEIGHT, WIDTH, 2**32 - 1)  # would need 69 GB
+    with pytest.raises(EventFileError, match="4294967295 events need more"):
+        open_events(write_bag(tmp_path / "claiming_bag", "dvs_msgs/msg/EventArray", [claimed]))
     reader = open_events(write_bag(tmp_path / "whole_bag", "dvs_msgs/msg/EventArray", [body]))
     (events,) = reader.blocks()
     reader.close()
