@@ -29,6 +29,7 @@ from cortex_ros2_bridge.backend.base import BackendError, Buffer
 from cortex_ros2_bridge.config import BridgeConfig
 from cortex_ros2_bridge.convert import RULES, Context, ConvertError
 from cortex_ros2_bridge.convert.camera import pixel_type
+from cortex_ros2_bridge.convert.records import stamp_ns_of
 from cortex_ros2_bridge.convert.registry import Rule
 from cortex_ros2_bridge.event_codec import decode_mono, read_dvs
 from cortex_ros2_bridge.frames import rotate
@@ -217,7 +218,7 @@ def _image(data: Buffer) -> messages.Image:
     rows = made.data.reshape(made.height, made.step)[:, : made.width * channels * dtype.itemsize]
     pixels = np.ascontiguousarray(rows).view(kind).astype(dtype)
     return messages.Image(
-        stamp_ns=_stamp_ns(made),
+        stamp_ns=stamp_ns_of(made.header.stamp),
         data=pixels.reshape(made.height, made.width, channels),
         encoding=made.encoding,
         frame_id=made.header.frame_id,
@@ -227,7 +228,7 @@ def _image(data: Buffer) -> messages.Image:
 def _imu(data: Buffer) -> messages.Imu:
     made = cdr.decode_record(data, "sensor_msgs/msg/Imu")
     return messages.Imu(
-        stamp_ns=_stamp_ns(made),
+        stamp_ns=stamp_ns_of(made.header.stamp),
         specific_force=_vector(made.linear_acceleration),
         angular_rate=_vector(made.angular_velocity),
     )
@@ -238,7 +239,7 @@ def _odometry(data: Buffer) -> messages.Odometry:
     pose, twist = made.pose.pose, made.twist.twist
     orientation = np.array([*_vector(pose.orientation), pose.orientation.w])
     return messages.Odometry(
-        stamp_ns=_stamp_ns(made),
+        stamp_ns=stamp_ns_of(made.header.stamp),
         position=_vector(pose.position),
         orientation=orientation,
         velocity=rotate(orientation, _vector(twist.linear)),
@@ -259,7 +260,7 @@ class _PacketDecoder:
 
     def __call__(self, data: Buffer) -> messages.Events:
         made = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
-        stamp_us = _stamp_ns(made) // 1000
+        stamp_us = stamp_ns_of(made.header.stamp) // 1000
         if made.encoding == "mono":
             columns = decode_mono(made.events, base_ns=made.time_base)
             columns = columns._replace(t=columns.t // 1000)
@@ -299,10 +300,6 @@ def _events(columns: EventColumns, stamp_us: int, size: tuple[int, int]) -> mess
         y=columns.y,
         polarity=columns.polarity,
     )
-
-
-def _stamp_ns(made: Any) -> int:
-    return int(made.header.stamp.sec) * 1_000_000_000 + int(made.header.stamp.nanosec)
 
 
 def _vector(made: Any) -> np.ndarray[Any, np.dtype[np.float64]]:

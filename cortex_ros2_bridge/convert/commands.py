@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cortex import messages
 from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
-from cortex_ros2_bridge.convert.records import header, pose_of, quaternion, record, vector
+from cortex_ros2_bridge.convert.records import header, pose_of, quaternion, record, stamp_ns_of, vector
 from cortex_ros2_bridge.convert.registry import command, recorded, request
 from cortex_ros2_bridge.convert.state import rotor_speeds
 
@@ -256,7 +256,7 @@ def _stamp_ns(message: Any, context: Context) -> int:
     stamp = message.header.stamp
     if stamp.sec < 0 or stamp.nanosec >= 1_000_000_000:
         raise ConvertError(f"a stamp of {stamp.sec} s and {stamp.nanosec} ns")
-    return stamp.sec * 1_000_000_000 + stamp.nanosec or context.now_ns
+    return stamp_ns_of(stamp) or context.now_ns
 
 
 def _thrust_n(message: Any, context: Context) -> float:

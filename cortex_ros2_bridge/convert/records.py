@@ -26,6 +26,11 @@ def time_of(stamp_ns: int) -> Any:
     return record("builtin_interfaces/msg/Time")(second, nanosecond)
 
 
+def stamp_ns_of(time: Any) -> int:
+    """Return the nanoseconds of a builtin_interfaces/Time."""
+    return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+
 def header(stamp_ns: int, frame: str, context: Context) -> Any:
     """Return a header with the name in ROS of a frame of Cortex."""
     return record("std_msgs/msg/Header")(time_of(stamp_ns), context.frames.ros(frame))

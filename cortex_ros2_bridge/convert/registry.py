@@ -35,7 +35,7 @@ from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
 from cortex_ros2_bridge.convert.context import Context, ConvertError, Out
 from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
-from cortex_ros2_bridge.convert.records import header, record
+from cortex_ros2_bridge.convert.records import header, record, stamp_ns_of
 from cortex_ros2_bridge.typestore import define, typestore
 
 GROUP = "cortex_ros2_bridge.converters"
@@ -447,8 +447,7 @@ def _reader(kind: type[Any], plain: Any) -> Callable[[Any, Context], Any]:
         values: dict[str, Any] = {}
         for name, each in fields:
             if name == "stamp_ns":
-                stamp = message.header.stamp
-                values[name] = stamp.sec * 1_000_000_000 + stamp.nanosec
+                values[name] = stamp_ns_of(message.header.stamp)
             elif name == "frame_id" and "stamp_ns" in names:
                 values[name] = message.header.frame_id
             elif isinstance(each, dict) and "array" in each:

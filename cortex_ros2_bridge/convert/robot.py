@@ -13,6 +13,7 @@ from cortex.evt3 import EventCodecError, Evt3Decoder
 from cortex_ros2_bridge import cdr, frames
 from cortex_ros2_bridge.convert.commands import recorded_rates, unit, xyz
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+from cortex_ros2_bridge.convert.records import stamp_ns_of
 from cortex_ros2_bridge.convert.registry import NEWEST, PACKETS, RULES, Direction, Rule, encoded
 from cortex_ros2_bridge.event_codec import decode_mono
 
@@ -24,7 +25,7 @@ def odometry(message: Any, context: Context) -> messages.Odometry:
     check_finite("odometry", position, velocity, rate)
     orientation = unit(pose.orientation)
     return messages.Odometry(
-        stamp_ns=_stamp_ns(message),
+        stamp_ns=stamp_ns_of(message.header.stamp),
         position=position,
         orientation=orientation,
         velocity=frames.rotate(orientation, velocity),
@@ -39,7 +40,7 @@ def events(message: Any, context: Context) -> messages.Events:
     A packet tells the time of its first event. Its stamp in Cortex is the end of the window in which its last
     one lies, where the option `packet_rate_hz` tells how windows follow each other; else the time of that.
     """
-    data, stamp_ns = np.asarray(message.events, np.uint8), _stamp_ns(message)
+    data, stamp_ns = np.asarray(message.events, np.uint8), stamp_ns_of(message.header.stamp)
     if stamp_ns < context.memory.get("stamp_ns", 0):  # time has begun again
         context.memory.clear()
     context.memory["stamp_ns"] = stamp_ns
@@ -71,11 +72,6 @@ def events(message: Any, context: Context) -> messages.Events:
         start_ns=min(stamp_ns, end_ns),
         sequence=message.seq,
     )
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _decoded(convert: Callable[[Any, Context], Any], ros_type: str) -> Callable[[Any, Context], Any]:
