@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -101,17 +102,11 @@ class Ppo:
                 ("done", done),
             ):
                 rows[name].append(value)
-            metrics = info["metrics"]
-            ended += torch.stack(
-                [done.sum(), (metrics["success"] * done).sum(), (metrics["crash"] * done).sum()]
-            )
+            ended += count_ended(done, info["metrics"])
             self._now = self._seen(observations)
         batch = {name: torch.stack(values) for name, values in rows.items()}
         add_advantages(batch, policy.value(self._now[1]), config)
-        episodes, successes, crashes = ended.tolist()
-        log = {"reward": float(batch["reward"].mean()), "spread": float(spread.mean())}
-        if episodes:
-            log |= {"success": successes / episodes, "crash": crashes / episodes}
+        log = flown_log(batch["reward"], spread, ended)
         return {name: value.flatten(0, 1) for name, value in batch.items()}, log
 
     def _learn(self, batch: dict[str, torch.Tensor], rate: float) -> None:
@@ -119,17 +114,35 @@ class Ppo:
             self._batch = {name: torch.empty_like(value) for name, value in batch.items()}
         for name, value in batch.items():
             self._batch[name].copy_(value)
-        count = len(batch["advantage"])
-        for _ in range(self.config.epochs):
-            order = torch.randperm(count, generator=self._generator, device=self.env.device)
-            for rows in order.split(len(self._rows))[: self.config.minibatches]:
-                self._rows.copy_(rows)
-                self.descent.step(rate)
+        for rows in minibatches(len(batch["advantage"]), len(self._rows), self.config, self._generator):
+            self._rows.copy_(rows)
+            self.descent.step(rate)
 
     def _loss(self) -> torch.Tensor:
         """Return the loss of the rows of the batch that `_rows` names."""
         part = {name: value.index_select(0, self._rows) for name, value in self._batch.items()}
         return ppo_loss(self.policy, self.policy(part["actor"]), part, self.config)
+
+
+def count_ended(done: torch.Tensor, metrics: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Return how many episodes a step has ended, and how many in success and in a crash, shape [3]."""
+    return torch.stack([done.sum(), (metrics["success"] * done).sum(), (metrics["crash"] * done).sum()])
+
+
+def flown_log(reward: torch.Tensor, spread: torch.Tensor, ended: torch.Tensor) -> dict[str, float]:
+    """Return what to log of the steps of an iteration; `ended` is the sum of their `count_ended`."""
+    log = {"reward": float(reward.mean()), "spread": float(spread.mean())}
+    episodes, successes, crashes = ended.tolist()
+    return log | ({"success": successes / episodes, "crash": crashes / episodes} if episodes else {})
+
+
+def minibatches(
+    count: int, size: int, config: PpoConfig, generator: torch.Generator
+) -> Iterator[torch.Tensor]:
+    """Yield the numbers of the rows of each minibatch of all epochs, drawn from so many, `size` at a time."""
+    for _ in range(config.epochs):
+        order = torch.randperm(count, generator=generator, device=generator.device)
+        yield from order.split(size)[: config.minibatches]
 
 
 def add_advantages(batch: dict[str, torch.Tensor], later: torch.Tensor, config: PpoConfig) -> None:

@@ -11,7 +11,14 @@ from torch import nn
 from neurosim_core.learn.descent import Descent, Replayed
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import Critic, EventPolicy
-from neurosim_core.learn.ppo import PpoConfig, add_advantages, ppo_loss
+from neurosim_core.learn.ppo import (
+    PpoConfig,
+    add_advantages,
+    count_ended,
+    flown_log,
+    minibatches,
+    ppo_loss,
+)
 from neurosim_core.learn.task import Observations
 
 
@@ -102,12 +109,10 @@ class RecurrentPpo:
         with torch.no_grad():
             log = self._fly()
         self._hint_error.zero_()
-        config, device = self.config, self.env.device
-        for _ in range(config.epochs):
-            order = torch.randperm(self.env.num_envs, generator=self._generator, device=device)
-            for rows in order.split(len(self._rows))[: config.minibatches]:
-                self._rows.copy_(rows)
-                self.descent.step(config.learning_rate * (1.0 - 0.9 * done))
+        config = self.config
+        for rows in minibatches(self.env.num_envs, len(self._rows), config, self._generator):
+            self._rows.copy_(rows)
+            self.descent.step(config.learning_rate * (1.0 - 0.9 * done))
         return log | {"hint": float(self._hint_error) / (config.epochs * config.minibatches)}
 
     def _fly(self) -> dict[str, float]:
@@ -124,22 +129,13 @@ class RecurrentPpo:
             cut = self._module.value(env.group(info["final_obs"], "critic"))  # it would have gone on
             kept["reward"][step] = config.reward_scale * reward + config.discount * cut * truncated
             self._begun = kept["done"][step] = (terminated | truncated).float()
-            metrics = info["metrics"]
-            ended += torch.stack(
-                [
-                    (self._begun * value).sum()
-                    for value in (torch.ones_like(reward), metrics["success"], metrics["crash"])
-                ]
-            )
+            ended += count_ended(self._begun, info["metrics"])
         later = self._module.value(env.group(self._now, "critic"))
         batch = {name: kept[name] for name in ("reward", "value", "done")}
         add_advantages(batch, later, config)
         for name in ("advantage", "return"):
             kept[name].copy_(batch[name])
-        episodes, successes, crashes = ended.tolist()
-        spread = float(torch.exp(self._module.log_spread).mean())
-        log = {"reward": float(kept["reward"].mean()), "spread": spread}
-        return log | ({"success": successes / episodes, "crash": crashes / episodes} if episodes else {})
+        return flown_log(kept["reward"], torch.exp(self._module.log_spread), ended)
 
     def _look(self, now: Observations) -> None:
         """Copy what is seen to where `_decide` looks."""
