@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 import wire_oracle
+from wire_vectors import load_vectors
 
 from cortex.codec import Codec, MalformedMessage, codec_of
-from cortex.vectors import load_vectors
-from cortex.vectors.catalogue import CATALOGUE
+from cortex.schema import Schema, type_from_schema
 
 INTERESTING = [bytes([n]) for n in (0, 1, 2, 127, 128, 255)]
 INTERESTING += [
@@ -38,7 +38,7 @@ class Target:
 
     def __init__(self, name: str, vector: dict[str, Any]) -> None:
         self.name = name
-        self.codec: Codec = codec_of(CATALOGUE[name].type)
+        self.codec: Codec = codec_of(type_from_schema(Schema.from_json(vector["schema"])))
         self.schema = json.loads(vector["schema"])
         self.bodies = [bytes.fromhex(case["body"]) for case in vector["cases"] + vector["malformed"]]
 

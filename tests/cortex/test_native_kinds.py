@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from processes import SOON_S, wait_for
 from random_schemas import any_message, schemas
 from test_large import connected, slots_held
+from wire_vectors import load_vectors
 
 from cortex import reliable
 from cortex.codec import MalformedMessage, codec_of
@@ -25,9 +26,7 @@ from cortex.encoder import join
 from cortex.message import Array, Float32, Int8, Int32, message
 from cortex.messages import Image
 from cortex.native import make_coder
-from cortex.schema import schema_of, type_from_schema
-from cortex.vectors import load_vectors
-from cortex.vectors.catalogue import CATALOGUE
+from cortex.schema import Schema, schema_of, type_from_schema
 
 pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
@@ -159,10 +158,11 @@ def test_random_bytes_are_refused_alike(schema, data):
     check_decoding(type_from_schema(schema), data)
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", load_vectors())
 def test_vectors(name):
     """The bodies of the test vectors, and the malformed ones with what is said of them."""
-    vector, cls = load_vectors()[name], CATALOGUE[name].type
+    vector = load_vectors()[name]
+    cls = type_from_schema(Schema.from_json(vector["schema"]))
     coder = coder_of(cls)
     for case in vector["cases"]:
         body = bytes.fromhex(case["body"])
