@@ -20,9 +20,8 @@ from test_large import connected, slots_held
 from wire_vectors import load_vectors
 
 from cortex import reliable
-from cortex.codec import MalformedMessage, codec_of
+from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.compiled import native
-from cortex.encoder import join
 from cortex.message import Array, Float32, Int8, Int32, message
 from cortex.messages import Image
 from cortex.native import make_coder
@@ -91,7 +90,7 @@ def everything(**changes: Any) -> Everything:
 
 def python_body(value: Any) -> bytes:
     """The body as the Python packer writes it."""
-    return join(codec_of(type(value))._encoder.layout(value)[0])
+    return Plan(codec_of(type(value))._body, value).to_bytes()
 
 
 def coder_of(cls: type) -> Any:
@@ -123,7 +122,7 @@ def assert_same(left: Any, right: Any) -> None:
 
 def check_decoding(cls: type, body: bytes) -> bool:
     """C takes a body if and only if Python does, as the same message; return whether they do."""
-    expected = outcome(codec_of(cls)._decoder.decode, body)
+    expected = outcome(codec_of(cls)._body.read, body)
     found = coder_of(cls).decode(body, 0, len(body))
     assert (found is None) == (expected is None)
     if found is not None:
@@ -174,7 +173,7 @@ def test_vectors(name):
         with pytest.raises(MalformedMessage) as after_c:
             codec_of(cls).decode(body)
         with pytest.raises(MalformedMessage) as by_python:
-            codec_of(cls)._decoder.decode(body)
+            codec_of(cls)._body.read(body)
         assert str(after_c.value) == str(by_python.value)
 
 
@@ -256,7 +255,7 @@ def test_wrong_values_are_left_to_python(changes):
     with pytest.raises((TypeError, ValueError), match=r"Everything\.") as through_c:
         codec_of(Everything).encode(wrong, 1 << 20)
     with pytest.raises(type(through_c.value)) as by_python:
-        codec_of(Everything).plan(wrong)
+        codec_of(Everything).size(wrong)
     assert str(through_c.value) == str(by_python.value)
 
 
