@@ -87,9 +87,7 @@ class Result:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return the exit status."""
-    parser = argparse.ArgumentParser(
-        description="measure the bridge on this machine"
-    )
+    parser = argparse.ArgumentParser(description="measure the bridge on this machine")
     default = Load()
     parser.add_argument("--seconds", type=float, default=default.seconds, help="of each measurement [s]")
     parser.add_argument("--encoding", default=default.encoding, choices=["evt3", "mono"], help="of events")
