@@ -346,6 +346,8 @@ class _Endpoint:
     """Whether the executor waits for it."""
     seen_qos = Qos()
     """As discovery tells it."""
+    lister = ""
+    """What the node lists those of a topic with."""
     destroyer = ""
     """What the node destroys a handle with."""
 
@@ -371,7 +373,6 @@ class RclpyPublisher(_Endpoint):
     is_waited_for = False
     destroyer = "destroy_publisher"
     lister = "get_publishers_info_by_topic"
-    """What the node lists those of a topic with."""
 
     @property
     def subscriber_count(self) -> int:

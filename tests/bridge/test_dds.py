@@ -17,7 +17,7 @@ from foreigners import Foreigner
 from processes import SOON_S, wait_for
 
 from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo
-from cortex_ros2_bridge.backend.dds import DdsBackend
+from cortex_ros2_bridge.backend.dds import DdsBackend, _Part
 from cortex_ros2_bridge.typestore import typestore
 
 PRIMITIVES = (
@@ -162,7 +162,8 @@ def test_every_type_of_the_distributions_can_be_published(backend: DdsBackend) -
                 "actuator_msgs",
                 "mavros_msgs",
             ):
-                backend._site().writer(f"rt/{distro}{number}", idl_struct(type_name, distro), Qos(), b"")
+                kind = idl_struct(type_name, distro)
+                _Part(backend)._make("writer", f"rt/{distro}{number}", kind, Qos(), b"")
             else:
                 idl_struct(type_name, distro)
 
@@ -411,7 +412,7 @@ def test_a_closed_subscription_does_not_call(backend: DdsBackend) -> None:
     publisher.publish(text("b"))
     closing = threading.Thread(target=subscription.close)
     closing.start()
-    wait_for(lambda: subscription._deliver._closed)
+    wait_for(lambda: subscription._receiver._deliver._closed)
     assert closing.is_alive()
     go.set()
     closing.join(SOON_S)
