@@ -18,8 +18,8 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any, TypeAlias
 
+from cortex.body import shared_names
 from cortex.compiled import native
-from cortex.encoder import shared_names
 from cortex.layout import (
     DTYPE_CODES,
     DTYPES,

@@ -90,7 +90,6 @@ class Publisher(Generic[T]):
             max_wait_s=max_wait_s,
             expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
         )
-        self._was_large = False
         self._on_close = on_close
         self._closing = False
         self._closed = False
@@ -125,15 +124,9 @@ class Publisher(Generic[T]):
             if not self._fanout.readers and not self.latch:
                 self._gate.sequence += 1
                 return True
-            if self._was_large:  # the next is most likely large, too
-                prepared: Any = self.codec.plan(message)
-                if prepared.size <= self._inline_max:
-                    prepared = self.codec.prepare(message, self._inline_max)
-            else:
-                prepared = self.codec.prepare(message, self._inline_max)
+            prepared: Any = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-            self._was_large = not isinstance(prepared, bytes)
-            if not self._was_large:
+            if isinstance(prepared, bytes):
                 return self._publish_inline(prepared, stamp_ns, now_ns)
         finally:
             self._lock.release()
