@@ -1,4 +1,4 @@
-/* Messages to bodies, as `encoder.py` writes them.
+/* Messages to bodies, as `body.py` writes them.
 
    The same walk is done twice, first to learn the size, then to write. Between the two others may have had the GIL, and
    may have changed a list: so the second checks that all goes where it was measured, and gives up if not. No Python code

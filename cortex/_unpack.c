@@ -1,4 +1,4 @@
-/* Bodies to messages, as `decoder.py` reads them, which also says what is wrong with a body.
+/* Bodies to messages, as `body.py` reads them, which also says what is wrong with a body.
 
    Another process may write to the bytes while they are read, against all rules: so every number is read once. */
 
@@ -11,7 +11,7 @@ typedef struct {
     PyObject *owner; /* of its memory */
     const char *data;
     Py_ssize_t size;
-    Py_ssize_t left; /* bytes that items may still take up, as in `decoder.py` */
+    Py_ssize_t left; /* bytes that items may still take up, as in `body.py` */
     Py_ssize_t values_left;
 } Body;
 

@@ -11,32 +11,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortex.checks import explain
-from cortex.decoder import Decoder, MalformedMessage
+from cortex.body import Body, MalformedMessage
 from cortex.draft import Draft, Drafter
-from cortex.encoder import ENCODE_ERRORS, Encoder, join, write
 from cortex.layout import has_tail, record_dtype
 from cortex.native import make_coder
 from cortex.schema import schema_of
 
-__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of"]
-
-
-_SMALL_BODY_BYTES = 8192
-"""Up to this size a body is written faster by joining its parts first."""
+__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of", "coder_of"]
 
 
 class Plan:
-    """A message, ready to be written."""
+    """A message, ready to be written: its arrays must not change until it is."""
 
-    __slots__ = ("parts", "size")
+    __slots__ = ("_body", "_message", "size")
 
-    def __init__(self, parts: list[Any], size: int) -> None:
-        self.parts = parts
-        self.size = size
+    def __init__(self, body: Body, message: Any) -> None:
+        self._body = body
+        self._message = message
+        self.size = body.write(message, None)
         """Bytes of the body."""
 
-    def write(self, buffer: memoryview | NDArray[np.uint8]) -> int:
+    def write(self, buffer: NDArray[np.uint8]) -> int:
         """Write the body to writable memory, arrays with one copy, and return its size [bytes].
 
         Raises:
@@ -44,11 +39,13 @@ class Plan:
         """
         if self.size > len(buffer):
             raise ValueError(f"a body of {self.size} bytes does not fit into a buffer of {len(buffer)}")
-        if self.size <= _SMALL_BODY_BYTES:
-            memoryview(buffer)[: self.size] = join(self.parts)  # type: ignore[arg-type]  # an array is a buffer
-        else:
-            write(self.parts, buffer if isinstance(buffer, np.ndarray) else np.frombuffer(buffer, np.uint8))
-        return self.size
+        return self._body.write(self._message, buffer)
+
+    def to_bytes(self) -> bytes:
+        """Return the body."""
+        memory = np.empty(self.size, np.uint8)
+        self.write(memory)
+        return memory.tobytes()
 
 
 class Codec:
@@ -58,8 +55,8 @@ class Codec:
         self.type = message_type
         self.schema = schema_of(message_type)
         self.fingerprint = self.schema.fingerprint
-        self._encoder = Encoder(self.schema, message_type)
-        block = self._encoder.block
+        self._body = Body(self.schema, message_type)
+        block = self._body.block
         is_fixed = not has_tail(self.schema)
         self.fixed_size: int | None = block if is_fixed else None
         """Bytes of every body, if they are always the same."""
@@ -70,8 +67,6 @@ class Codec:
         for field in self.schema.fields:
             if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
                 self.stamp_of = attrgetter("stamp_ns")
-        encoder, decoder = self._encoder, Decoder(self.schema, message_type)
-        self._decoder = decoder
         self.encode: Callable[[Any, int], bytes | None] = self._encode
         """Message and limit to the body, or None if it would be larger than `limit` bytes.
 
@@ -79,7 +74,7 @@ class Codec:
             TypeError: A value, or an array's dtype, is not of the field's type.
             ValueError: A value is out of range, or an array has the wrong shape.
         """
-        self.decode: Callable[..., Any] = decoder.decode
+        self.decode: Callable[..., Any] = self._body.read
         """Buffer, offset = 0 and size = None to the message.
 
         The buffer is `bytes` or a read-only array of bytes. The message keeps it: arrays are views of it.
@@ -91,37 +86,27 @@ class Codec:
         if self._coder is not None:
             self.encode = _encode_natively(self._coder.encode, self._encode)
             self.decode = _decode_natively(self._coder.decode, self.decode)
-        self._drafter = Drafter(self.schema, message_type, encoder)
-
-    def plan(self, message: Any) -> Plan:
-        """Lay out a message once, to learn its size and then write it; it raises as `encode` does.
-
-        The plan refers to the arrays of the message, which must not change until it is written.
-        """
-        try:
-            return Plan(*self._encoder.layout(message))
-        except ENCODE_ERRORS as error:
-            raise explain(self.schema, self.type, message, error) from error
+        self._drafter = Drafter(self.schema, message_type, self._body)
 
     def prepare(self, message: Any, limit: int) -> bytes | Plan:
         """Return the body of a message, or its plan if it would be larger than `limit` bytes.
 
-        It raises as `encode` does, and does the work of `encode` and `plan` once.
+        It raises as `encode` does.
         """
         if self._coder is not None:
             body: bytes | None = self._coder.encode(message, limit)
             if body is not None:
                 return body
-        plan = self.plan(message)
-        return plan if plan.size > limit else join(plan.parts)
+        plan = Plan(self._body, message)
+        return plan if plan.size > limit else plan.to_bytes()
 
     def size(self, message: Any) -> int:
         """Return the size of the body [bytes]. It raises as `encode` does."""
-        return self.plan(message).size
+        return self._body.write(message, None)
 
     def _encode(self, message: Any, limit: int) -> bytes | None:
-        plan = self.plan(message)
-        return None if plan.size > limit else join(plan.parts)
+        plan = Plan(self._body, message)
+        return None if plan.size > limit else plan.to_bytes()
 
     def draft_size(
         self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
@@ -199,6 +184,16 @@ def _decode_natively(native: Callable[..., Any], fallback: Callable[..., Any]) -
         return fallback(buffer, offset, size) if message is None else message
 
     return decode
+
+
+def coder_of(codec: Any, head: bytes) -> Any:
+    """Return what packs and reads the messages of one publisher in C; None: Python does.
+
+    Args:
+        codec: Of its type.
+        head: The first 24 bytes of its plain frames.
+    """
+    return make_coder(codec.schema, codec.type, head) if isinstance(codec, Codec) else None
 
 
 _lock = threading.Lock()

@@ -9,17 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortex.checks import explain
-from cortex.encoder import ENCODE_ERRORS, Encoder, Tail, shared_names, write
-from cortex.layout import (
-    DTYPE_CODES,
-    DTYPES,
-    LARGE_ARRAY_BYTES,
-    array_dtype,
-    measure_fields,
-)
+from cortex.body import Body, Writer, check_shape
+from cortex.layout import DTYPE_CODES, DTYPES, alignment_of, array_dtype
 from cortex.schema import ArrayType, FieldType, ListType, OptionalType, Schema
-from cortex.structure import new_message
 
 _PLACED_MAX = 64
 """Sizes of drafts whose places are kept."""
@@ -75,22 +67,19 @@ _UNSET: Any = object()
 class Drafter:
     """Makes and finishes the drafts of one type."""
 
-    def __init__(self, schema: Schema, cls: type, encoder: Encoder) -> None:
+    def __init__(self, schema: Schema, cls: type, body: Body) -> None:
         self._schema = schema
-        self._cls = cls
-        self._encoder = encoder
+        self._body = body
         self._names = tuple(field.name for field in schema.fields)
-        self._shared = shared_names([field.type for field in schema.fields])
-        offsets = measure_fields(schema)[0]
         arrays = [
-            (field.name, field.type, offset)
-            for field, offset in zip(schema.fields, offsets, strict=True)
+            (field.name, field.type, field.offset)
+            for field in body.fields.of[cls]
             if isinstance(field.type, ArrayType)
         ]
+        self._fields = body.fields.of[cls]
         self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
         self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
         self._defaults = {field.name: field for field in dataclasses.fields(cls)}
-        self._kinds = dict(self._variable)
         self._placed: dict[tuple[Any, ...], tuple[dict[str, _Place], int]] = {}
 
     def size(self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None) -> int:
@@ -105,6 +94,7 @@ class Drafter:
         places, end = self._places_of(dims, dtypes)
         if end > len(buffer):
             raise ValueError(f"{self._schema.name}: draft of {end} bytes, the buffer has {len(buffer)}")
+        buffer[: self._body.block] = 0
         draft = Draft(buffer, self._names, places)
         views = draft._Draft__views
         for name, kind, offset in self._fixed:
@@ -116,24 +106,15 @@ class Drafter:
     def finish(self, draft: Draft) -> int:
         """Write what is not yet in its place and return the size of the body; the views become read-only."""
         buffer, places = draft._Draft__buffer, draft._Draft__places
-        views = draft._Draft__views
         self._set_defaults(draft)
-        values = draft._Draft__values
-        message: Any = new_message(
-            self._cls, [views[name] if name in views else values[name] for name in self._names]
-        )
-        try:
-            parts, end = self._layout(message, places)
-        except ENCODE_ERRORS as error:
-            raise explain(self._schema, self._cls, message, error) from error
+        end = self._write(draft, None)
         if end > len(buffer):
             raise ValueError(
                 f"{self._schema.name}: the fields {self._unplaced(places)} need {end - len(buffer)} bytes "
                 f"more than the {RESERVE_BYTES} in reserve; give the dimensions of arrays to the loan, or "
                 "publish the message without one"
             )
-        in_place = {id(view) for view in views.values()}
-        write([part.nbytes if id(part) in in_place else part for part in parts], buffer)
+        self._write(draft, buffer)
         self.seal(draft)
         return end
 
@@ -155,23 +136,22 @@ class Drafter:
         for view in draft._Draft__views.values():
             view.flags.writeable = False
 
-    def _layout(self, message: Any, places: dict[str, _Place]) -> tuple[list[Any], int]:
-        values: list[Any] = []
-        tail = Tail(self._encoder.block)
+    def _write(self, draft: Draft, memory: NDArray[np.uint8] | None) -> int:
+        """Write all but the views, and say where those in the tail lie; return the size of the body."""
+        places, values, views = draft._Draft__places, draft._Draft__values, draft._Draft__views
+        writer = Writer(self._body.fields, self._body.block, memory)
         for place in places.values():
-            _reserve(tail, place.shape, place.dtype)
-        scope: dict[str, int] = {}
-        for name, put in zip(self._names, self._encoder.put_fields, strict=True):
-            if name not in places:
-                put(getattr(message, name), values, tail, scope)
-                continue
-            place = places[name]
-            kind = self._kinds[name]
-            for size, dimension in zip(place.shape, kind.shape, strict=True):
-                if dimension in self._shared and scope.setdefault(str(dimension), size) != size:
-                    raise ValueError
-            values += (place.offset, len(place.shape) << 8 | DTYPES.index(place.dtype), *place.shape)
-        return self._encoder.finish(values, tail), tail.end
+            _reserve(writer, place.shape, place.dtype)
+        sizes: dict[str, int] = {}
+        for name, kind, bound, offset in self._fields:
+            where = f"{self._schema.name}.{name}"
+            if name in places:
+                place = places[name]
+                check_shape(kind, place.shape, where, sizes)  # type: ignore[arg-type]  # an array's
+                writer.describe(place.dtype, place.shape, place.offset, offset)
+            elif name not in views:
+                writer.put(kind, bound, values[name], offset, where, sizes)
+        return writer.end
 
     def _set_defaults(self, draft: Draft) -> None:
         views, values = draft._Draft__views, draft._Draft__values
@@ -199,18 +179,18 @@ class Drafter:
         except TypeError:  # not to be hashed, so no dtype: `_place` says so
             key, found = (), None
         if found is None:
-            places, tail = self._place(dims, dtypes)
+            found = self._place(dims, dtypes)
             if len(self._placed) >= _PLACED_MAX:
                 self._placed.clear()
-            found = self._placed[key] = places, tail.end
+            self._placed[key] = found
         return found
 
     def _place(
         self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
-    ) -> tuple[dict[str, _Place], Tail]:
+    ) -> tuple[dict[str, _Place], int]:
         dims, dtypes = dims or {}, dtypes or {}
         self._check_arguments(dims, dtypes)
-        tail = Tail(self._encoder.block)
+        writer = Writer(self._body.fields, self._body.block, None)
         places = {}
         for name, kind in self._variable:
             shape = [dims.get(size) if isinstance(size, str) else size for size in kind.shape]
@@ -218,8 +198,8 @@ class Drafter:
             if dtype is None or None in shape:
                 continue
             known = tuple(int(size) for size in shape if size is not None)
-            places[name] = _Place(_reserve(tail, known, np.dtype(dtype)), known, np.dtype(dtype))
-        return places, tail
+            places[name] = _Place(_reserve(writer, known, np.dtype(dtype)), known, np.dtype(dtype))
+        return places, writer.end
 
     def _check_arguments(self, dims: Mapping[str, int], dtypes: Mapping[str, Any]) -> None:
         names = {size for _, kind in self._variable for size in kind.shape if isinstance(size, str)}
@@ -254,9 +234,9 @@ def _is_same(view: NDArray[Any], value: Any) -> bool:
     )
 
 
-def _reserve(tail: Tail, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+def _reserve(writer: Writer, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
     """Keep room in the tail for an array that is written in place, and return its offset."""
     size = dtype.itemsize
     for dimension in shape:
         size *= dimension
-    return tail.add(size, size, 63 if size >= LARGE_ARRAY_BYTES else 7) if size else 0
+    return writer.reserve(size, alignment_of(size)) if size else 0

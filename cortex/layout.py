@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -56,6 +53,11 @@ DTYPE_CODES = {name: code for code, name in enumerate(DTYPE_NAMES)}
 def align(position: int, alignment: int) -> int:
     """Return the next multiple of `alignment` from `position` on."""
     return -(-position // alignment) * alignment
+
+
+def alignment_of(size: int) -> int:
+    """Return how an array of so many bytes is aligned in the tail."""
+    return LARGE_ALIGNMENT if size >= LARGE_ARRAY_BYTES else ITEM_ALIGNMENT
 
 
 def array_dtype(kind: ArrayType) -> np.dtype[Any]:
@@ -121,74 +123,6 @@ def values_of(kind: FieldType) -> int:
     if isinstance(kind, Schema):
         return 1 + sum(values_of(field.type) for field in kind.fields)
     return 1
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """One number, or one fixed array, of a block."""
-
-    offset: int
-    code: str
-    """Code of the struct module; empty for a fixed array."""
-    size: int
-    """Bytes."""
-
-
-def leaves(kind: FieldType, offset: int = 0) -> Iterator[Leaf]:
-    """Yield what a type at `offset` of a block consists of, in order."""
-    if isinstance(kind, str) and kind in SCALAR_CODES:
-        yield Leaf(offset, SCALAR_CODES[kind], SCALAR_SIZES[kind])
-    elif isinstance(kind, EnumType):
-        yield Leaf(offset, "i", 4)
-    elif isinstance(kind, ArrayType) and kind.is_fixed:
-        yield Leaf(offset, "", fixed_bytes(kind))
-    elif isinstance(kind, OptionalType):
-        yield Leaf(offset, "B", 1)
-        yield from leaves(kind.item, offset + measure(kind)[1])
-    elif isinstance(kind, Schema):
-        for field, field_offset in zip(kind.fields, measure_fields(kind)[0], strict=True):
-            yield from leaves(field.type, offset + field_offset)
-    else:  # str, bytes, list, array of variable size: a descriptor of 32-bit numbers
-        for position in range(offset, offset + measure(kind)[0], 4):
-            yield Leaf(position, "I", 4)
-
-
-def reading_struct(kind: FieldType, size: int) -> struct.Struct:
-    """Return the struct that unpacks all numbers of a block and skips its fixed arrays."""
-    return struct.Struct(_format([leaf for leaf in leaves(kind) if leaf.code], 0, size))
-
-
-def writing_structs(kind: FieldType, size: int) -> list[tuple[struct.Struct, int]]:
-    """Return how to write a block of `size` bytes.
-
-    Returns:
-        Structs, each with the number of values that it packs. Between two of them lies one large fixed array,
-        as a value of its own; smaller fixed arrays are packed as bytes.
-    """
-    result = []
-    pending: list[Leaf] = []
-    start = 0
-    for leaf in leaves(kind):
-        if not leaf.code and leaf.size >= LARGE_ARRAY_BYTES:
-            result.append((struct.Struct(_format(pending, start, leaf.offset)), len(pending)))
-            pending, start = [], leaf.offset + leaf.size
-        else:
-            pending.append(leaf)
-    result.append((struct.Struct(_format(pending, start, size)), len(pending)))
-    return result
-
-
-def _format(parts: list[Leaf], start: int, end: int) -> str:
-    codes = ["<"]
-    position = start
-    for leaf in parts:
-        if leaf.offset > position:
-            codes.append(f"{leaf.offset - position}x")
-        codes.append(leaf.code or f"{leaf.size}s")
-        position = leaf.offset + leaf.size
-    if end > position:
-        codes.append(f"{end - position}x")
-    return "".join(codes)
 
 
 def has_tail(kind: FieldType) -> bool:

@@ -13,13 +13,12 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from cortex.codec import Codec
+from cortex.codec import Codec, coder_of
 from cortex.context import Closed
 from cortex.fanout import Fanout
-from cortex.gate import Gate, LongGate, make_gate
+from cortex.gate import Gate, make_gate
 from cortex.loan import Loan
 from cortex.outlet import Backoff, Outlets
-from cortex.packer import coder_of
 from cortex.patience import Patience
 from cortex.stats import PublisherCounters
 from cortex.wire import MESSAGE, REST, message_head
@@ -90,7 +89,6 @@ class Publisher(Generic[T]):
             max_wait_s=max_wait_s,
             expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
         )
-        self._was_large = False
         self._on_close = on_close
         self._closing = False
         self._closed = False
@@ -125,15 +123,9 @@ class Publisher(Generic[T]):
             if not self._fanout.readers and not self.latch:
                 self._gate.sequence += 1
                 return True
-            if self._was_large:  # the next is most likely large, too
-                prepared: Any = self.codec.plan(message)
-                if prepared.size <= self._inline_max:
-                    prepared = self.codec.prepare(message, self._inline_max)
-            else:
-                prepared = self.codec.prepare(message, self._inline_max)
+            prepared: Any = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-            self._was_large = not isinstance(prepared, bytes)
-            if not self._was_large:
+            if isinstance(prepared, bytes):
                 return self._publish_inline(prepared, stamp_ns, now_ns)
         finally:
             self._lock.release()
@@ -350,7 +342,7 @@ class Publisher(Generic[T]):
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old ones may have been held at the fork
         self._large_lock = threading.Lock()
-        self._gate = LongGate(self._publish_slowly)
+        self._gate = Gate(self._publish_slowly)
         self._patience.is_waiting = False  # who was held up at the fork is not here
         self._closing = self._closed = True
 

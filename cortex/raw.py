@@ -49,10 +49,6 @@ class RawCodec:
             raise ValueError(f"a body has at most {BODY_LIMIT} bytes, got {size}")
         return bytes(message.body) if size <= limit else RawPlan(message.body, size)
 
-    def plan(self, message: RawMessage) -> RawPlan:
-        """What writes the body."""
-        return RawPlan(message.body, len(message.body))
-
     def draft_size(
         self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
     ) -> NoReturn:

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from cpp_client import Peer
 from cpp_messages import Picture, Rich, Scan
+from wire_vectors import load_vectors
 
 from cortex.cppgen import generate
 from cortex.registry import ensure_registry
 from cortex.schema import Schema
-from cortex.vectors import load_vectors
 
 CPP = Path(__file__).parents[2] / "cortex" / "cpp"
 PATIENCE_S = 900.0

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from cortex import Array, MalformedMessage, Node, TypeMismatch, message, reliable
+from cortex.body import Body
 from cortex.codec import codec_of
-from cortex.decoder import Decoder
-from cortex.encoder import Encoder, join
 from cortex.layout import VALUES_MAX
 from cortex.schema import Schema, SchemaError, schema_of, type_from_schema
 
@@ -50,7 +49,7 @@ def _body(count: int) -> bytes:
 def test_lists_of_a_body_become_a_bounded_number_of_objects(in_python):
     """Each element is a message with one field: 16 MB would become 32 million objects."""
     schema = schema_of(Cells)
-    decode = Decoder(schema, Cells).decode if in_python else codec_of(Cells).decode
+    decode = Body(schema, Cells).read if in_python else codec_of(Cells).decode
     assert len(decode(_body(VALUES_MAX // 2)).cells) == VALUES_MAX // 2
     tracemalloc.start()
     try:
@@ -64,8 +63,8 @@ def test_lists_of_a_body_become_a_bounded_number_of_objects(in_python):
 def test_what_no_reader_would_take_is_not_written():
     with pytest.raises(ValueError, match="more than 1048576 values; send large ones as arrays"):
         codec_of(Numbers).encode(Numbers([0] * (VALUES_MAX + 1)), 1 << 30)
-    encoder = Encoder(schema_of(Numbers), Numbers)
-    assert len(join(encoder.layout(Numbers([0] * VALUES_MAX))[0])) == 8 + 8 * VALUES_MAX
+    largest = Numbers([0] * VALUES_MAX)
+    assert len(codec_of(Numbers).encode(largest, 1 << 30)) == 8 + 8 * VALUES_MAX
 
 
 def _text(types: list[object]) -> str:

@@ -27,6 +27,7 @@ from cpp_client import (
 from cpp_messages import OtherScan, Picture, Rich, Scan
 from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
+from wire_vectors import load_vectors
 
 from cortex import wire
 from cortex.codec import codec_of
@@ -34,7 +35,6 @@ from cortex.node import Node
 from cortex.policy import keep_last, reliable
 from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
-from cortex.vectors import load_vectors
 
 MUTATIONS = 3000
 CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}

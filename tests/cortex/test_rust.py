@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block
 from processes import ROOT, SOON_S
+from wire_vectors import message_to_plain
 
 from cortex import Node, keep_last, reliable
 from cortex.registry import ensure_registry
 from cortex.schema import schema_of
-from cortex.vectors import message_to_plain
 
 CRATE = ROOT / "cortex" / "examples" / "rust"
 TARGET = ROOT / "build" / "rust"

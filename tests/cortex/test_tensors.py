@@ -33,7 +33,7 @@ def test_tensors_are_encoded_as_arrays(dtype):
     body = codec.encode(picture(tensor), 1000)
     assert body == codec.encode(picture(tensor.numpy(), np.ones(3, np.float32)), 1000)
     memory = np.zeros(1000, np.uint8)
-    assert memory[: codec.plan(picture(tensor)).write(memory)].tobytes() == body
+    assert memory[: codec.prepare(picture(tensor), 0).write(memory)].tobytes() == body
     assert codec.size(picture(tensor)) == len(body)
 
 

@@ -1,21 +1,4 @@
-"""Test vectors of the wire format: schemas, bodies with their values, frames, and malformed ones.
-
-Each JSON file but two holds one type:
-
-- `schema`: the canonical text; `fingerprint`: 16 hexadecimal digits of the u64;
-- `fixed_size`: bytes of every body, or null;
-- `cases`: `name`, `value` and `body` (hexadecimal). An encoder that lays out the tail in the order of the
-  fields, a list's elements before what hangs on them, writes exactly these bytes;
-- `malformed`: `name` and `body`, all of which a decoder must reject.
-
-Values are JSON: integers in full; floats as numbers or "nan", "inf", "-inf"; bytes in hexadecimal; enums by
-name; null for an absent optional; messages as objects; arrays as `{"dtype", "shape", "items"}` with the
-little-endian items in hexadecimal.
-
-`types.json` lists names, schemas and fingerprints of the standard and the control messages, `frames.json`
-frames and what is in them (see `wire_frames.py`).
-`python -m cortex.vectors` writes all of them anew.
-"""
+"""Reads the test vectors of `cortex/vectors`, as WIRE.md, section 11, describes them."""
 
 from __future__ import annotations
 
@@ -26,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+import cortex
 from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema, type_from_schema
 
-DIRECTORY = Path(__file__).parent
+DIRECTORY = Path(cortex.__file__).parent / "vectors"
 
 
 def load_vectors() -> dict[str, dict[str, Any]]:
