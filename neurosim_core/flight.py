@@ -7,6 +7,7 @@ import functools
 import importlib
 import importlib.util
 import itertools
+import math
 import shutil
 import sys
 import tempfile
@@ -289,7 +290,7 @@ class _Files:
         self._model, self._folder, self._console = model, folder, console
         self._recording: RecordingWriter | None = None
         self._rerun: RerunLogger | None = None
-        self._checked_s = time.monotonic()
+        self._checked_s = -math.inf  # so before the first packet is in flight.h5
         header = header_of(model)
         if _has("h5py", console, "flight.h5"):
             self._recording = RecordingWriter(folder / "flight.h5", header)
