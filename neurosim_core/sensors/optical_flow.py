@@ -404,8 +404,8 @@ class FlowProcess:
         lens_rows = list(context.lens_of_world)
         model.lens_of_world = wp.array(lens_rows, dtype=int, device=device)
         view_count = len(lens_rows) * context.stride
-        for name, kind in (("R_TC", wp.mat33d), ("p_TC", wp.vec3d), ("p_CT", wp.vec3), ("clearance", float)):
-            setattr(model, name, wp.zeros(view_count, dtype=kind, device=device))
+        for name, dtype in (("R_TC", wp.mat33d), ("p_TC", wp.vec3d), ("p_CT", wp.vec3), ("clearance", float)):
+            setattr(model, name, wp.zeros(view_count, dtype=dtype, device=device))
         mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
         model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
         model.scene_of_world = context.scene_of_world
