@@ -21,7 +21,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 
 from cortex import messages
-from cortex.evt3 import EVT3_SIZE_MAX, EventCodecError, EventColumns, Evt3Decoder
+from cortex.evt3 import EVT3_SIZE_MAX, EventCodecError
 from cortex.schema import schema_of
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.bag import BagBackend, BagPublisher
@@ -29,10 +29,10 @@ from cortex_ros2_bridge.backend.base import BackendError, Buffer
 from cortex_ros2_bridge.config import BridgeConfig
 from cortex_ros2_bridge.convert import RULES, Context, ConvertError
 from cortex_ros2_bridge.convert.camera import pixel_type
+from cortex_ros2_bridge.convert.commands import xyz
 from cortex_ros2_bridge.convert.records import stamp_ns_of
 from cortex_ros2_bridge.convert.registry import Rule
-from cortex_ros2_bridge.event_codec import decode_mono, read_dvs
-from cortex_ros2_bridge.frames import rotate
+from cortex_ros2_bridge.event_codec import read_dvs
 from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, rule_of, vehicle_of
 from cortex_ros2_bridge.typestore import typestore
 
@@ -146,7 +146,8 @@ class BagReader:
             raise BagError(f"{path} is not a readable bag: {error}") from None
         self._closed = False
         of_commands = [each for each in self._reader.connections if _rules_of(each)]
-        self._connections = [each for each in self._reader.connections if each.msgtype in _DECODERS]
+        readable = _DECODERS.keys() | _OF_ROBOTS.keys()
+        self._connections = [each for each in self._reader.connections if each.msgtype in readable]
         drawn = {f"{each.topic}/image" for each in self._connections if each.msgtype in EVENT_TYPES}
         self._connections = [each for each in self._connections if each.topic not in drawn]
         self.topics = {each.topic: each.msgtype for each in self._connections}
@@ -176,15 +177,16 @@ class BagReader:
         if self._ros1 and connection.msgtype == _EVENT_ARRAY:
             return lambda data: _event_array(data, ros1=True)
         if connection.msgtype in _DECODERS:
-            return _DECODERS[connection.msgtype]()
-        rules = _rules_of(connection)
+            return _DECODERS[connection.msgtype]
+        of_robot = _OF_ROBOTS.get(connection.msgtype)
+        rules = _rules_of(connection) if of_robot is None else [of_robot]
         context = Context(vehicle=vehicle_of(connection.topic), max_thrust_n=self._max_thrust_n)
 
         def decode(data: Buffer) -> Any:
             made = (rule.convert(data, context) for rule in rules)
-            command = next((each for each in made if each is not None), None)
+            message = next((each for each in made if each is not None), None)
             context.sequence += 1
-            return command
+            return message
 
         return decode
 
@@ -207,7 +209,7 @@ class BagReader:
 def _rules_of(connection: Connection) -> list[Rule]:
     """Return the rules by which the messages of a topic are commands."""
     kind, topic = connection.msgtype, connection.topic
-    commands = [rule for rule in RULES if rule.direction == "in" and rule.ros_type == kind]
+    commands = [rule for rule in RULES if rule[1:3] == (kind, "in") and not rule.robot]
     return [rule for rule in commands if topic.endswith(rule.name.removeprefix("{base}"))]
 
 
@@ -229,90 +231,28 @@ def _imu(data: Buffer) -> messages.Imu:
     made = cdr.decode_record(data, "sensor_msgs/msg/Imu")
     return messages.Imu(
         stamp_ns=stamp_ns_of(made.header.stamp),
-        specific_force=_vector(made.linear_acceleration),
-        angular_rate=_vector(made.angular_velocity),
+        specific_force=xyz(made.linear_acceleration),
+        angular_rate=xyz(made.angular_velocity),
     )
-
-
-def _odometry(data: Buffer) -> messages.Odometry:
-    made = cdr.decode_record(data, "nav_msgs/msg/Odometry")
-    pose, twist = made.pose.pose, made.twist.twist
-    orientation = np.array([*_vector(pose.orientation), pose.orientation.w])
-    return messages.Odometry(
-        stamp_ns=stamp_ns_of(made.header.stamp),
-        position=_vector(pose.position),
-        orientation=orientation,
-        velocity=rotate(orientation, _vector(twist.linear)),
-        body_rate=_vector(twist.angular),
-    )
-
-
-class _PacketDecoder:
-    """Decodes the packets of one event camera, in their order.
-
-    Time in evt3 has 24 bits. Where packets are stamped with the time of their first event, as ours are, the
-    stamp says the rest; the stamps of drivers are of another clock, so there wraps are counted.
-    """
-
-    def __init__(self) -> None:
-        self._decoder: Evt3Decoder | None = None
-        self._is_stamped = True
-
-    def __call__(self, data: Buffer) -> messages.Events:
-        made = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
-        stamp_us = stamp_ns_of(made.header.stamp) // 1000
-        if made.encoding == "mono":
-            columns = decode_mono(made.events, base_ns=made.time_base)
-            columns = columns._replace(t=columns.t // 1000)
-        elif made.encoding == "evt3":
-            columns = self._decode_evt3(made, stamp_us)
-        else:
-            raise BagError(f"events are encoded as {made.encoding!r}, known: evt3, mono")
-        return _events(columns, stamp_us, (made.width, made.height))
-
-    def _decode_evt3(self, made: Any, stamp_us: int) -> EventColumns:
-        size = {"width": made.width, "height": made.height}
-        if self._is_stamped:
-            columns = Evt3Decoder(start_us=stamp_us).decode(made.events, **size)
-            if not len(columns.t) or int(columns.t[0]) == stamp_us:
-                return columns
-            self._is_stamped = False
-        if self._decoder is None:
-            self._decoder = Evt3Decoder()
-        return self._decoder.decode(made.events, **size)
 
 
 def _event_array(data: Buffer, *, ros1: bool = False) -> messages.Events:
     size, columns = read_dvs(data, ros1=ros1)
-    stamp_us = int(columns.t[0]) if len(columns.t) else 0
-    return _events(columns, stamp_us, size)
-
-
-def _events(columns: EventColumns, stamp_us: int, size: tuple[int, int]) -> messages.Events:
-    end_us = int(columns.t[-1]) if len(columns.t) else stamp_us
     return messages.Events(
-        stamp_ns=end_us * 1000,
-        start_ns=stamp_us * 1000,
+        stamp_ns=1000 * int(columns.t[-1]) if len(columns.t) else 0,
+        start_ns=1000 * int(columns.t[0]) if len(columns.t) else 0,
+        **columns._asdict(),
         width=size[0],
         height=size[1],
-        t=columns.t,
-        x=columns.x,
-        y=columns.y,
-        polarity=columns.polarity,
     )
-
-
-def _vector(made: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return np.array([made.x, made.y, made.z])
 
 
 _EVENT_ARRAY = "dvs_msgs/msg/EventArray"
 EVENT_TYPES = frozenset({"event_camera_msgs/msg/EventPacket", _EVENT_ARRAY})
-_DECODERS: dict[str, Callable[[], Callable[[Buffer], Any]]] = {
-    "event_camera_msgs/msg/EventPacket": _PacketDecoder,
-    _EVENT_ARRAY: lambda: _event_array,
-    "sensor_msgs/msg/Image": lambda: _image,
-    "sensor_msgs/msg/Imu": lambda: _imu,
-    "nav_msgs/msg/Odometry": lambda: _odometry,
+_DECODERS: dict[str, Callable[[Buffer], Any]] = {
+    _EVENT_ARRAY: _event_array,
+    "sensor_msgs/msg/Image": _image,
+    "sensor_msgs/msg/Imu": _imu,
 }
-"""What makes the decoder of a topic, by its type in ROS."""
+"""What no rule of the bridge takes in."""
+_OF_ROBOTS = {rule.ros_type: rule for rule in RULES if rule.robot and rule.direction == "in"}

@@ -54,17 +54,12 @@ _EXAMPLES = """examples:
   cortex-ros2-bridge --list                            what would go where
   cortex-ros2-bridge --print-config > bridge.yaml      settings to edit, for --config bridge.yaml
   cortex-ros2-bridge --backend run.mcap                into a bag, until Ctrl-C
-  cortex-ros2-bridge bench                             how fast it is on this machine
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if arguments[:1] == ["bench"]:
-        from cortex_ros2_bridge import bench
-
-        return bench.main(arguments[1:])
     try:
         arguments, ros = split(arguments)
         options = _parser().parse_args(arguments)

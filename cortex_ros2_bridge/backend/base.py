@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
 Buffer = bytes | bytearray | memoryview
@@ -23,16 +23,21 @@ class Qos:
         if self.depth < 1:
             raise ValueError(f"depth must be >= 1, got {self.depth}")
 
+    def seen(self) -> Qos:
+        """Return what discovery tells of it: all but the depth."""
+        return replace(self, depth=Qos.depth)
+
 
 class TopicInfo(NamedTuple):
-    """A topic that is seen on the ROS 2 side."""
+    """A topic that other nodes have."""
 
     topic: str
     """Such as "/drone/imu"."""
     type_name: str
     """Such as "sensor_msgs/msg/Imu"."""
-    publisher_count: int
-    subscriber_count: int
+    publishers: tuple[Qos, ...] = ()
+    """As discovery tells it of each one, see `Qos.seen`."""
+    subscribers: tuple[Qos, ...] = ()
 
 
 Serve = Callable[[Any, Any], Any]
@@ -138,15 +143,6 @@ class Backend(Protocol):
 
 class BackendError(RuntimeError):
     """ROS 2 cannot be reached, or refused a message."""
-
-
-def why_apart(writer: Qos, reader: Qos) -> str:
-    """Return why two endpoints of a topic do not meet; empty if they do."""
-    if reader.reliability == "reliable" and writer.reliability != "reliable":
-        return "its subscriber wants it reliable, its publisher is not"
-    if reader.durability == "transient_local" and writer.durability != "transient_local":
-        return "its subscriber wants it transient local, its publisher is volatile"
-    return ""
 
 
 def check_message(message: Buffer, topic: str) -> None:

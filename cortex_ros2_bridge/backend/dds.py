@@ -10,8 +10,9 @@ import logging
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from cyclonedds.core import DDSException, GuardCondition
 from cyclonedds.domain import Domain, DomainParticipant
@@ -53,40 +54,31 @@ _CLOSE_S = 5.0
 _CLIENT_S = 0.1
 """Longest wait for a client whose request was faster than the discovery of its ear for the reply."""
 _CLIENT_BYTES = 16
+_Kind = TypeVar("_Kind", bound="_Part")
 
-_Part = TypeVar("_Part")
-
-
-class _Domains:
-    """Domains of this process, with our configuration; each ends with its last user."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._domains: dict[int, Any] = {}
-        self._users: dict[int, int] = {}
-
-    def enter(self, number: int, config: str) -> None:
-        with self._lock:
-            if number not in self._domains:
-                try:
-                    self._domains[number] = Domain(number, config)
-                except DDSException as error:
-                    if error.code != DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
-                        raise BackendError(
-                            f"DDS domain {number} cannot be joined: {error} "
-                            f"(CYCLONEDDS_URI is {os.environ.get('CYCLONEDDS_URI')!r})"
-                        ) from error
-                    self._domains[number] = None  # another library of this process is there already
-            self._users[number] = self._users.get(number, 0) + 1
-
-    def leave(self, number: int) -> None:
-        with self._lock:
-            self._users[number] -= 1
-            if not self._users[number]:
-                del self._users[number], self._domains[number]
+_made: dict[int, weakref.ref[Any]] = {}
+_made_lock = threading.Lock()
 
 
-_domains = _Domains()
+def _domain(number: int, config: str) -> Any:
+    """Return a domain of this process, with our configuration; it ends with its last user.
+
+    None, if another library of this process has it already.
+    """
+    with _made_lock:
+        domain = _made[number]() if number in _made else None
+        if domain is None:
+            try:
+                domain = Domain(number, config)
+            except DDSException as error:
+                if error.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
+                    return None
+                uri = os.environ.get("CYCLONEDDS_URI")
+                raise BackendError(
+                    f"DDS domain {number} cannot be joined: {error} (CYCLONEDDS_URI is {uri!r})"
+                ) from error
+            _made[number] = weakref.ref(domain)
+        return domain
 
 
 class DdsBackend:
@@ -107,110 +99,112 @@ class DdsBackend:
         node_name, namespace = check_node_name(node_name, namespace)
         known = chosen_distro(distro)
         self.distro = known or DEFAULT_DISTRO
-        self._domain = domain_id(domain)
+        number = domain_id(domain)
         self._lock = threading.Lock()
-        self._parts: dict[Any, None] = {}
-        _domains.enter(self._domain, cyclone_config(known))
+        self._parts: dict[_Part, None] = {}
+        self._domain = _domain(number, cyclone_config(known))
         try:
             with ENTITIES:
-                self._participant: Any = DomainParticipant(
-                    self._domain, DdsQos(Policy.Userdata(ENCLAVE), Policy.EntityName(PARTICIPANT_NAME))
+                self.participant: Any = DomainParticipant(
+                    number, DdsQos(Policy.Userdata(ENCLAVE), Policy.EntityName(PARTICIPANT_NAME))
                 )
-            self._graph = Graph(self._participant, node_name=node_name, namespace=namespace, distro=known)
+            self.graph = Graph(self.participant, node_name=node_name, namespace=namespace, distro=known)
         except (DDSException, Refused) as error:
-            self._participant = None
-            _domains.leave(self._domain)
-            raise BackendError(f"DDS does not start in domain {self._domain}: {error}") from error
+            raise BackendError(f"DDS does not start in domain {number}: {error}") from error
 
     @property
     def layout(self) -> str | None:
         """Distribution as which the node is announced; None as long as it is not, because nobody is there."""
-        return self._graph.layout
+        return self.graph.layout
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> DdsPublisher:
         """Publish on a topic."""
         check_name(topic)
-        with self._lock:
-            return self._keep(DdsPublisher(self._site(), topic, type_name, qos))
+        return self._keep(lambda: DdsPublisher(self, topic, type_name, qos))
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> DdsSubscription:
         """Subscribe to a topic."""
         check_name(topic)
-        with self._lock:
-            return self._keep(DdsSubscription(self._site(), topic, type_name, qos, callback))
+        return self._keep(lambda: DdsSubscription(self, topic, type_name, qos, callback))
 
     def service(self, name: str, type_name: str, callback: Serve) -> DdsService:
         """Answer requests of nodes that use Cyclone DDS too; services of other implementations differ."""
         check_name(name)
-        with self._lock:
-            return self._keep(DdsService(self._site(), name, type_name, callback))
+        return self._keep(lambda: DdsService(self, name, type_name, callback))
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
-        return self._graph.topics()
+        return self.graph.topics()
 
     def close(self) -> None:
         """Leave the domain."""
         with self._lock:
-            if self._participant is None:
+            if self.participant is None:
                 return
             parts, self._parts = list(self._parts), {}
-            self._participant = None
+            self.participant = None
         for part in parts:
             part.close()
-        self._graph.close()
-        _domains.leave(self._domain)
+        self.graph.close()
+        self._domain = None
 
-    def _site(self) -> _Site:
-        if self._participant is None:
-            raise BackendError("this node is closed")
-        return _Site(self._participant, self._graph, self.distro, self._forget)
-
-    def _keep(self, part: _Part) -> _Part:
-        self._parts[part] = None
-        return part
-
-    def _forget(self, part: Any) -> None:
+    def forget(self, part: _Part) -> None:
+        """Take note that a part is closed."""
         with self._lock:
             self._parts.pop(part, None)
 
+    def _keep(self, make: Callable[[], _Kind]) -> _Kind:
+        with self._lock:
+            if self.participant is None:
+                raise BackendError("this node is closed")
+            part = make()
+            self._parts[part] = None
+            return part
 
-class _Site(NamedTuple):
-    """Where publishers and subscriptions are made."""
 
-    participant: Any
-    graph: Graph
-    distro: str
-    forget: Callable[[Any], None]
+class _Part:
+    """A publisher, a subscription or a service: entities of DDS, until it is closed."""
 
-    def writer(self, topic: str, kind: Any, qos: Qos, user_data: bytes) -> Any:
-        return self._announced("writer", DataWriter, topic, kind, qos, user_data)
+    _writer: Any = None
+    _reader: Any = None
+    _receiver: _Receiver | None = None
 
-    def reader(self, topic: str, kind: Any, qos: Qos, user_data: bytes) -> Any:
-        return self._announced("reader", DataReader, topic, kind, qos, user_data)
+    def __init__(self, backend: DdsBackend) -> None:
+        self._backend = backend
 
-    def _announced(
-        self, role: Kind, make: Callable[..., Any], topic: str, kind: Any, qos: Qos, user_data: bytes
-    ) -> Any:
-        own = Endpoint(
-            role,
-            self.participant.guid.bytes,
-            topic,
-            kind.__idl_typename__.replace(".", "::"),
-            user_data,
-            qos,
-        )
+    def close(self) -> None:
+        """Withdraw it; no callback is called any more once this returns."""
+        guids = [entity.guid.bytes for entity in (self._writer, self._reader) if entity is not None]
+        if not guids:
+            return
+        if self._receiver is not None:
+            self._receiver.close()
+        for guid in guids:
+            self._backend.graph.remove(guid)
+        with ENTITIES:
+            self._writer = self._reader = None
+        self._backend.forget(self)
+
+    def _make(self, role: Kind, topic: str, kind: Any, qos: Qos, user_data: bytes) -> Any:
+        """Make a writer or a reader, and announce it."""
+        participant = self._backend.participant
+        type_name = kind.__idl_typename__.replace(".", "::")
+        own = Endpoint(role, participant.guid.bytes, topic, type_name, user_data, qos)
+        make = DataWriter if role == "writer" else DataReader
         try:
             with ENTITIES:
-                entity = make(
-                    self.participant, Topic(self.participant, topic, kind), _dds_qos(qos, user_data)
-                )
-            self.graph.add(entity.guid.bytes, own)
+                entity = make(participant, Topic(participant, topic, kind), _dds_qos(qos, user_data))
+            self._backend.graph.add(entity.guid.bytes, own)
         except (DDSException, Refused) as error:
             raise BackendError(f"the {role} of {topic} cannot be made: {error}") from error
         return entity
+
+    def _make_of_topic(self, role: Kind, topic: str, type_name: str, qos: Qos) -> Any:
+        distro = self._backend.distro
+        kind, user_data = idl_struct(type_name, distro), user_data_of_type(type_name, distro)
+        return self._make(role, TOPIC_PREFIX + topic, kind, qos, user_data)
 
 
 def _dds_qos(qos: Qos, user_data: bytes) -> DdsQos:
@@ -229,15 +223,13 @@ def _dds_qos(qos: Qos, user_data: bytes) -> DdsQos:
     )
 
 
-class DdsPublisher:
+class DdsPublisher(_Part):
     """Publishes on one topic."""
 
-    def __init__(self, site: _Site, topic: str, type_name: str, qos: Qos) -> None:
-        self._site = site
+    def __init__(self, backend: DdsBackend, topic: str, type_name: str, qos: Qos) -> None:
+        super().__init__(backend)
         self._name = f"{topic} ({type_name})"
-        kind = idl_struct(type_name, site.distro)
-        self._writer = site.writer(TOPIC_PREFIX + topic, kind, qos, user_data_of_type(type_name, site.distro))
-        self._guid = self._writer.guid.bytes
+        self._writer = self._make_of_topic("writer", topic, type_name, qos)
 
     @property
     def subscriber_count(self) -> int:
@@ -255,25 +247,17 @@ class DdsPublisher:
         except Refused as error:
             raise BackendError(f"a message for {self._name} cannot be sent: {error}") from error
 
-    def close(self) -> None:
-        """Withdraw the publisher."""
-        if self._writer is not None:
-            self._site.graph.remove(self._guid)
-            with ENTITIES:
-                self._writer = None
-            self._site.forget(self)
-
 
 class _Receiver:
     """Takes what comes to a reader, on its own thread: a slow callback holds up its own topic only."""
 
-    def __init__(self, site: _Site, reader: Any, limit: int, deliver: Delivery, name: str) -> None:
+    def __init__(self, participant: Any, reader: Any, limit: int, deliver: Delivery, name: str) -> None:
         self._deliver = deliver
         self._closed = threading.Event()
         with ENTITIES:
-            self._guard = GuardCondition(site.participant)
+            self._guard = GuardCondition(participant)
         self._thread = threading.Thread(
-            target=self._run, args=(site, reader, limit, name), name=f"ros {name}", daemon=True
+            target=self._run, args=(participant, reader, limit, name), name=f"ros {name}", daemon=True
         )
         self._thread.start()
 
@@ -285,10 +269,10 @@ class _Receiver:
         if threading.current_thread() is not self._thread:
             self._thread.join(_CLOSE_S)
 
-    def _run(self, site: _Site, reader: Any, limit: int, name: str) -> None:
+    def _run(self, participant: Any, reader: Any, limit: int, name: str) -> None:
         try:
             with ENTITIES:
-                waitset = wait_set(site.participant, self._guard, [reader])
+                waitset = wait_set(participant, self._guard, [reader])
             while not self._closed.is_set():
                 waitset.wait(duration(infinite=True))
                 for message in take(reader, limit):
@@ -298,19 +282,22 @@ class _Receiver:
                 _log.exception("%s is not received any more", name)
 
 
-class DdsSubscription:
+class DdsSubscription(_Part):
     """Receives from one topic."""
 
     def __init__(
-        self, site: _Site, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
+        self,
+        backend: DdsBackend,
+        topic: str,
+        type_name: str,
+        qos: Qos,
+        callback: Callable[[bytes], None],
     ) -> None:
-        self._site = site
-        kind = idl_struct(type_name, site.distro)
-        self._reader = site.reader(TOPIC_PREFIX + topic, kind, qos, user_data_of_type(type_name, site.distro))
-        self._guid = self._reader.guid.bytes
+        super().__init__(backend)
         self._lost_count = 0
-        self._deliver = Delivery(callback, topic)
-        self._receiver = _Receiver(site, self._reader, qos.depth, self._deliver, topic)
+        self._reader = self._make_of_topic("reader", topic, type_name, qos)
+        deliver = Delivery(callback, topic)
+        self._receiver = _Receiver(backend.participant, self._reader, qos.depth, deliver, topic)
 
     @property
     def publisher_count(self) -> int:
@@ -328,47 +315,30 @@ class DdsSubscription:
 
     def close(self) -> None:
         """Withdraw the subscription."""
-        if self._reader is not None:
-            self._lost_count = self.lost_count
-            self._receiver.close()
-            self._site.graph.remove(self._guid)
-            with ENTITIES:
-                self._reader = None
-            self._site.forget(self)
+        self._lost_count = self.lost_count
+        super().close()
 
 
-class DdsService:
+class DdsService(_Part):
     """Answers the requests to one service, as `rmw_cyclonedds_cpp` asks them.
 
     Requests and replies are topics; before the fields go the client's number and that of its request.
     """
 
-    def __init__(self, site: _Site, name: str, type_name: str, callback: Serve) -> None:
-        self._site = site
+    def __init__(self, backend: DdsBackend, name: str, type_name: str, callback: Serve) -> None:
+        super().__init__(backend)
         self._callback = callback
         self._request_type, self._response_type = service_types(type_name)
-        self._name = name
         identity = ".".join(f"{byte:x}" for byte in os.urandom(16))
         user_data = f"serviceid={identity};".encode() + NO_TYPE_HASH
         qos = Qos(depth=10)
         header = {"guid": types.uint64, "seq": types.int64}
-        request = idl_struct(self._request_type, site.distro, header)
-        reply = idl_struct(self._response_type, site.distro, header)
-        self._writer = site.writer(f"{REPLY_PREFIX}{name}Reply", reply, qos, user_data)
-        self._reader = site.reader(f"{REQUEST_PREFIX}{name}Request", request, qos, user_data)
-        self._guids = self._writer.guid.bytes, self._reader.guid.bytes
-        self._deliver = Delivery(self._answer, name)
-        self._receiver = _Receiver(site, self._reader, qos.depth, self._deliver, name)
-
-    def close(self) -> None:
-        """Withdraw the service."""
-        if self._reader is not None:
-            self._receiver.close()
-            for guid in self._guids:
-                self._site.graph.remove(guid)
-            with ENTITIES:
-                self._reader = self._writer = None
-            self._site.forget(self)
+        request = idl_struct(self._request_type, backend.distro, header)
+        reply = idl_struct(self._response_type, backend.distro, header)
+        self._writer = self._make("writer", f"{REPLY_PREFIX}{name}Reply", reply, qos, user_data)
+        self._reader = self._make("reader", f"{REQUEST_PREFIX}{name}Request", request, qos, user_data)
+        deliver = Delivery(self._answer, name)
+        self._receiver = _Receiver(backend.participant, self._reader, qos.depth, deliver, name)
 
     def _answer(self, data: bytes) -> None:
         client = data[4 : 4 + _CLIENT_BYTES]

@@ -29,7 +29,7 @@ from cyclonedds.qos import Qos as DdsQos
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from cortex_ros2_bridge.backend.base import Qos, TopicInfo, why_apart
+from cortex_ros2_bridge.backend.base import Qos, TopicInfo
 from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, wait_set, write
 from cortex_ros2_bridge.backend.idl import idl_struct
 from cortex_ros2_bridge.backend.names import TOPIC_PREFIX, ros_topic, ros_type
@@ -84,7 +84,7 @@ class Graph:
         self._own: dict[bytes, Endpoint] = {}
         self._participants: dict[bytes, tuple[bytes, str]] = {}
         self._endpoints: dict[bytes, Endpoint] = {}
-        self._warned: set[tuple[str, str]] = set()
+        self._warned: set[bool] = set()
         self._writer: Any = None
         self._layout: str | None = None
         if distro is not None:
@@ -104,8 +104,6 @@ class Graph:
         """Announce an endpoint of ours."""
         with self._lock:
             self._own[guid] = endpoint
-            for other in self._endpoints.values():
-                self._compare(endpoint, other)
             self._announce()
 
     def remove(self, guid: bytes) -> None:
@@ -116,14 +114,14 @@ class Graph:
 
     def topics(self) -> list[TopicInfo]:
         """Return the topics of others, in order of their names."""
-        counts: dict[tuple[str, str], list[int]] = {}
+        found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         with self._lock:
             for endpoint in self._endpoints.values():
                 name = ros_topic(endpoint.topic)
                 if name is not None:
-                    count = counts.setdefault((name, ros_type(endpoint.type_name)), [0, 0])
-                    count[endpoint.kind == "reader"] += 1
-        return [TopicInfo(*names, *count) for names, count in sorted(counts.items())]
+                    ends = found.setdefault((name, ros_type(endpoint.type_name)), ([], []))
+                    ends[endpoint.kind == "reader"].append(endpoint.qos)
+        return [TopicInfo(*names, *map(tuple, ends)) for names, ends in sorted(found.items())]
 
     def close(self) -> None:
         """Withdraw the announcement and end the thread."""
@@ -185,18 +183,6 @@ class Graph:
             )
             with self._lock:
                 self._endpoints[sample.key.bytes] = endpoint
-                for own in self._own.values():
-                    self._compare(own, endpoint)
-
-    def _compare(self, own: Endpoint, other: Endpoint) -> None:
-        """Say once why two endpoints of a topic do not meet."""
-        if own.topic != other.topic or own.kind == other.kind or own.type_name != other.type_name:
-            return
-        writer, reader = (own, other) if own.kind == "writer" else (other, own)
-        why = why_apart(writer.qos, reader.qos)
-        if why and (own.topic, why) not in self._warned:
-            self._warned.add((own.topic, why))
-            _log.warning("%s does not reach a node: %s", ros_topic(own.topic) or own.topic, why)
 
     def _learn(self) -> None:
         """Find out which layout the others speak; announce in it."""
@@ -212,8 +198,8 @@ class Graph:
                 self._speak(DEFAULT_DISTRO if min(heard) else _WITHOUT_HASH)
             spoken = DISTROS[self._layout].shows_type_hash if self._layout else True
             for stranger in sorted(heard - {spoken}):
-                if ("", str(stranger)) not in self._warned:
-                    self._warned.add(("", str(stranger)))
+                if stranger not in self._warned:
+                    self._warned.add(stranger)
                     _log.warning(
                         "nodes of ROS %s are here too: they cannot see this node's name, announced as in %s",
                         "Iron or later" if stranger else _WITHOUT_HASH.capitalize(),

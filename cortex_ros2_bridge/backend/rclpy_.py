@@ -19,7 +19,6 @@ from cortex_ros2_bridge.backend.base import (
     Serve,
     TopicInfo,
     check_message,
-    why_apart,
 )
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
@@ -223,7 +222,6 @@ class RclpyBackend:
         self.distro = chosen_distro() or DEFAULT_DISTRO
         self._lock = threading.Lock()
         self._closed = False
-        self._warned: set[tuple[str, str]] = set()
         self._context = Context()
         self._service_loop: _Loop | None = None
         try:
@@ -261,7 +259,7 @@ class RclpyBackend:
         made = RclpyPublisher(
             loop, topic, lambda node: node.create_publisher(kind, topic, profile, event_callbacks=quiet)
         )
-        made.qos = qos
+        made.seen_qos = qos.seen()
         return loop.add(made)
 
     def subscription(
@@ -275,7 +273,7 @@ class RclpyBackend:
         made = RclpySubscription(
             loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, **arguments)
         )
-        made.qos = qos
+        made.seen_qos = qos.seen()
         made.deliver = Delivery(callback, topic)
         return loop.add(made)
 
@@ -294,28 +292,22 @@ class RclpyBackend:
         return loop.add(made)
 
     def topics(self) -> list[TopicInfo]:
-        """Return what others have; what does not meet an endpoint of ours is said once."""
+        """Return what others have."""
         if self._closed or self._loop.failure:
             return []
         node, parts = self._loop.node, self._loop.endpoints()
-        for part in parts:
-            self._compare(part)
-        found = []
-        for topic, types in node.get_topic_names_and_types():
-            own = [sum(isinstance(part, kind) and part.topic == topic for part in parts) for kind in _ENDS]
-            others = node.count_publishers(topic) - own[0], node.count_subscribers(topic) - own[1]
-            if others > (0, 0):
-                found += [TopicInfo(topic, type_name, *others) for type_name in types]
-        return sorted(found)
-
-    def _compare(self, own: _Endpoint) -> None:
-        """Say once why others of a topic do not meet ours."""
-        for each in getattr(self._loop.node, own.lister)(own.topic) if own.lister else ():
-            other = _qos_of(each)
-            why = why_apart(*((own.qos, other) if isinstance(own, RclpyPublisher) else (other, own.qos)))
-            if why and (own.topic, why) not in self._warned:
-                self._warned.add((own.topic, why))
-                _log.warning("%s does not reach a node: %s", own.topic, why)
+        me = node.get_name(), node.get_namespace()
+        found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
+        for topic, _ in node.get_topic_names_and_types():
+            for end, kind in enumerate((RclpyPublisher, RclpySubscription)):
+                own = [part.seen_qos for part in parts if isinstance(part, kind) and part.topic == topic]
+                for each in getattr(node, kind.lister)(topic):
+                    qos = _qos_of(each)
+                    if (each.node_name, each.node_namespace) == me and qos in own:
+                        own.remove(qos)  # more of our name are of another bridge
+                    else:
+                        found.setdefault((topic, each.topic_type), ([], []))[end].append(qos)
+        return [TopicInfo(*names, *map(tuple, ends)) for names, ends in sorted(found.items())]
 
     def close(self) -> None:
         """End the node."""
@@ -352,11 +344,12 @@ class _Endpoint:
 
     is_waited_for = True
     """Whether the executor waits for it."""
+    seen_qos = Qos()
+    """As discovery tells it."""
+    lister = ""
+    """What the node lists those of a topic with."""
     destroyer = ""
     """What the node destroys a handle with."""
-    lister = ""
-    """What the node lists the other ends of the topic with."""
-    qos = Qos()
 
     def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
         self.topic = topic
@@ -379,7 +372,7 @@ class RclpyPublisher(_Endpoint):
 
     is_waited_for = False
     destroyer = "destroy_publisher"
-    lister = "get_subscriptions_info_by_topic"
+    lister = "get_publishers_info_by_topic"
 
     @property
     def subscriber_count(self) -> int:
@@ -403,7 +396,7 @@ class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
     destroyer = "destroy_subscription"
-    lister = "get_publishers_info_by_topic"
+    lister = "get_subscriptions_info_by_topic"
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
@@ -448,9 +441,6 @@ class RclpyService(_Endpoint):
         except Exception:  # whatever it raises: the client gets an answer, and the node goes on
             _log.exception("the service %s failed", self.topic)
             return type(response)()
-
-
-_ENDS = (RclpyPublisher, RclpySubscription)
 
 
 def _interface(type_name: str) -> Any:

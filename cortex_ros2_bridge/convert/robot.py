@@ -6,10 +6,8 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
-import numpy as np
-
 from cortex import messages
-from cortex.evt3 import EventCodecError, Evt3Decoder
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder
 from cortex_ros2_bridge import cdr, frames
 from cortex_ros2_bridge.convert.commands import recorded_rates, unit, xyz
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
@@ -40,38 +38,49 @@ def events(message: Any, context: Context) -> messages.Events:
     A packet tells the time of its first event. Its stamp in Cortex is the end of the window in which its last
     one lies, where the option `packet_rate_hz` tells how windows follow each other; else the time of that.
     """
-    data, stamp_ns = np.asarray(message.events, np.uint8), stamp_ns_of(message.header.stamp)
+    stamp_ns = stamp_ns_of(message.header.stamp)
     if stamp_ns < context.memory.get("stamp_ns", 0):  # time has begun again
         context.memory.clear()
     context.memory["stamp_ns"] = stamp_ns
     try:
         if message.encoding == "evt3":
-            decoder = context.remembered("evt3", lambda: Evt3Decoder(start_us=stamp_ns // 1000))
-            columns = decoder.decode(data, width=message.width, height=message.height)
-            t = columns.t
+            columns = _decode_evt3(message, stamp_ns // 1000, context)
         elif message.encoding == "mono":
-            columns = decode_mono(data, base_ns=message.time_base)
-            t = columns.t // 1000
+            columns = decode_mono(message.events, base_ns=message.time_base)
+            columns = columns._replace(t=columns.t // 1000)
         else:
             raise ConvertError(f"EventPacket.encoding must be evt3 or mono, got {message.encoding!r}")
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
-    end_ns = int(t[-1]) * 1000 if len(t) else stamp_ns
+    end_ns = int(columns.t[-1]) * 1000 if len(columns.t) else stamp_ns
     rate_hz = context.option("packet_rate_hz")
     if rate_hz is not None:
         period_ns = 1_000_000_000 / Fraction(str(rate_hz))
         end_ns = int(-(-end_ns // period_ns) * period_ns)
     return messages.Events(
         stamp_ns=end_ns,
-        x=columns.x,
-        y=columns.y,
-        t=t,
-        polarity=columns.polarity,
+        **columns._asdict(),
         width=message.width,
         height=message.height,
         start_ns=min(stamp_ns, end_ns),
         sequence=message.seq,
     )
+
+
+def _decode_evt3(message: Any, stamp_us: int, context: Context) -> EventColumns:
+    """Return the events of a packet, after those before it.
+
+    Time in evt3 has 24 bits. Where packets are stamped with the time of their first event, as ours are, the
+    stamp says the rest; the stamps of drivers are of another clock, so there wraps are counted.
+    """
+    size = {"width": message.width, "height": message.height}
+    if context.remembered("is_stamped", lambda: True):
+        columns = Evt3Decoder(start_us=stamp_us).decode(message.events, **size)
+        if not len(columns.t) or int(columns.t[0]) == stamp_us:
+            return columns
+        context.memory["is_stamped"] = False
+    decoder: Evt3Decoder = context.remembered("evt3", Evt3Decoder)
+    return decoder.decode(message.events, **size)
 
 
 def _decoded(convert: Callable[[Any, Context], Any], ros_type: str) -> Callable[[Any, Context], Any]:

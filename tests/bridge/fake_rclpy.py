@@ -239,6 +239,16 @@ class Service:
         self.destroyed = False
 
 
+def _info(end: Publisher | Subscription) -> Any:
+    """As TopicEndpointInfo."""
+    return types.SimpleNamespace(
+        node_name=end.node.get_name(),
+        node_namespace=end.node.get_namespace(),
+        topic_type=NAMES[end.msg_type],
+        qos_profile=end.qos_profile,
+    )
+
+
 class Node:
     def __init__(self, node_name: str, context: Context, namespace: str | None) -> None:
         if not context.ok():
@@ -330,11 +340,17 @@ class Node:
     def count_subscribers(self, topic_name: str) -> int:
         return sum(one.topic == topic_name for node in self.world for one in node.subs)
 
-    def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Publisher]:
-        return [one for node in self.world for one in node.pubs if one.topic == topic_name]
+    def get_name(self) -> str:
+        return self.name
 
-    def get_subscriptions_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Subscription]:
-        return [one for node in self.world for one in node.subs if one.topic == topic_name]
+    def get_namespace(self) -> str:
+        return self.namespace or "/"
+
+    def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Any]:
+        return [_info(one) for node in self.world for one in node.pubs if one.topic == topic_name]
+
+    def get_subscriptions_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Any]:
+        return [_info(one) for node in self.world for one in node.subs if one.topic == topic_name]
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         found: dict[str, set[str]] = {}

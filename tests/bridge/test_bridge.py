@@ -22,7 +22,7 @@ from cortex_ros2_bridge import bridge as bridge_module
 from cortex_ros2_bridge import incoming as incoming_module
 from cortex_ros2_bridge import links, neighbours, tally
 from cortex_ros2_bridge import outgoing as outgoing_module
-from cortex_ros2_bridge.backend.base import BackendError, TopicInfo
+from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo
 from cortex_ros2_bridge.config import ConfigError
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.typestore import typestore
@@ -768,14 +768,14 @@ def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, capl
         rig.opens("/drone/imu")
         rig.subscribes("/drone/command_velocity")
         rig.backend.others = [
-            TopicInfo("/drone/command_velocity", "geometry_msgs/msg/Twist", 1, 0),
-            TopicInfo("/drone/imu", "sensor_msgs/msg/Image", 0, 1),
-            TopicInfo("/drone/cmd_vel", "geometry_msgs/msg/Twist", 1, 0),
-            TopicInfo("/elsewhere", "geometry_msgs/msg/Twist", 1, 1),
-            TopicInfo("/drone/command_vel", "geometry_msgs/msg/TwistStamped", 1, 0),
-            TopicInfo("/drone/command_speed", "geometry_msgs/msg/TwistStamped", 1, 1),
-            TopicInfo("/drone/command_velocity_raw", "geometry_msgs/msg/Twist", 0, 1),
-            TopicInfo("/goal", "geometry_msgs/msg/TwistStamped", 1, 0),
+            TopicInfo("/drone/command_velocity", "geometry_msgs/msg/Twist", (Qos(),), ()),
+            TopicInfo("/drone/imu", "sensor_msgs/msg/Image", (), (Qos(),)),
+            TopicInfo("/drone/cmd_vel", "geometry_msgs/msg/Twist", (Qos(),), ()),
+            TopicInfo("/elsewhere", "geometry_msgs/msg/Twist", (Qos(),), (Qos(),)),
+            TopicInfo("/drone/command_vel", "geometry_msgs/msg/TwistStamped", (Qos(),), ()),
+            TopicInfo("/drone/command_speed", "geometry_msgs/msg/TwistStamped", (Qos(),), (Qos(),)),
+            TopicInfo("/drone/command_velocity_raw", "geometry_msgs/msg/Twist", (), (Qos(),)),
+            TopicInfo("/goal", "geometry_msgs/msg/TwistStamped", (Qos(),), ()),
         ]
         with rig.backend.listening("/diagnostics") as (diagnostics,):
             rig.update_until(lambda: diagnostics.sent)
@@ -791,6 +791,36 @@ def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, capl
         "/drone/imu: a node subscribes to it as sensor_msgs/msg/Image, it is sensor_msgs/msg/Imu",
         "/drone/command_vel: a node publishes geometry_msgs/msg/TwistStamped, which nobody reads; did you "
         "mean /drone/command_velocity?",
+    ]
+
+
+def test_what_does_not_meet_is_said(monkeypatch, caplog):
+    """A subscriber that wants more than is published, and a publisher of commands that gives less."""
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    settings = {
+        "routes": [
+            {"cortex": "/drone/imu", "qos": "sensor_data"},
+            {"cortex": "*", "type": "geometry_msgs/TwistStamped", "qos": "latched"},
+        ]
+    }
+    less, more = Qos(reliability="best_effort"), Qos(durability="transient_local")
+    with rig_of(settings) as rig:
+        Craft(rig, velocity=msg.VelocityCommand)
+        for topic in ("/drone/imu", "/drone/gyro"):
+            rig.simulator.publisher(topic, msg.Imu)
+        rig.opens("/drone/imu", "/drone/gyro")
+        rig.subscribes("/drone/command_velocity")
+        rig.backend.others = [
+            TopicInfo("/drone/imu", "sensor_msgs/msg/Imu", (), (less, Qos(), Qos())),
+            TopicInfo("/drone/gyro", "sensor_msgs/msg/Imu", (), (less, Qos())),
+            TopicInfo("/drone/command_velocity", "geometry_msgs/msg/TwistStamped", (more, Qos()), ()),
+        ]
+        rig.update_until(lambda: "transient local" in caplog.text)
+        rig.updates_during()
+    assert sorted(record.getMessage() for record in caplog.records if "reach" in record.getMessage()) == [
+        "/drone/command_velocity does not reach a node: its subscriber wants it transient local, its "
+        "publisher is volatile",
+        "/drone/imu does not reach a node: its subscriber wants it reliable, its publisher is not",
     ]
 
 
@@ -823,9 +853,9 @@ def test_another_bridge_is_said_and_named(monkeypatch, caplog):
             rig.simulator.publisher(topic, msg.Imu)
         rig.opens("/drone/imu", "/drone/gyro")
         rig.backend.others = [
-            TopicInfo("/clock", "rosgraph_msgs/msg/Clock", 1, 0),
-            TopicInfo("/drone/imu", "sensor_msgs/msg/Imu", 1, 0),
-            TopicInfo("/drone/gyro", "sensor_msgs/msg/Imu", 1, 0),
+            TopicInfo("/clock", "rosgraph_msgs/msg/Clock", (Qos(),), ()),
+            TopicInfo("/drone/imu", "sensor_msgs/msg/Imu", (Qos(),), ()),
+            TopicInfo("/drone/gyro", "sensor_msgs/msg/Imu", (Qos(),), ()),
         ]
         rig.updates_during()
         assert "ROS gets all of it twice" not in caplog.text

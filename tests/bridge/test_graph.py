@@ -124,7 +124,7 @@ def test_humble_wins_where_both_are(make: Any, foreigner: Start, caplog: pytest.
     wait_for(lambda: "nodes of ROS Humble are here too" in caplog.text)
     assert node.layout == "jazzy"
     ros_node(foreigner(), "jazzy")
-    wait_for(lambda: node.topics() == [TopicInfo("/chatter", STRING, 2, 0)])
+    wait_for(lambda: node.topics() == [TopicInfo("/chatter", STRING, (Qos(), Qos()), ())])
     late = make(node_name="late")
     wait_for(lambda: late.layout is not None)
     assert late.layout == "humble"
@@ -162,13 +162,13 @@ def test_topics_of_others(short_lease: None, make: Any, foreigner: Start) -> Non
     other.do("subscribe", topic="rt/mine", kind="String")
     other.do("advertise", topic="rt/a/image", kind="Image", matched=False)
     expected = [
-        TopicInfo("/a/image", "sensor_msgs/msg/Image", 1, 0),
-        TopicInfo("/b", STRING, 2, 1),
-        TopicInfo("/mine", STRING, 0, 1),
+        TopicInfo("/a/image", "sensor_msgs/msg/Image", (Qos(),), ()),
+        TopicInfo("/b", STRING, (Qos(), Qos()), (Qos(),)),
+        TopicInfo("/mine", STRING, (), (Qos(),)),
     ]
     wait_for(lambda: node.topics() == expected)
     another.kill()
-    wait_for(lambda: TopicInfo("/b", STRING, 1, 1) in node.topics())
+    wait_for(lambda: TopicInfo("/b", STRING, (Qos(),), (Qos(),)) in node.topics())
 
 
 def test_a_closed_node_is_gone(make: Any, foreigner: Start, caplog: pytest.LogCaptureFixture) -> None:
@@ -331,7 +331,7 @@ def test_cyclone_accepts_each_configuration(
     other = foreigner()
     other.do("listen", topic="/words", type_name=STRING, depth=1)
     if environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "OFF":
-        wait_for(lambda: node.topics() == [TopicInfo("/words", STRING, 0, 1)])
+        wait_for(lambda: node.topics() == [TopicInfo("/words", STRING, (), (Qos(),))])
     else:
         assert node.topics() == []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,29 @@ EVENTS = "event_camera_msgs/msg/EventPacket"
 def demonstrate(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The script, which can be read without ROS."""
     fake_rclpy.install(monkeypatch)
-    spec = importlib.util.spec_from_file_location("demonstrate", TOUR / "demonstrate.py")
+    return _script("demonstrate", monkeypatch)
+
+
+def _script(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    spec = importlib.util.spec_from_file_location(name, TOUR / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
     return module
+
+
+def test_latencies_are_measured_of_all_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All messages of a short run arrive, and take longer than nothing."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    latency = _script("latency", monkeypatch)
+    result = latency.end_to_end(("imu",), latency.Load(seconds=0.2))["imu"]
+    assert result.sent == result.received == 200
+    assert result.lost_in_bridge == 0
+    latencies = list(result.latency_ms.values())
+    assert latencies[0] > 0.0
+    assert latencies == sorted(latencies)
 
 
 def test_every_type_of_the_bridge_has_a_row(demonstrate: Any) -> None:

@@ -1,7 +1,9 @@
-"""`cortex-ros2-bridge bench`: what does the bridge cost here; one `name value unit` a line.
+"""What the bridge costs on this machine: latencies from `publish` in Cortex to the callback in ROS.
+
+    python3 examples/ros2_tour/latency.py [--backend rclpy] [--seconds 5]
 
 There are three processes: a Cortex publisher, the bridge, and a subscriber in ROS. Messages are stamped when
-they are published: a latency is all from `publish` in Cortex to the callback in ROS.
+they are published. It prints one `name value unit` a line.
 """
 
 from __future__ import annotations
@@ -83,11 +85,9 @@ class Result:
     """By the names of `QUANTILES` [ms]."""
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="cortex-ros2-bridge bench", description="Measure the bridge on this machine."
-    )
+    parser = argparse.ArgumentParser(description="measure the bridge on this machine")
     default = Load()
     parser.add_argument("--seconds", type=float, default=default.seconds, help="of each measurement [s]")
     parser.add_argument("--encoding", default=default.encoding, choices=["evt3", "mono"], help="of events")
@@ -137,13 +137,13 @@ def end_to_end(streams: Sequence[str], load: Load) -> dict[str, Result]:
         given = [f"--{name.replace('_', '-')}={value}" for name, value in vars(load).items()]
 
         def run(*words: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
-            return _process([sys.executable, "-m", "cortex_ros2_bridge", *words], environment)
+            return _process([sys.executable, *words], environment)
 
         def part(role: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
-            return run("bench", "--role", role, "--streams", ",".join(streams), *given)
+            return run(__file__, "--role", role, "--streams", ",".join(streams), *given)
 
         with (
-            run("--backend", load.backend, "--config", str(config)),
+            run("-m", "cortex_ros2_bridge", "--backend", load.backend, "--config", str(config)),
             part("subscribe") as subscriber,
             part("publish") as publisher,
         ):
@@ -281,3 +281,7 @@ def _hear(process: subprocess.Popen[str]) -> dict[str, Any]:
         raise RuntimeError(f"a process of the benchmark has ended: {lines[-1]}")
     heard: dict[str, Any] = json.loads(line)
     return heard
+
+
+if __name__ == "__main__":
+    sys.exit(main())
