@@ -15,23 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex.evt3 import (
-    Allocate,
     Buffer,
     Bytes,
     EventCodecError,
     EventColumns,
     check_events,
     check_pixels,
-    new_bytes,
     read_words,
 )
 
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
 
 
-def encode_mono(
-    events: EventColumns, *, width: int, height: int, base_us: int, allocate: Allocate | None = None
-) -> Bytes:
+def encode_mono(events: EventColumns, *, width: int, height: int, base_us: int) -> Bytes:
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
 
     Args:
@@ -39,7 +35,6 @@ def encode_mono(
         width: Of the sensor [px].
         height: Of the sensor [px].
         base_us: Time not after that of the first event [us].
-        allocate: Makes room for the events; None: a new array.
 
     Raises:
         EventCodecError: The sensor has too many rows, an event is outside of it or has another polarity, or
@@ -54,7 +49,7 @@ def encode_mono(
         raise EventCodecError(
             f"mono holds times from its base to 4.29 s later, got {t_us[0]} to {t_us[-1]} us for {base_us} us"
         )
-    out = (new_bytes if allocate is None else allocate)(8 * count)
+    out = np.empty(8 * count, np.uint8)
     quarters = out.view("<u2").reshape(count, 4)
     after_ns = _after(t_us, base_us)
     after_ns *= np.uint32(1000)

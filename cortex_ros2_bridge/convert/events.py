@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from cortex import messages
-from cortex.evt3 import Bytes, EventCodecError, EventColumns, Evt3Encoder
-from cortex_ros2_bridge import cdr
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Encoder
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
 from cortex_ros2_bridge.event_codec import EventPicture, encode_mono
-
-_NO_BYTES: Bytes = np.empty(0, np.uint8)
 
 
 @standard(messages.Events, "event_camera_msgs/EventPacket", "{topic}", PACKETS, "encoding")
@@ -27,37 +22,29 @@ def event_packet(message: messages.Events, context: Context) -> Any:
     window. `time_base` is that time in mono, and 0 in evt3, where it has no meaning.
     """
     encoding = context.option("encoding")
-    stamp_ns = _events_stamp_ns(message)
+    stamp_ns = int(message.t[0]) * 1000 if len(message.t) else message.stamp_ns
     base_us = stamp_ns // 1000
-    if encoding == "mono" and base_us < 0:
-        raise ConvertError(f"mono holds no time before 0, got {base_us} us")
-    prefix = cdr.encode(
-        record("event_camera_msgs/msg/EventPacket")(
-            header(stamp_ns, message.frame_id or context.frame_id, context),
-            message.height,
-            message.width,
-            message.sequence,
-            base_us * 1000 if encoding == "mono" else 0,
-            encoding,
-            False,
-            _NO_BYTES,
-        )
-    )
-    room = _Room(prefix)
-    columns = _columns(message)
+    columns = EventColumns(message.t, message.x, message.y, message.polarity)
+    size = {"width": message.width, "height": message.height}
     try:
         if encoding == "mono":
-            encode_mono(
-                columns, width=message.width, height=message.height, base_us=base_us, allocate=room.make
-            )
+            if base_us < 0:
+                raise ConvertError(f"mono holds no time before 0, got {base_us} us")
+            data = encode_mono(columns, **size, base_us=base_us)
         else:
-            encoder = context.remembered("evt3", Evt3Encoder)
-            encoder.encode(
-                columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
-            )
+            data = context.remembered("evt3", Evt3Encoder).encode(columns, **size, end_us=base_us)
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
-    return room.message()
+    return record("event_camera_msgs/msg/EventPacket")(
+        header(stamp_ns, message.frame_id or context.frame_id, context),
+        message.height,
+        message.width,
+        message.sequence,
+        base_us * 1000 if encoding == "mono" else 0,
+        encoding,
+        False,
+        data,
+    )
 
 
 @standard(messages.Events, "sensor_msgs/Image", "{topic}/image", FRAMES, "period_s")
@@ -116,34 +103,3 @@ def _ends_picture(message: messages.Events, context: Context) -> bool:
     context.memory["seen_until_ns"] = message.stamp_ns
     begin_ns = until_ns if until_ns <= message.stamp_ns else message.start_ns
     return bool(message.stamp_ns // period_ns > begin_ns // period_ns)
-
-
-def _columns(message: messages.Events) -> EventColumns:
-    return EventColumns(message.t, message.x, message.y, message.polarity)
-
-
-class _Room:
-    """Makes room behind the beginning of a message for what its last field holds: nothing is copied twice."""
-
-    def __init__(self, prefix: memoryview) -> None:
-        """Begin with a message whose last field is an empty sequence: the last 4 bytes are its length, 0."""
-        self._prefix = prefix
-        self._buffer = _NO_BYTES
-
-    def make(self, size: int) -> Bytes:
-        """Return so many bytes to write to, and up to 3 more."""
-        begin = len(self._prefix)
-        self._buffer = np.empty(begin + (size + 3 & -4), np.uint8)
-        self._buffer[:begin] = self._prefix
-        self._buffer[begin - 4 : begin].view("<u4")[0] = size
-        self._buffer[begin + size :] = 0
-        return self._buffer[begin:]
-
-    def message(self) -> memoryview:
-        """Return the message."""
-        return self._buffer.data.toreadonly()
-
-
-def _events_stamp_ns(message: messages.Events) -> int:
-    """Return the time of the first event, or of the end of a window without any [ns]."""
-    return int(message.t[0]) * 1000 if len(message.t) else message.stamp_ns

@@ -86,31 +86,38 @@ def standard(
     *options: str,
     default: bool = True,
     direction: Direction = "out",
+    robot: bool = False,
 ) -> Callable[[F], F]:
-    """Register a conversion of the bridge's own, which makes a record or CDR; see `Rule`."""
+    """Register a conversion of the bridge's own; see `Rule`.
+
+    One to ROS makes a record or CDR, one from ROS takes a plain record.
+    """
+    to = ros_type.replace("/", "/msg/")
 
     def register(function: F) -> F:
-        _add_rule(kind, ros_type, direction, name, qos, encoded(function), default, options)
+        convert = encoded(function) if direction in ("out", "record") else _decoded(function, to)
+        source = schema_of(kind).name
+        RULES.append(Rule(source, to, direction, name, qos, convert, default, frozenset(options), robot))
         return function
 
     return register
 
 
 def recorded(kind: type[Any], ros_type: str, name: str, *options: str) -> Callable[[F], F]:
-    """Register a conversion of commands for bags, as `standard`; `name` is below {base}."""
+    """Register a conversion of commands for bags; `name` is below {base}."""
     return standard(kind, ros_type, f"{{base}}/{name}", NEWEST, *options, direction="record")
 
 
 def command(
     kind: type[Any], ros_type: str, name: str, *options: str, default: bool = True
 ) -> Callable[[F], F]:
-    """Register a conversion of commands, which takes plain records; `name` is below {base}."""
-    return _incoming(kind, ros_type, "in", f"{{base}}/{name}", default, options)
+    """Register a conversion of commands; `name` is below {base}."""
+    return standard(kind, ros_type, f"{{base}}/{name}", NEWEST, *options, default=default, direction="in")
 
 
 def request(kind: type[Any], ros_type: str, name: str = "{topic}") -> Callable[[F], F]:
-    """Register a conversion of requests, likewise."""
-    return _incoming(kind, ros_type, "call", name, True, ())
+    """Register a conversion of requests."""
+    return standard(kind, ros_type, name, direction="call")
 
 
 def encoded(function: Callable[..., Any]) -> Out:
@@ -124,25 +131,12 @@ def encoded(function: Callable[..., Any]) -> Out:
     return convert
 
 
-def _incoming(kind: type[Any], ros_type: str, direction: Direction, *rest: Any) -> Callable[[F], F]:
-    name, default, options = rest
+def _decoded(function: Callable[..., Any], ros_type: str) -> Callable[[Buffer, Context], Any]:
+    @functools.wraps(function)
+    def convert(data: Buffer, context: Context) -> Any:
+        return function(cdr.decode_record(data, ros_type), context)
 
-    def register(function: F) -> F:
-        def convert(data: Buffer, context: Context) -> Any:
-            return function(cdr.decode_record(data, ros_type.replace("/", "/msg/")), context)
-
-        functools.update_wrapper(convert, function)
-        qos = NEWEST if direction == "in" else Qos()
-        _add_rule(kind, ros_type, direction, name, qos, convert, default, options)
-        return function
-
-    return register
-
-
-def _add_rule(kind: type[Any], ros_type: str, *rest: Any) -> None:
-    direction, name, qos, convert, default, options = rest
-    to = ros_type.replace("/", "/msg/")
-    RULES.append(Rule(schema_of(kind).name, to, direction, name, qos, convert, default, frozenset(options)))
+    return convert
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -221,7 +221,7 @@ def test_the_command_does_what_launch_asks(dds_domain: int, runtime: Path) -> No
                     assert wrong.process.wait(60.0) == 1
                     wrong.hear()
                     assert (
-                        "--backend: a backend is auto, rclpy, dds or a path that ends in .mcap" in wrong.said
+                        "backend: a backend is auto, rclpy, dds or a path that ends in .mcap" in wrong.said
                     )
                 with BridgeProcess("--backend", "dds", "--ros-args", *arguments) as second:
                     assert second.process.wait(60.0) == 1
