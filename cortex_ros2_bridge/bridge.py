@@ -49,11 +49,6 @@ class Bridge:
     def __init__(self, config: BridgeConfig, backend: Backend, node: Node) -> None:
         """Prepare; nothing but /diagnostics is connected before `update` or `run`.
 
-        Args:
-            config: What to do.
-            backend: The ROS side; it stays open.
-            node: The Cortex side; it stays open.
-
         Raises:
             BackendError: The backend cannot publish.
         """

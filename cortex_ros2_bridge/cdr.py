@@ -41,10 +41,7 @@ class CdrError(ValueError):
 
 
 def encode(message: Any) -> memoryview:
-    """Return a message as CDR.
-
-    Args:
-        message: A stand-in, a message of rclpy, or one of the plain records that `record_class` makes.
+    """Return a stand-in, a message of rclpy, or a plain record of a `record_class`, as CDR.
 
     Raises:
         CdrError: A field has a value that its type cannot hold.
@@ -65,9 +62,7 @@ def encode(message: Any) -> memoryview:
 def decode(data: Buffer, type_name: str | type[Any]) -> Any:
     """Return the message in a buffer, as an object of `msgs.message_class(type_name)`; its arrays are copies.
 
-    Args:
-        data: The message.
-        type_name: Such as "sensor_msgs/msg/Imu", or the class that `msgs` has for it.
+    The type is given by its name, or by the class that `msgs` has for it.
 
     Raises:
         CdrError: The data are cut off or too long, hold a length beyond their end, or are no plain CDR.

@@ -143,13 +143,7 @@ def _version() -> str:
 def _bridge(
     make: Callable[[Mapping[str, Any]], BridgeConfig], given: Mapping[str, Any], *, beside: bool
 ) -> int:
-    """Bridge until interrupted.
-
-    Args:
-        make: Makes settings of ROS parameters.
-        given: The parameters.
-        beside: Run although another bridge publishes the same topics.
-    """
+    """Bridge until interrupted, with what makes settings of ROS parameters, and the parameters."""
     config = make(given)
     _load_converters(config)
     stop = _stop_at_signals(forced=not config.is_bag)

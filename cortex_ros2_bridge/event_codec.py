@@ -30,12 +30,6 @@ _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
 def encode_mono(events: EventColumns, *, width: int, height: int, base_us: int) -> Bytes:
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
 
-    Args:
-        events: What to write, with times in microseconds.
-        width: Of the sensor [px].
-        height: Of the sensor [px].
-        base_us: Time not after that of the first event [us].
-
     Raises:
         EventCodecError: The sensor has too many rows, an event is outside of it or has another polarity, or
             times decrease or reach over more than 4.29 s.
@@ -63,11 +57,7 @@ def encode_mono(events: EventColumns, *, width: int, height: int, base_us: int) 
 
 
 def decode_mono(data: Buffer | Bytes, *, base_ns: int) -> EventColumns:
-    """Return the events of a packet, with times in nanoseconds.
-
-    Args:
-        data: Words of 64 bits, little endian.
-        base_ns: The packet's `time_base` [ns].
+    """Return the events of a packet with a `time_base`, with times in nanoseconds.
 
     Raises:
         EventCodecError: It does not consist of words of 8 bytes.

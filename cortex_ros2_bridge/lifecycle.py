@@ -16,11 +16,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Backend, BackendError, Qos
 from cortex_ros2_bridge.msgs import message_class
+
+if TYPE_CHECKING:
+    from cortex_ros2_bridge.bridge import Bridge
 
 logger = logging.getLogger(__name__)
 
@@ -78,19 +81,10 @@ TRANSITIONS = _CALLS + tuple(
 """All of them, also those that follow by themselves."""
 
 
-class Managed(Protocol):
-    """What has a lifecycle."""
-
-    state: int
-
-    def change_state(self, state: int) -> None:
-        """Go on in another primary state."""
-
-
 class Lifecycle:
     """Answers the services of a managed node of a full name, until it is closed."""
 
-    def __init__(self, managed: Managed, backend: Backend, node: str) -> None:
+    def __init__(self, managed: Bridge, backend: Backend, node: str) -> None:
         self._managed = managed
         self._lock = threading.Lock()
         self._resources = contextlib.ExitStack()

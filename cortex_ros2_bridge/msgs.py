@@ -109,10 +109,7 @@ class Message:
 
 @functools.cache
 def message_class(type_name: str) -> Any:
-    """Return the class of a message type: that of ROS if it can be imported, else a stand-in.
-
-    Args:
-        type_name: Such as "sensor_msgs/msg/Imu".
+    """Return the class of a type such as "sensor_msgs/msg/Imu": that of ROS if it imports, else a stand-in.
 
     Raises:
         UnknownTypeError: There is no such type.

@@ -162,11 +162,7 @@ class StaticTransforms:
         self.changed = False
 
     def add(self, source: str, transform: Transform) -> None:
-        """Take in a transform, or a newer one of the same child.
-
-        Args:
-            source: Cortex topic that it came on.
-            transform: The transform.
+        """Take in a transform from a Cortex topic, or a newer one of the same child.
 
         Raises:
             ConvertError: It is none: the one before stays.
@@ -177,12 +173,7 @@ class StaticTransforms:
             self.changed = True
 
     def keep(self, sources: Iterable[str], vehicles: Iterable[str]) -> None:
-        """Say what there is; transforms that came from elsewhere are forgotten.
-
-        Args:
-            sources: Cortex topics of transforms.
-            vehicles: Vehicles that move.
-        """
+        """Say which topics of transforms there are, and which vehicles move; forget what came from others."""
         there = set(sources)
         with self._lock:
             kept = {child: held for child, held in self._transforms.items() if held[0] in there}
@@ -227,12 +218,7 @@ class Feed:
         self.newest = (0.0, 0)
 
     def tap(self, function: Callable[[Any], None], wants: Callable[[], bool]) -> None:
-        """Give each message to a function of the bridge, before the routes get it.
-
-        Args:
-            function: Gets the messages, on the callback thread.
-            wants: Says whether it wants any now.
-        """
+        """Give messages to a function of the bridge while it wants any, before the routes get them."""
         with self._lock:
             self._taps[function] = wants
             if self._last is not None:

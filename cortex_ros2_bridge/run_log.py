@@ -14,11 +14,7 @@ class RunLog:
     """Says that a run has ended, and which commands the simulator refuses."""
 
     def __init__(self, reset: str) -> None:
-        """Begin with no simulator.
-
-        Args:
-            reset: Name in ROS of the service that begins another run.
-        """
+        """Begin with no simulator; `reset` is the service in ROS that begins another run."""
         self._reset = reset
         self._phase = ""
         self._refused: dict[str, Tally] = {}

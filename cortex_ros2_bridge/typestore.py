@@ -57,11 +57,7 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
 
 
 def define(type_name: str, text: str) -> None:
-    """Make a message type known that no distribution has.
-
-    Args:
-        type_name: Such as "my_robot/msg/Battery".
-        text: As in a .msg file.
+    """Make a type such as "my_robot/msg/Battery" known that no distribution has, by the text of a .msg file.
 
     Raises:
         ValueError: The text is no definition, or the type is known with another one.

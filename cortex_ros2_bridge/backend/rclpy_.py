@@ -39,7 +39,6 @@ _TAKE_COUNT_MAX = 32
 _SERVICES = "_services"
 """Added to the node's name for the node of its services; `ros2 node list` hides names with a leading "_"."""
 _Result = TypeVar("_Result")
-_Part = TypeVar("_Part", bound="_Endpoint")
 
 
 class _Loop:
@@ -110,7 +109,7 @@ class _Loop:
         with contextlib.suppress(Exception):  # it is being replaced: the new one begins with the jobs
             self._executor.create_task(self._work)
 
-    def add(self, endpoint: _Part) -> _Part:
+    def add(self, endpoint: _Endpoint) -> None:
         """Make the handle of an endpoint, and keep it over a restart."""
 
         def make() -> None:
@@ -118,7 +117,6 @@ class _Loop:
             self._endpoints[endpoint] = None
 
         self.call(make)
-        return endpoint
 
     def remove(self, endpoint: _Endpoint) -> None:
         """Destroy the handle of an endpoint."""
@@ -252,44 +250,22 @@ class RclpyBackend:
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
-        check_name(topic)
-        kind, profile = _interface(type_name), _profile(qos)
-        loop = self._here()
-        quiet = _no_events("PublisherEventCallbacks")
-        made = RclpyPublisher(
-            loop, topic, lambda node: node.create_publisher(kind, topic, profile, event_callbacks=quiet)
-        )
-        made.seen_qos = qos.seen()
-        return loop.add(made)
+        return RclpyPublisher(self._here(), topic, type_name, qos)
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> RclpySubscription:
         """Subscribe to a topic; all subscriptions share a thread."""
-        check_name(topic)
-        kind, profile = _interface(type_name), _profile(qos)
-        loop = self._here()
-        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
-        made = RclpySubscription(
-            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, **arguments)
-        )
-        made.seen_qos = qos.seen()
-        made.deliver = Delivery(callback, topic)
-        return loop.add(made)
+        return RclpySubscription(self._here(), topic, type_name, qos, callback)
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
         """Answer requests to a service; all services share a node and a thread of their own."""
-        check_name(name)
-        kind = _interface(type_name)
         with self._lock:
             self._here()
             if self._service_loop is None:
                 node_name, namespace = self._names
                 self._service_loop = _Loop(self._context, f"_{node_name}{_SERVICES}", namespace)
-        loop = self._service_loop
-        made = RclpyService(loop, name, lambda node: node.create_service(kind, name, made.answer))
-        made.callback = callback
-        return loop.add(made)
+        return RclpyService(self._service_loop, name, type_name, callback)
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
@@ -338,24 +314,28 @@ class _Endpoint:
 
     Attributes:
         topic: Its topic, or the name of the service.
+        seen_qos: As discovery tells it.
         handle: What rclpy has for it; None once it is closed.
-        make: Makes the handle for a node.
     """
 
     is_waited_for = True
     """Whether the executor waits for it."""
-    seen_qos = Qos()
-    """As discovery tells it."""
     lister = ""
     """What the node lists those of a topic with."""
     destroyer = ""
     """What the node destroys a handle with."""
 
-    def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
-        self.topic = topic
+    def __init__(self, loop: _Loop, topic: str, type_name: str, qos: Qos) -> None:
+        self.topic = check_name(topic)
+        self.seen_qos = qos.seen()
         self.handle: Any = None
-        self.make = make
         self._loop = loop
+        self._kind, self._profile = _interface(type_name), _profile(qos)
+        loop.add(self)
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        raise NotImplementedError
 
     def destroy(self, node: Any, handle: Any) -> None:
         """Destroy the handle."""
@@ -371,8 +351,13 @@ class RclpyPublisher(_Endpoint):
     """Publishes on one topic."""
 
     is_waited_for = False
-    destroyer = "destroy_publisher"
     lister = "get_publishers_info_by_topic"
+    destroyer = "destroy_publisher"
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        quiet = _no_events("PublisherEventCallbacks")
+        return node.create_publisher(self._kind, self.topic, self._profile, event_callbacks=quiet)
 
     @property
     def subscriber_count(self) -> int:
@@ -395,11 +380,21 @@ class RclpyPublisher(_Endpoint):
 class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
-    destroyer = "destroy_subscription"
     lister = "get_subscriptions_info_by_topic"
+    destroyer = "destroy_subscription"
     lost_count = 0
     """rclpy does not tell."""
-    deliver: Delivery
+
+    def __init__(
+        self, loop: _Loop, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
+    ) -> None:
+        self.deliver = Delivery(callback, topic)
+        super().__init__(loop, topic, type_name, qos)
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
+        return node.create_subscription(self._kind, self.topic, self.take, self._profile, **arguments)
 
     def take(self, message: bytes) -> None:
         """Deliver a message, and those that have come meanwhile.
@@ -432,12 +427,19 @@ class RclpyService(_Endpoint):
     """Answers the requests to one service."""
 
     destroyer = "destroy_service"
-    callback: Serve
+
+    def __init__(self, loop: _Loop, name: str, type_name: str, callback: Serve) -> None:
+        self._callback = callback
+        super().__init__(loop, name, type_name, Qos())
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        return node.create_service(self._kind, self.topic, self.answer)
 
     def answer(self, request: Any, response: Any) -> Any:
         """Answer a request; an empty response where the callback raises."""
         try:
-            return self.callback(request, response)
+            return self._callback(request, response)
         except Exception:  # whatever it raises: the client gets an answer, and the node goes on
             _log.exception("the service %s failed", self.topic)
             return type(response)()

@@ -271,11 +271,7 @@ def _picture_rules(plain: Any) -> Iterable[Rule]:
 
 
 def load_converters(modules: Iterable[str]) -> list[str]:
-    """Import modules with conversions: those of entry points, and others; returns what went wrong.
-
-    Args:
-        modules: Names of modules, or files that end in .py.
-    """
+    """Import modules with conversions, of entry points and by name or file (.py); returns what went wrong."""
     problems = []
     entries = [(each.name, each.load) for each in importlib.metadata.entry_points(group=GROUP)]
     for name, load in [*entries, *((each, lambda each=each: _import(each)) for each in modules)]:

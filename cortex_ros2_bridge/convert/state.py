@@ -132,11 +132,6 @@ def static_transforms(
 ) -> Buffer:
     """Return one tf2_msgs/TFMessage with all static transforms, and those from map to each vehicle's odom.
 
-    Args:
-        transforms: Where sensors sit.
-        vehicles: Names of the vehicles.
-        names: Names of frames in ROS.
-
     Raises:
         ConvertError: A transform has numbers that are not finite, or no rotation.
     """
