@@ -85,8 +85,10 @@ class Bridge:
             BackendError: The backend is dead for good.
         """
         while not stop.is_set():
-            if self._backend.failure:
-                raise BackendError(self._backend.failure)
+            if reason := self._backend.failure:
+                self._failure = reason
+                self._diagnose(DIAGNOSTICS_INTERVAL_S)
+                raise BackendError(reason)
             try:
                 self.update()
             except Exception as error:  # streams and commands of others must not end with one mistake
@@ -257,7 +259,7 @@ class Bridge:
         """Publish how everything is doing."""
         failure, self._failure = self._failure, ""
         feeds = self._connections.feeds.values()
-        wrong = self.problems + self._notes + ([self._backend.trouble] if self._backend.trouble else [])
+        wrong = self.problems + self._notes
         missing = "" if self._was_routed else "no Cortex topics: no simulator runs"
         if missing and self._had_routes:
             missing = "the Cortex side has gone"

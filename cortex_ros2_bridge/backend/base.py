@@ -105,10 +105,6 @@ class Backend(Protocol):
     def failure(self) -> str:
         """Why nothing is received any more, for good; empty while all is well."""
 
-    @property
-    def trouble(self) -> str:
-        """What went wrong and was mended; empty if nothing was."""
-
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
         """Publish on a topic.
 

@@ -85,7 +85,7 @@ class DdsBackend:
     """A node of ROS 2 that speaks DDS itself."""
 
     name = "dds"
-    failure = trouble = ""
+    failure = ""
 
     def __init__(
         self,

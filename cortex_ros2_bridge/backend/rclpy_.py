@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import importlib
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -31,9 +29,6 @@ _CLOSE_S = 3.0
 """Longest wait for an executor that was told to end [s]."""
 _CALL_S = 10.0
 """Longest wait for an executor to make or destroy something [s]."""
-_RESTART_COUNT_MAX = 10
-"""An executor that fails more often than this within `_RESTART_PERIOD_S` is given up."""
-_RESTART_PERIOD_S = 10.0
 _TAKE_COUNT_MAX = 32
 """So many messages of a topic are taken before others have their turn."""
 _SERVICES = "_services"
@@ -45,24 +40,20 @@ class _Loop:
     """A node, and the thread that executes its callbacks.
 
     Everything that the executor waits for is made and destroyed on its thread, between two waits: a handle
-    that another thread destroys while the executor builds its wait set ends the executor of Humble. An
-    executor that fails nevertheless is replaced, and what it waited for is made anew.
+    that another thread destroys while the executor builds its wait set ends the executor of Humble. One
+    that fails nevertheless may never look at some of its endpoints again, and is not used any more.
 
     Attributes:
         node: The node of rclpy.
         failure: Why it is dead for good; empty while it lives.
-        restart_count: How often the executor was replaced.
-        restart_reason: Why, the last time.
     """
 
     def __init__(self, context: Any, name: str, namespace: str) -> None:
         import rclpy
+        from rclpy.executors import SingleThreadedExecutor
 
         self.failure = ""
-        self.restart_count = 0
-        self.restart_reason = ""
         self._context = context
-        self._restarts_s: deque[float] = deque(maxlen=_RESTART_COUNT_MAX + 1)
         self._jobs: deque[Callable[[], None]] = deque()
         self._endpoints: dict[_Endpoint, None] = {}
         self._closed = False
@@ -73,7 +64,8 @@ class _Loop:
             use_global_arguments=False,
             start_parameter_services=False,
         )
-        self._executor: Any = self._make_executor()
+        self._executor: Any = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._run, name=f"executor {name}", daemon=True)
         self._thread.start()
 
@@ -106,11 +98,10 @@ class _Loop:
     def defer(self, job: Callable[[], None]) -> None:
         """Have a function called on the executor's thread, after the callback that runs now."""
         self._jobs.append(job)
-        with contextlib.suppress(Exception):  # it is being replaced: the new one begins with the jobs
-            self._executor.create_task(self._work)
+        self._executor.create_task(self._work)
 
     def add(self, endpoint: _Endpoint) -> None:
-        """Make the handle of an endpoint, and keep it over a restart."""
+        """Make the handle of an endpoint."""
 
         def make() -> None:
             endpoint.handle = endpoint.make(self.node)
@@ -125,7 +116,7 @@ class _Loop:
             if endpoint in self._endpoints:
                 del self._endpoints[endpoint]
                 handle, endpoint.handle = endpoint.handle, None
-                endpoint.destroy(self.node, handle)
+                getattr(self.node, endpoint.destroyer)(handle)
 
         if self._closed or self.failure:
             endpoint.handle = None  # it went with the node
@@ -153,50 +144,18 @@ class _Loop:
         self._executor.shutdown(timeout_sec=0.0)
         self.node.destroy_node()
 
-    def _make_executor(self) -> Any:
-        from rclpy.executors import SingleThreadedExecutor
-
-        executor = SingleThreadedExecutor(context=self._context)
-        executor.add_node(self.node)
-        return executor
-
     def _run(self) -> None:
         while not self._closed and not self.failure:
+            reason = ""
             try:
                 self._executor.spin_once()
-                if not self._context.ok() and not self._closed:
-                    self.failure = "the context of rclpy was shut down from outside"
-            except Exception as error:  # whatever rclpy raises: the node must not go deaf
-                self._restart(error)
-        if self.failure:
-            _log.error("%s: nothing is received any more", self.failure)
-
-    def _restart(self, error: Exception) -> None:
-        """Replace the executor, and make anew what it waits for: it may never look at the old ones again."""
-        if self._closed:
-            return
-        reason = f"{type(error).__name__}: {error}"
-        now_s = time.monotonic()
-        self._restarts_s.append(now_s)
-        self.restart_count += 1
-        self.restart_reason = reason
-        if not self._context.ok():
-            self.failure = "the context of rclpy was shut down from outside"
-        elif len(self._restarts_s) > _RESTART_COUNT_MAX and now_s - self._restarts_s[0] < _RESTART_PERIOD_S:
-            self.failure = f"the executor of rclpy fails again and again: {reason}"
-        if self.failure:
-            return
-        _log.warning("the executor of rclpy has failed and is restarted: %s", reason, exc_info=error)
-        try:
-            self._executor.shutdown(timeout_sec=0.0)
-            self._executor = self._make_executor()
-            for endpoint in self._endpoints:
-                if endpoint.is_waited_for:
-                    endpoint.destroy(self.node, endpoint.handle)
-                    endpoint.handle = endpoint.make(self.node)
-            self._executor.create_task(self._work)
-        except Exception as fatal:  # nothing is left that could be tried
-            self.failure = f"the executor of rclpy cannot be restarted: {type(fatal).__name__}: {fatal}"
+            except Exception as error:  # whatever rclpy raises: the node must not go deaf unnoticed
+                reason = f"the executor of rclpy has failed: {type(error).__name__}: {error}"
+            if not self._context.ok():
+                reason = "the context of rclpy was shut down from outside"
+            if reason and not self._closed:
+                self.failure = reason
+                _log.error("%s: nothing is received any more", reason)
 
     def _work(self) -> None:
         while self._jobs:
@@ -237,16 +196,6 @@ class RclpyBackend:
     def failure(self) -> str:
         """Why nothing is received any more, for good; empty while all is well."""
         return next((loop.failure for loop in self._loops() if loop.failure), "")
-
-    @property
-    def trouble(self) -> str:
-        """What went wrong and was mended; empty if nothing was."""
-        return "; ".join(
-            f"the executor of rclpy failed and was restarted, {loop.restart_count} times by now "
-            f"({loop.restart_reason})"
-            for loop in self._loops()
-            if loop.restart_count
-        )
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
@@ -318,8 +267,6 @@ class _Endpoint:
         handle: What rclpy has for it; None once it is closed.
     """
 
-    is_waited_for = True
-    """Whether the executor waits for it."""
     lister = ""
     """What the node lists those of a topic with."""
     destroyer = ""
@@ -337,10 +284,6 @@ class _Endpoint:
         """Return a handle of a node."""
         raise NotImplementedError
 
-    def destroy(self, node: Any, handle: Any) -> None:
-        """Destroy the handle."""
-        getattr(node, self.destroyer)(handle)
-
     def close(self) -> None:
         """Withdraw it."""
         if self.handle is not None:
@@ -350,7 +293,6 @@ class _Endpoint:
 class RclpyPublisher(_Endpoint):
     """Publishes on one topic."""
 
-    is_waited_for = False
     lister = "get_publishers_info_by_topic"
     destroyer = "destroy_publisher"
 
