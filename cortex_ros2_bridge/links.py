@@ -260,13 +260,13 @@ class Connections:
         return lambda: any(i.heard for i in self.incoming.values() if i.whereabouts is whereabouts)
 
     def _take_transform(self, source: str, transform: Any, tally: Tally) -> None:
-        tally.receive()
+        tally.count("received")
         try:
             self._static.add(source, transform)
         except convert.ConvertError as error:
-            tally.refuse(str(error))
+            tally.count("refused", str(error))
         else:
-            tally.send()
+            tally.count("sent")
 
 
 def _topic_of(type_name: str, seen: Seen) -> str | None:

@@ -153,22 +153,11 @@ def _make_class(type_name: str) -> Any:
         "__doc__": f"Message class '{base}'.",
         "__module__": __name__,
         "__qualname__": base,
-        "__reduce__": _reduce,
         "__ros_type__": type_name,
         "_fields_and_field_types": {field.name: _idl_type(field.description) for field in fields},
         "__ros_fields__": tuple(fields),
     }
     return type(base, (Message,), attributes)
-
-
-def _reduce(self: Message) -> tuple[Any, ...]:
-    """Pickle and copy by the name of the type: its class has no place in a module."""
-    return _restore, (self.__ros_type__, [getattr(self, slot) for slot in self.__slots__])
-
-
-def _restore(type_name: str, values: list[Any]) -> Any:
-    kind = message_class(type_name)
-    return kind(**dict(zip(kind.get_fields_and_field_types(), values, strict=True)))
 
 
 def _as_it_is(value: Any) -> Any:

@@ -24,7 +24,7 @@ from cortex.messages import (
 )
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
-from cortex_ros2_bridge.convert import Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.convert import Context, ConvertError, static_transforms, transform_of
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.routes import Route
 from cortex_ros2_bridge.tally import Tally
@@ -98,18 +98,18 @@ class Outgoing:
     def send(self, message: Any) -> None:
         """Convert a message and publish it."""
         tally = self.tally
-        tally.receive()
+        tally.count("received")
         if isinstance(message, Events) and message.dropped_count:
-            tally.drop(message.dropped_count)
+            tally.count("dropped", "events that did not fit into the sensor's buffer", message.dropped_count)
         if self.whereabouts is not None:
             self._context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
             data = self._convert(message, self._context)
         except (ConvertError, cdr.CdrError) as error:
-            tally.refuse(str(error))
+            tally.count("refused", str(error))
             return
         except Exception as error:  # whatever is wrong with a message, the next one may be right
-            tally.refuse(f"{type(error).__name__}: {error}")
+            tally.count("refused", f"{type(error).__name__}: {error}")
             return
         if data is None:
             return
@@ -118,9 +118,9 @@ class Outgoing:
             try:
                 self._publisher.publish(data)
             except BackendError as error:
-                self.tally.lose(str(error))
+                self.tally.count("lost", str(error))
                 return
-            self.tally.send()
+            self.tally.count("sent")
             if self._latched:
                 self._last, self._last_s = bytes(data), time.monotonic()
 
@@ -148,7 +148,7 @@ class Outgoing:
                     try:
                         self._publisher.publish(self._last)
                     except BackendError as error:
-                        self.tally.lose(str(error))
+                        self.tally.count("lost", str(error))
 
 
 class StaticTransforms:
@@ -156,7 +156,7 @@ class StaticTransforms:
 
     def __init__(self, frames: FrameNames) -> None:
         self._frames = frames
-        self._transforms: dict[str, tuple[str, Transform]] = {}
+        self._transforms: dict[str, tuple[str, Any]] = {}
         self._vehicles: tuple[str, ...] = ()
         self._lock = threading.Lock()
         self.changed = False
@@ -167,9 +167,9 @@ class StaticTransforms:
         Raises:
             ConvertError: It is none: the one before stays.
         """
-        check_transform(transform, self._frames)
+        made = transform_of(transform, self._frames)
         with self._lock:
-            self._transforms[transform.child] = source, transform
+            self._transforms[transform.child] = source, made
             self.changed = True
 
     def keep(self, sources: Iterable[str], vehicles: Iterable[str]) -> None:
@@ -337,10 +337,10 @@ class Feed:
         self._told = now
         for output in self._outputs:
             if lost and output.wanted:
-                output.tally.receive(lost)
-                output.tally.lose("the bridge, or the machine, is too slow", lost)
+                output.tally.count("received", count=lost)
+                output.tally.count("lost", "the bridge, or the machine, is too slow", lost)
             for _ in range(rejected):
-                output.tally.refuse("a malformed message, or one of another type")
+                output.tally.count("refused", "a malformed message, or one of another type")
 
 
 @dataclass(eq=False)

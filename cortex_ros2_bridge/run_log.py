@@ -27,5 +27,5 @@ class RunLog:
         for vehicle in status.vehicles:
             tally = self._refused.setdefault(vehicle.name, Tally(f"{vehicle.name}: the simulator"))
             if vehicle.refused_count > tally.refused:
-                tally.refuse(vehicle.refused_reason, vehicle.refused_count - tally.refused)
+                tally.count("refused", vehicle.refused_reason, vehicle.refused_count - tally.refused)
             tally.refused = vehicle.refused_count

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
@@ -89,18 +89,13 @@ _stores: list[Typestore] = []
 def definitions() -> dict[str, str]:
     """Return the text of each definition that the bridge brings along, by its type's name."""
     found = {}
-    for package in files("cortex_ros2_bridge").joinpath("definitions").iterdir():
-        for folder in package.iterdir():
-            for path in folder.iterdir():
-                name, _, kind = path.name.partition(".")
-                text = path.read_text(encoding="utf-8")
-                if kind == "msg":
-                    found[f"{package.name}/msg/{name}"] = text
-                elif kind == "srv":
-                    for half, part in zip(
-                        service_types(f"{package.name}/srv/{name}"), _halves(text), strict=True
-                    ):
-                        found[half] = part
+    for path in Path(__file__).with_name("definitions").glob("*/*/*"):
+        package, text = path.parts[-3], path.read_text(encoding="utf-8")
+        if path.suffix == ".msg":
+            found[f"{package}/msg/{path.stem}"] = text
+        elif path.suffix == ".srv":
+            halves = service_types(f"{package}/srv/{path.stem}")
+            found |= zip(halves, _halves(text), strict=True)
     return dict(sorted(found.items()))
 
 

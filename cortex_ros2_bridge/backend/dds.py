@@ -112,11 +112,6 @@ class DdsBackend:
         except (DDSException, Refused) as error:
             raise BackendError(f"DDS does not start in domain {number}: {error}") from error
 
-    @property
-    def layout(self) -> str | None:
-        """Distribution as which the node is announced; None as long as it is not, because nobody is there."""
-        return self.graph.layout
-
     def publisher(self, topic: str, type_name: str, qos: Qos) -> DdsPublisher:
         """Publish on a topic."""
         check_name(topic)

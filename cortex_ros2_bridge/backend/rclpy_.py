@@ -244,11 +244,6 @@ class RclpyBackend:
             loop.close()
         self._context.try_shutdown()
 
-    @property
-    def node(self) -> Any:
-        """The node of rclpy."""
-        return self._loop.node
-
     def _loops(self) -> list[_Loop]:
         return [self._loop] if self._service_loop is None else [self._loop, self._service_loop]
 

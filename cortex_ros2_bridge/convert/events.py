@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from cortex import messages
-from cortex.evt3 import EventCodecError, EventColumns, Evt3Encoder
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Encoder, check_pixels
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
-from cortex_ros2_bridge.event_codec import EventPicture, encode_mono
+from cortex_ros2_bridge.event_codec import encode_mono
+
+_COLORS = np.array([[255, 255, 255], [220, 30, 30], [30, 60, 220]], np.uint8)
+"""Red, green, blue of a pixel without events, that became darker, that became brighter."""
 
 
 @standard(messages.Events, "event_camera_msgs/EventPacket", "{topic}", PACKETS, "encoding")
@@ -55,28 +60,28 @@ def event_image(message: messages.Events, context: Context) -> Any:
     of simulated time. A picture ends with the window in which a multiple of the period lies, and has its
     stamp.
     """
-    size = (int(message.width), int(message.height))
-    if context.memory.get("picture_size") != size:
-        context.memory["picture_size"] = size
-        context.memory["picture"] = EventPicture(width=size[0], height=size[1])
-    picture: EventPicture = context.memory["picture"]
+    shape = int(message.height), int(message.width)
+    last = context.memory.get("picture")
+    if last is None or last.shape != shape:
+        last = context.memory["picture"] = np.zeros(shape, np.uint8)
     if message.stamp_ns < context.memory.get("seen_until_ns", message.stamp_ns):  # time was set back
-        picture.take()
+        last[:] = 0
     ends = _ends_picture(message, context)
     try:
-        picture.add(message.x, message.y, message.polarity)
+        check_pixels(message.x, message.y, message.polarity, shape[1], shape[0])
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
+    last[message.y, message.x] = message.polarity + np.uint8(1)
     if not ends:
         return None
-    data = picture.take()
+    data = _COLORS.take(last, axis=0)
+    last[:] = 0
     return record("sensor_msgs/msg/Image")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
-        size[1],
-        size[0],
+        *shape,
         "rgb8",
         0,
-        3 * size[0],
+        3 * shape[1],
         data.reshape(-1),
     )
 

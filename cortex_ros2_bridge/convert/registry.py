@@ -308,6 +308,7 @@ def _add(kind: type[Any], rule: Rule) -> None:
 _SCALARS = {"bool", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64))}
 
 
+@functools.cache
 def ros_type_of(name: str) -> str:
     """Return what a type of Cortex is called in ROS: my_robot/msg/Battery for my_robot/Battery.
 
@@ -371,56 +372,40 @@ def _ros_field(kind: Any, name: str) -> str:
 
 def _writer(plain: Any, ros_type: str) -> Out:
     """Return the conversion to ROS of messages of a schema."""
-    convert = _to_record(plain, ros_type)
-    return lambda message, context: cdr.encode(convert(message, context))
+    return lambda message, context: cdr.encode(_to_record(plain, ros_type, message, context))
 
 
-def _to_record(plain: Any, ros_type: str) -> Callable[[Any, Context], Any]:
-    fields = [(field["name"], _to_value(field["type"])) for field in plain["fields"]]
-    names = [name for name, _ in fields]
-    make = record(ros_type)
+def _to_record(plain: Any, ros_type: str, message: Any, context: Context) -> Any:
+    is_stamped = any(field["name"] == "stamp_ns" for field in plain["fields"])
+    values: list[Any] = []
+    if is_stamped:
+        frame = getattr(message, "frame_id", "") or context.frame_id
+        values.append(header(message.stamp_ns, frame, context))
+    for field in plain["fields"]:
+        name, kind = field["name"], field["type"]
+        if is_stamped and name in ("stamp_ns", "frame_id"):
+            continue
+        value = getattr(message, name)
+        values.append(_to_value(kind, value, context))
+        if isinstance(kind, dict) and len(kind.get("shape", ())) > 1:
+            values.append(np.array(np.shape(value), np.uint32))
+    return record(ros_type)(*values)
 
-    def convert(message: Any, context: Context) -> Any:
-        values: list[Any] = []
-        if "stamp_ns" in names:
-            frame = getattr(message, "frame_id", "") or context.frame_id
-            values.append(header(message.stamp_ns, frame, context))
-        for name, to_value in fields:
-            if name != "stamp_ns" and not (name == "frame_id" and "stamp_ns" in names):
-                values += to_value(getattr(message, name), context)
-        return make(*values)
 
-    return convert
-
-
-def _to_value(kind: Any) -> Callable[[Any, Context], list[Any]]:
-    """Return what makes the values in ROS of a field: one, or for arrays of more dimensions two."""
-    if kind == "bytes":
-        return lambda value, _: [np.frombuffer(bytes(value), np.uint8)]
+def _to_value(kind: Any, value: Any, context: Context) -> Any:
+    """Return the value in ROS of a field."""
     if isinstance(kind, str):
-        return lambda value, _: [value]
+        return np.frombuffer(bytes(value), np.uint8) if kind == "bytes" else value
     if "array" in kind:
-        dtype, many = np.dtype(kind["array"]), len(kind["shape"]) > 1
-
-        def flat(value: Any, _: Context) -> list[Any]:
-            array = np.ascontiguousarray(value, dtype)
-            shape = [np.array(array.shape, np.uint32)] if many else []
-            return [array.reshape(-1), *shape]
-
-        return flat
+        return np.ascontiguousarray(value, kind["array"]).reshape(-1)
     if "enum" in kind:
-        return lambda value, _: [int(getattr(value, "value", value))]
+        return int(getattr(value, "value", value))
     if "message" in kind:
-        inner = _to_record(kind["message"], ros_type_of(kind["message"]["name"]))
-        return lambda value, context: [inner(value, context)]
-    item = _to_value(kind["list"])
-    plain_item = isinstance(kind["list"], str) and kind["list"] != "str"
-
-    def each(values: Any, context: Context) -> list[Any]:
-        items = [item(value, context)[0] for value in values]
-        return [np.array(items, kind["list"]) if plain_item else items]
-
-    return each
+        inner = kind["message"]
+        return _to_record(inner, ros_type_of(inner["name"]), value, context)
+    items = [_to_value(kind["list"], each, context) for each in value]
+    is_row = isinstance(kind["list"], str) and kind["list"] != "str"
+    return np.array(items, kind["list"]) if is_row else items
 
 
 def _reader(kind: type[Any], plain: Any) -> Callable[[Any, Context], Any]:

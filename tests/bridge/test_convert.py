@@ -20,7 +20,7 @@ import pytest
 from cortex import messages
 from cortex.evt3 import Evt3Decoder
 from cortex_ros2_bridge import cdr, frames
-from cortex_ros2_bridge.convert import RULES, Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.convert import RULES, Context, ConvertError, static_transforms, transform_of
 from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
@@ -49,7 +49,7 @@ convert = SimpleNamespace(
         rule.convert.__name__: rule.convert for rule in RULES if rule.direction != "record" and not rule.robot
     },
     static_transforms=static_transforms,
-    check_transform=check_transform,
+    transform_of=transform_of,
 )
 GOLDEN = Path(__file__).with_name("golden")
 TURN = np.array([0.5, 0.5, 0.5, 0.5])
@@ -731,7 +731,8 @@ def test_static_transforms_are_one_message_from_the_map_on():
         translation=np.array([0.1, 0.2, 0.3]),
         rotation=TURN,
     )
-    data = static_transforms([mount], ["a", "b"], FrameNames(map="earth"))
+    names = FrameNames(map="earth")
+    data = static_transforms([transform_of(mount, names)], ["a", "b"], names)
     identity = (0.0, 0.0, 0.0, 1.0)
     expected = record(
         "tf2_msgs/TFMessage",
@@ -750,7 +751,7 @@ def test_frames_of_a_flight_form_one_tree():
     mount = messages.Transform(0, "drone/base_link", "drone/imu", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     parents = {}
     for data in (
-        static_transforms([mount], ["drone"], FrameNames()),
+        static_transforms([transform_of(mount, FrameNames())], ["drone"], FrameNames()),
         convert.odometry_transform(ODOMETRY, context()),
     ):
         for each in cdr.decode(data, "tf2_msgs/msg/TFMessage").transforms:
@@ -1355,7 +1356,9 @@ if __name__ == "__main__":
     (GOLDEN / "event_image.cdr").write_bytes(event_image_bytes())
     tf_static = messages.Transform(STAMP_NS, "a/base_link", "a/imu", np.array([0.1, 0.2, 0.3]), TURN)
     (GOLDEN / "static_transforms.cdr").write_bytes(
-        static_transforms([tf_static], ["a", "b"], FrameNames(map="earth"))
+        static_transforms(
+            [transform_of(tf_static, FrameNames(map="earth"))], ["a", "b"], FrameNames(map="earth")
+        )
     )
 
 

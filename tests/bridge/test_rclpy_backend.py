@@ -196,7 +196,7 @@ def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None
         return response
 
     service = node.service("/drone/reset", TRIGGER, answer)
-    replies = [other.node.call("/drone/reset") for _ in range(3)]
+    replies = [other._loop.node.call("/drone/reset") for _ in range(3)]
     assert [(reply.success, reply.message) for reply in replies] == [
         (True, "reset"),
         (False, "not now"),
@@ -221,7 +221,7 @@ def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
 
     node.service("/reset", TRIGGER, serve)
     node.subscription("/words", STRING, Qos(), got.append)
-    asking = threading.Thread(target=lambda: replies.append(other.node.call("/reset")))
+    asking = threading.Thread(target=lambda: replies.append(other._loop.node.call("/reset")))
     asking.start()
     other.publisher("/words", STRING, Qos()).publish(text("meanwhile"))
     wait_for(lambda: got)
@@ -237,7 +237,7 @@ def test_quality_of_service_reaches_rclpy(fake: None) -> None:
     node = RclpyBackend()
     node.publisher("/a", STRING, Qos(reliability="best_effort", depth=3))
     node.subscription("/b", STRING, Qos(durability="transient_local", depth=7), print)
-    first, second = node.node.pubs[0].qos_profile, node.node.subs[0].qos_profile
+    first, second = node._loop.node.pubs[0].qos_profile, node._loop.node.subs[0].qos_profile
     assert (first.depth, first.reliability.name, first.durability.name) == (3, "BEST_EFFORT", "VOLATILE")
     assert (second.depth, second.reliability.name, second.durability.name) == (
         7,
@@ -245,7 +245,7 @@ def test_quality_of_service_reaches_rclpy(fake: None) -> None:
         "TRANSIENT_LOCAL",
     )
     assert {first.history.name, second.history.name} == {"KEEP_LAST"}
-    assert node.node.context.args == []  # not those of the command line
+    assert node._loop.node.context.args == []  # not those of the command line
     node.close()
 
 
@@ -253,7 +253,7 @@ def test_the_end_of_the_context_is_told(fake: None, caplog: pytest.LogCaptureFix
     node = RclpyBackend()
     node.publisher("/words", STRING, Qos())
     assert node.failure == ""
-    node.node.context.shutdown()
+    node._loop.node.context.shutdown()
     wait_for(lambda: "the context of rclpy was shut down from outside: nothing is received" in caplog.text)
     assert node.failure == "the context of rclpy was shut down from outside"
     with pytest.raises(BackendError, match="shut down from outside"):
@@ -314,7 +314,7 @@ def test_choice(fake: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         node = open_backend(kind, node_name="sim", namespace="/a")
         assert (node.name, node.distro) == ("rclpy", "humble")
         assert isinstance(node, RclpyBackend)
-        assert (node.node.name, node.node.namespace) == ("sim", "/a")
+        assert (node._loop.node.name, node._loop.node.namespace) == ("sim", "/a")
         node.close()
     for path in ("x.mcap", tmp_path / "y"):
         bag = open_backend(tmp_path / path)
