@@ -228,16 +228,18 @@ def _bridge_config(raw: object) -> BridgeConfig:
     )
 
 
-def _backend(key: str, value: object) -> str:
-    """Return the name of a backend, or of a bag."""
+def _checked(key: str, check: Callable[..., Any], *values: Any) -> Any:
     try:
-        return check_kind(_text(key, value))
+        return check(*values)
     except ValueError as error:
         raise ConfigError(f"{key}: {error}") from None
 
 
+def _backend(key: str, value: object) -> Any:
+    return _checked(key, check_kind, _text(key, value))
+
+
 def _distro(key: str, value: object) -> str:
-    """Return the name of a distribution."""
     text = _text(key, value)
     if text not in DISTROS:
         raise ConfigError(f"{key} must be one of {', '.join(DISTROS)}, got {text!r}")
@@ -245,17 +247,13 @@ def _distro(key: str, value: object) -> str:
 
 
 def _cortex_domain(key: str, value: object) -> int:
-    """Return a domain of Cortex."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ConfigError(f"{key} must be an integer >= 0, got {value!r}")
     return value
 
 
-def _node_name(key: str, value: object) -> str:
-    try:
-        return check_node_name(_text(key, value), "")[0]
-    except ValueError as error:
-        raise ConfigError(f"{key}: {error}") from None
+def _node_name(key: str, value: object) -> Any:
+    return _checked(key, check_node_name, _text(key, value), "")[0]
 
 
 def _frame_names(key: str, value: object) -> FrameNames:
@@ -280,10 +278,7 @@ def _options(key: str, value: object) -> dict[str, Any]:
     given = _mapping(key, value)
     _refuse_unknown(key, given, OPTIONS)
     for name, option in given.items():
-        try:
-            check_option(name, option)
-        except ValueError as error:
-            raise ConfigError(f"{key}: {error}") from None
+        _checked(key, check_option, name, option)
     return dict(given)
 
 

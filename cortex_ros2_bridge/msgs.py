@@ -46,7 +46,8 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
     "simulation_interfaces/srv/StepSimulation_Request": {"steps": 1},
 }
-_EMPTY = "structure_needs_at_least_one_member"  # a byte that stands for an empty message on the wire
+EMPTY = "structure_needs_at_least_one_member"
+"""A byte that stands for an empty message on the wire."""
 _HIDDEN = {"actionlib_msgs", "type_description_interfaces"}
 """Packages whose messages have the names of others that are used more; `message_class` finds them."""
 
@@ -141,11 +142,11 @@ def _make_class(type_name: str) -> Any:
     attributes: dict[str, Any] = {
         name: bytes([int(value)]) if kind == "byte" else value for name, kind, value in constants
     }
-    fields = [_field(name, desc) for name, desc in entries if name != _EMPTY]
+    fields = [_field(name, desc) for name, desc in entries if name != EMPTY]
     for name, value in _DEFAULTS.get(type_name, {}).items():
         attributes[f"{name.upper()}__DEFAULT"] = value
         fields = [
-            f._replace(default=functools.partial(_as_it_is, value)) if f.name == name else f for f in fields
+            f._replace(default=functools.partial(as_it_is, value)) if f.name == name else f for f in fields
         ]
     attributes |= {field.name: _accessor(field) for field in fields}
     attributes |= {
@@ -160,7 +161,8 @@ def _make_class(type_name: str) -> Any:
     return type(base, (Message,), attributes)
 
 
-def _as_it_is(value: Any) -> Any:
+def as_it_is(value: Any) -> Any:
+    """Return a value."""
     return value
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
 from cortex.messages import (
-    CameraInfo,
     Clock,
     CommandRanges,
     Events,
@@ -59,6 +58,7 @@ class Outgoing:
     Attributes:
         route: The route.
         tally: What it has done.
+        context: Of its conversion.
         wanted: Whether anybody in ROS listens, or may later; as of the last look.
         subscriber_count: How many listen; as of the last look.
         whereabouts: Of the vehicle whose commands these are; None: they are none.
@@ -74,17 +74,13 @@ class Outgoing:
         self.whereabouts: Whereabouts | None = None
         self._publisher = publisher
         self._convert = convert
-        self._context = context
+        self.context = context
         self._lasting = route.qos.durability == "transient_local"
         self._latched = latched and not self._lasting
         self._lock = threading.Lock()
         self._last: bytes | None = None
         self._last_s = 0.0
         self._remind_s: list[float] = []
-
-    def take_camera_info(self, info: CameraInfo) -> None:
-        """Take in the calibration that goes with each image."""
-        self._context.camera_info = info
 
     def look(self, is_active: bool) -> bool:
         """See who listens; returns whether anybody does, or may later, and messages may pass."""
@@ -102,9 +98,9 @@ class Outgoing:
         if isinstance(message, Events) and message.dropped_count:
             tally.count("dropped", "events that did not fit into the sensor's buffer", message.dropped_count)
         if self.whereabouts is not None:
-            self._context.max_thrust_n = self.whereabouts.max_thrust_n
+            self.context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
-            data = self._convert(message, self._context)
+            data = self._convert(message, self.context)
         except (ConvertError, cdr.CdrError) as error:
             tally.count("refused", str(error))
             return
@@ -113,7 +109,7 @@ class Outgoing:
             return
         if data is None:
             return
-        self._context.sequence += 1
+        self.context.sequence += 1
         with self._lock:
             try:
                 self._publisher.publish(data)
@@ -345,43 +341,40 @@ class Feed:
 
 @dataclass(eq=False)
 class Whereabouts:
-    """What the bridge knows of a vehicle: its newest state, and what time that is."""
+    """What the bridge knows of a vehicle: the newest messages about it, None before the first."""
 
     vehicle: str
     odometry: Odometry | None = None
-    max_thrust_n: float | None = None
-    """Thrust with all rotors at their highest speed [N]; None if the simulator has not said."""
-    ranges: CommandRanges | None = None
-    """What it can be asked for; None if the simulator has not said."""
+    clock: Clock | None = None
+    simulation: Simulation | None = None
+    """What the vehicles can do; the simulator says it once."""
     sources: tuple[str | None, ...] = (None, None, None)
     """Topics of state, of time and of the simulation; None where there is none."""
     resources: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """What is to be closed when the sources change."""
-    clock_ns: int | None = None
 
     def forget(self, sources: tuple[str | None, ...]) -> None:
         """Forget all that came from other sources."""
         self.resources.close()
         self.sources = sources
-        self.odometry = self.clock_ns = self.max_thrust_n = self.ranges = None
+        self.odometry = self.clock = self.simulation = None
 
-    def take_odometry(self, message: Odometry) -> None:
-        """Take in a state."""
-        self.odometry = message
+    @property
+    def max_thrust_n(self) -> float | None:
+        """Thrust with all rotors at their highest speed [N]."""
+        return self._said("thrust_max_n")
 
-    def take_clock(self, message: Clock) -> None:
-        """Take in the time of the run."""
-        self.clock_ns = message.stamp_ns
-
-    def take_simulation(self, message: Simulation) -> None:
-        """Take in what a vehicle can do."""
-        known = dict(zip(message.vehicles, message.thrust_max_n, strict=False))
-        self.max_thrust_n = known.get(self.vehicle)
-        ranges = dict(zip(message.vehicles, message.command_ranges, strict=False))
-        self.ranges = ranges.get(self.vehicle)
+    @property
+    def ranges(self) -> CommandRanges | None:
+        """What it can be asked for."""
+        return self._said("command_ranges")
 
     @property
     def now_ns(self) -> int | None:
-        """Time of the newest state, else that of the run [ns]; None if neither has come."""
-        odometry = self.odometry
-        return self.clock_ns if odometry is None else odometry.stamp_ns
+        """Time of the newest state, else that of the run [ns]."""
+        newest = self.odometry or self.clock
+        return None if newest is None else newest.stamp_ns
+
+    def _said(self, name: str) -> Any:
+        said = self.simulation
+        return said and dict(zip(said.vehicles, getattr(said, name), strict=False)).get(self.vehicle)

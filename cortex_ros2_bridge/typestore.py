@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,20 +96,13 @@ def definitions() -> dict[str, str]:
             found[f"{package}/msg/{path.stem}"] = text
         elif path.suffix == ".srv":
             halves = service_types(f"{package}/srv/{path.stem}")
-            found |= zip(halves, _halves(text), strict=True)
+            found |= zip(halves, re.split("^---\n", text, flags=re.MULTILINE), strict=True)
     return dict(sorted(found.items()))
 
 
 def service_types(type_name: str) -> tuple[str, str]:
     """Return the types of a service's request and response; they are messages of their own."""
     return f"{type_name}_Request", f"{type_name}_Response"
-
-
-def _halves(text: str) -> list[str]:
-    """Split the definition of a service at its line of three dashes."""
-    lines = text.splitlines()
-    at = lines.index("---")
-    return ["\n".join(lines[:at]) + "\n", "\n".join(lines[at + 1 :]) + "\n"]
 
 
 def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:
