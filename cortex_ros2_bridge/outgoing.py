@@ -362,19 +362,19 @@ class Whereabouts:
     @property
     def max_thrust_n(self) -> float | None:
         """Thrust with all rotors at their highest speed [N]."""
-        return self._said("thrust_max_n")
+        said = self.simulation
+        known = {} if said is None else dict(zip(said.vehicles, said.thrust_max_n, strict=False))
+        return known.get(self.vehicle)
 
     @property
     def ranges(self) -> CommandRanges | None:
         """What it can be asked for."""
-        return self._said("command_ranges")
+        said = self.simulation
+        known = {} if said is None else dict(zip(said.vehicles, said.command_ranges, strict=False))
+        return known.get(self.vehicle)
 
     @property
     def now_ns(self) -> int | None:
         """Time of the newest state, else that of the run [ns]."""
         newest = self.odometry or self.clock
         return None if newest is None else newest.stamp_ns
-
-    def _said(self, name: str) -> Any:
-        said = self.simulation
-        return said and dict(zip(said.vehicles, getattr(said, name), strict=False)).get(self.vehicle)

@@ -224,7 +224,7 @@ class RclpyBackend:
         me = node.get_name(), node.get_namespace()
         found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         for topic, _ in node.get_topic_names_and_types():
-            for end, kind in enumerate((RclpyPublisher, RclpySubscription)):
+            for end, kind in enumerate(_ENDS):
                 own = [part.seen_qos for part in parts if isinstance(part, kind) and part.topic == topic]
                 for each in getattr(node, kind.lister)(topic):
                     qos = _qos_of(each)
@@ -380,6 +380,9 @@ class RclpyService(_Endpoint):
         except Exception:  # whatever it raises: the client gets an answer, and the node goes on
             _log.exception("the service %s failed", self.topic)
             return type(response)()
+
+
+_ENDS: tuple[type[_Endpoint], ...] = (RclpyPublisher, RclpySubscription)
 
 
 def _interface(type_name: str) -> Any:
