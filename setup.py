@@ -7,7 +7,6 @@ import numpy
 from setuptools import Extension, setup
 
 SUBJECTS = [
-    "arrival",
     "broadcast",
     "coder",
     "construct",
@@ -20,7 +19,7 @@ SUBJECTS = [
     "socket",
     "unpack",
 ]
-HEADERS = ("broadcast", "coder", "inlet", "items", "native", "numpy")
+HEADERS = ("broadcast", "coder", "items", "native", "numpy")
 
 setup(
     ext_modules=[

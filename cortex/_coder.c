@@ -1,5 +1,5 @@
 /* A `Coder` is made once per message type and publisher. It writes a message as a frame or as a bare body,
-   and reads a frame or a body back: what `packer.py` does, in a fifth of the time.
+   and reads a frame or a body back: what `body.py` does, in a tenth of the time.
 
    It is strict: of whatever is not exactly as usual (another class, a number of NumPy, a wrong dtype or shape, a
    malformed body) it returns None, and the Python code does the work, or says what is wrong. So it never raises for a

@@ -1,7 +1,6 @@
 /* The way of a message in, one at a time; see `inlet.py`. */
 
 #include "_coder.h"
-#include "_inlet.h"
 
 #include <structmember.h>
 
@@ -120,20 +119,13 @@ static PyObject *inlet_call(PyObject *self, PyObject *const *arguments, size_t f
     return may_wait < 0 ? NULL : inlet_take((Inlet *)self, may_wait, INT64_MIN);
 }
 
-int inlet_take_soon(PyObject *self, PyObject **message) {
+static PyObject *inlet_soon(PyObject *self, PyObject *unused) {
+    (void)unused;
     Inlet *inlet = (Inlet *)self;
     const int64_t now_ns = monotonic_ns();
     const int may_go_on = inlet->left > 0 && now_ns < inlet->until_ns;
     inlet->left -= may_go_on;
-    *message = may_go_on ? inlet_take(inlet, 0, now_ns) : Py_NewRef(inlet->nothing);
-    return *message != inlet->nothing;
-}
-
-static PyObject *inlet_soon(PyObject *inlet, PyObject *unused) {
-    (void)unused;
-    PyObject *message;
-    inlet_take_soon(inlet, &message);
-    return message;
+    return may_go_on ? inlet_take(inlet, 0, now_ns) : Py_NewRef(inlet->nothing);
 }
 
 static PyObject *inlet_open(Inlet *inlet, PyObject *const *arguments, Py_ssize_t count) {
@@ -235,7 +227,7 @@ static PyMemberDef inlet_members[] = {
     {NULL, 0, 0, 0, NULL},
 };
 
-PyTypeObject InletType = {
+static PyTypeObject InletType = {
     PyVarObject_HEAD_INIT(NULL, 0)
     .tp_name = "cortex._native.Inlet",
     .tp_doc = inlet_doc,

@@ -16,7 +16,6 @@ enum {
 };
 
 /* Each adds its names to the module; 0, or -1 with an error set. */
-int add_arrival(PyObject *module);
 int add_broadcast(PyObject *module);
 int add_coder(PyObject *module);
 int add_construct(PyObject *module);

@@ -17,7 +17,7 @@ from cortex.layout import has_tail, record_dtype
 from cortex.native import make_coder
 from cortex.schema import schema_of
 
-__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of"]
+__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of", "coder_of"]
 
 
 class Plan:
@@ -184,6 +184,16 @@ def _decode_natively(native: Callable[..., Any], fallback: Callable[..., Any]) -
         return fallback(buffer, offset, size) if message is None else message
 
     return decode
+
+
+def coder_of(codec: Any, head: bytes) -> Any:
+    """Return what packs and reads the messages of one publisher in C; None: Python does.
+
+    Args:
+        codec: Of its type.
+        head: The first 24 bytes of its plain frames.
+    """
+    return make_coder(codec.schema, codec.type, head) if isinstance(codec, Codec) else None
 
 
 _lock = threading.Lock()

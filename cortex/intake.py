@@ -119,13 +119,18 @@ class Intake:
             may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
         """
         links, latency = self._rotated(), self._counters.latency
+        if any(link.coder is None for link in links):
+            if may_wait:
+                self.receive_one(block=True)
+            self.drain()
+            return
         may_wait = may_wait and len(links) == 1 and not self._turn.waiting
         exhausted = True
         self.drained_ns = monotonic_ns()
         for link in links:
             left = min(self._policy.depth, DRAIN_MAX) - len(messages)
             while left > 0 and not self.queue:
-                link.expected, count, frame = link.drain(
+                link.expected, count, frame = link.coder.drain(
                     link.receive,
                     zmq.Again,
                     messages,
@@ -162,9 +167,9 @@ class Intake:
     def gather(self, codec: Codec) -> np.ndarray | None:
         """The plain messages of a type that wait in the sockets, as one array; None if there are none."""
         for link in self._rotated():
-            if link.gather is None or link.codec is not codec:
+            if link.coder is None or link.codec is not codec:
                 continue
-            link.expected, bodies, count, frame = link.gather(
+            link.expected, bodies, count, frame = link.coder.gather(
                 link.receive,
                 zmq.Again,
                 link.expected,

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import zmq
 
-from cortex.codec import Codec, MalformedMessage
+from cortex.codec import Codec, MalformedMessage, coder_of
 from cortex.compiled import native
 from cortex.context import Frames, new_socket
-from cortex.packer import make_reader
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
@@ -93,7 +92,8 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain, self.gather, self.coder = make_reader(codec, self.message_head)
+        self.coder = coder_of(codec, self.message_head)
+        """Reads them in C; its `slots` may be a `RingReader`: then frames that name slots of it, too."""
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,

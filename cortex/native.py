@@ -38,8 +38,7 @@ _Coder: Any = native and native.Coder
 NativeGate: Any = native and native.Gate
 """Sends small messages; see `gate.py`. There is one wherever `make_coder` returns something."""
 NativeInlet: Any = native and native.Inlet
-NativeArrivals: Any = native and native.Arrivals
-"""Take messages one at a time; see `inlet.py`."""
+"""Takes messages one at a time; see `inlet.py`."""
 _NUMBER, _BOOL, _ENUM, _FIXED, _VARIABLE, _STR, _BYTES, _OPTIONAL, _LIST, _MESSAGE = range(10)
 _NAMES_MAX = 64
 """More dimensions of one message that must agree are left to Python."""

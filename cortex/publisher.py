@@ -13,13 +13,12 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from cortex.codec import Codec
+from cortex.codec import Codec, coder_of
 from cortex.context import Closed
 from cortex.fanout import Fanout
-from cortex.gate import Gate, LongGate, make_gate
+from cortex.gate import Gate, make_gate
 from cortex.loan import Loan
 from cortex.outlet import Backoff, Outlets
-from cortex.packer import coder_of
 from cortex.patience import Patience
 from cortex.stats import PublisherCounters
 from cortex.wire import MESSAGE, REST, message_head
@@ -343,7 +342,7 @@ class Publisher(Generic[T]):
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old ones may have been held at the fork
         self._large_lock = threading.Lock()
-        self._gate = LongGate(self._publish_slowly)
+        self._gate = Gate(self._publish_slowly)
         self._patience.is_waiting = False  # who was held up at the fork is not here
         self._closing = self._closed = True
 

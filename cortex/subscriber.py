@@ -14,14 +14,14 @@ import os
 import select
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
-from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, make_arrivals
+from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, Inlet
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Item, Link
 from cortex.loop_reader import LoopReader
@@ -192,7 +192,7 @@ class Subscriber(Generic[T]):
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
-        return make_arrivals(self._inlet, self._recv_until_closed)
+        return _Arrivals(self._inlet, self._recv_until_closed)
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
@@ -359,7 +359,8 @@ class Subscriber(Generic[T]):
         assert dtype is not None
         bodies: list[Any] = [self._record(item, item.buffer)]
         with self._turn:
-            self._intake.drain()
+            if self.policy.reliable:  # else that was done for the first
+                self._intake.drain()
             while self._queue:
                 more = self._queue.popleft()
                 bodies.append(self._record(more, more.buffer))
@@ -647,3 +648,13 @@ class _Messages(Generic[T]):
             return self._subscriber.recv()
         except Closed:
             raise StopIteration from None
+
+
+class _Arrivals(AsyncIterator[T]):
+    def __init__(self, inlet: Inlet, wait: Callable[[], Coroutine[Any, Any, T]]) -> None:
+        self._inlet = inlet
+        self._wait = wait
+
+    async def __anext__(self) -> T:
+        message: T = self._inlet.soon()
+        return await self._wait() if message is NOTHING else message

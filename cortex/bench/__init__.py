@@ -1,1 +1,1 @@
-"""`cortex bench`: Cortex beside raw pyzmq, zenoh, iceoryx2, LCM and memory copies, in one run."""
+"""`cortex bench`: Cortex beside raw pyzmq, zenoh, DDS, ROS 2, memory copies and its own past, in one run."""

@@ -1,22 +1,34 @@
-"""The cases: one per bar, what it sends, who takes part, and what has to come out."""
+"""The cases: one per question, what it sends, who takes part, and what has to come out."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-Kind = Literal["flood", "roundtrip", "copy", "copies at once"]
+Kind = Literal["flood", "roundtrip", "copy", "publisher dies", "reader dies"]
 
-SIZES = {"40": 10, "4k": 1_000, "39k": 9_750, "900k": 225_000, "23.7M": 5_925_000}
-"""Payloads: their name, their number of float32."""
 
-_LABELS = {"40": "40 B", "4k": "4 kB", "39k": "39 kB", "900k": "0.9 MB", "23.7M": "23.7 MB"}
+class Metric(NamedTuple):
+    """How a figure is called and written."""
 
-_SAMPLE = "stamp_ns: int64, data: float32[n]"
+    text: str
+    unit: str
+    larger_is_better: bool = False
 
-_AGE_COUNT = 30_000
-"""Messages at 10 kHz, of which somebody who works 2 ms on each uses over 1,000: p99 means something."""
+
+METRICS = {
+    "rate": Metric("rate", "/s", True),
+    "cpu_us": Metric("subscriber's CPU", "us/msg"),
+    "rtt_p50_us": Metric("round trip p50", "us"),
+    "rtt_p99_us": Metric("round trip p99", "us"),
+    "age_p50_us": Metric("age p50", "us"),
+    "age_p99_us": Metric("age p99", "us"),
+    "known_ms": Metric("death known", "ms"),
+    "grown_kb": Metric("memory grown", "kB"),
+    "shm_files": Metric("shm files left", ""),
+}
 
 
 @dataclass(frozen=True)
@@ -24,7 +36,8 @@ class Contestant:
     """One way of doing a case's job."""
 
     name: str
-    transport: str
+    peer: str = ""
+    """Key of `cortex.bench.peers.PEERS`; empty: no library, but copies of memory."""
     options: Mapping[str, Any] = field(default_factory=dict)
     kind: Kind = "flood"
 
@@ -40,35 +53,6 @@ class Bar:
     bound: float
     metric: str = "rate"
 
-    @property
-    def text(self) -> str:
-        """The bar in words."""
-        best = self.against[0] if len(self.against) == 1 else f"the best of ({', '.join(self.against)})"
-        what = f"{self.who} / {best}" if self.against else self.who
-        unit = "" if self.against else f" {METRICS[self.metric].unit}"
-        return f"{what}, {METRICS[self.metric].text} {self.wanted} {self.bound:,g}{unit}".rstrip()
-
-
-@dataclass(frozen=True)
-class Metric:
-    """How a figure is called and written."""
-
-    text: str
-    unit: str
-    larger_is_better: bool
-
-
-METRICS = {
-    "rate": Metric("rate", "/s", True),
-    "cpu_us": Metric("subscriber's CPU", "us/msg", False),
-    "rtt_p50_us": Metric("round trip p50", "us", False),
-    "rtt_p99_us": Metric("round trip p99", "us", False),
-    "age_p50_us": Metric("age p50", "us", False),
-    "age_p99_us": Metric("age p99", "us", False),
-    "grown_kb": Metric("memory grown", "kB", False),
-    "shm_files": Metric("shm files left", "", False),
-}
-
 
 @dataclass(frozen=True)
 class Case:
@@ -76,262 +60,168 @@ class Case:
 
     name: str
     title: str
-    message: str
-    """The type of what is sent, in words."""
     floats: int
     contestants: tuple[Contestant, ...]
     bars: tuple[Bar, ...] = ()
     metrics: tuple[str, ...] = ("rate",)
+    _: dataclasses.KW_ONLY
     subscribers: int = 1
     count: int = 0
     """Messages per repetition; 0: as many as the time allows."""
     repeats: int = 0
     """At most so many repetitions; 0: as many as asked for."""
+    bound: float = 0.8
+    """What the first metric has to be of that of another checkout (its inverse where smaller is better)."""
+
+    def beside(self, checkout: str) -> Case:
+        """Return the case with each contestant of Cortex in Python also as another checkout has it."""
+        ours = [c for c in self.contestants if c.peer == "cortex" and c.kind in ("flood", "roundtrip")]
+        theirs = [
+            dataclasses.replace(c, name=f"{c.name}, before", options={**c.options, "checkout": checkout})
+            for c in ours
+        ]
+        metric = self.metrics[0]
+        wanted: Literal[">=", "<="] = ">=" if METRICS[metric].larger_is_better else "<="
+        bound = self.bound if wanted == ">=" else round(1.0 / self.bound, 2)
+        bars = [Bar(c.name, (f"{c.name}, before",), wanted, bound, metric) for c in ours]
+        return dataclasses.replace(self, contestants=(*self.contestants, *theirs), bars=(*self.bars, *bars))
 
 
-def _cortex(
-    name: str = "cortex", *, transport: str = "cortex", kind: Kind = "flood", **options: Any
-) -> Contestant:
-    return Contestant(name, transport, options, kind)
+FLOATS = {"40": 10, "4k": 1_000, "39k": 9_750, "900k": 225_000, "23.7M": 5_925_000}
+"""Payloads: their name, their number of float32."""
+_LABELS = {"40": "40 B", "4k": "4 kB", "39k": "39 kB", "900k": "0.9 MB", "23.7M": "23.7 MB"}
+_AGE_COUNT = 30_000
+"""Messages at 10 kHz, of which somebody who works 2 ms on each uses over 1,000: p99 means something."""
+_RTT = ("rtt_p50_us", "rtt_p99_us")
+_AGE = ("age_p50_us", "age_p99_us")
+_RAW1, _RAW2, _RING, _AT_ONCE = (
+    "pyzmq 1 frame",
+    "pyzmq 2 frames, no copy",
+    "copy into ring",
+    "copy in + copy out",
+)
 
 
-def _pyzmq(name: str, *, kind: Kind = "flood", transport: str = "pyzmq", **options: Any) -> Contestant:
-    return Contestant(name, transport, options, kind)
+def _cortex(name: str = "cortex", peer: str = "cortex", kind: Kind = "flood", **options: Any) -> Contestant:
+    return Contestant(name, peer, options, kind)
 
 
-_ONE = _pyzmq("pyzmq 1 frame", frames=1)
-_TWO = _pyzmq("pyzmq 2 frames, no copy", frames=2)
+def _raw(frames: int, kind: Kind = "flood", **options: Any) -> Contestant:
+    return Contestant(_RAW1 if frames == 1 else _RAW2, "pyzmq", {"frames": frames, **options}, kind)
+
+
 _ZENOH = Contestant("zenoh shm", "zenoh")
-_ICEORYX = Contestant("iceoryx2 event", "iceoryx2")
-_LCM = Contestant("LCM", "lcm")
-_PRIVATE = Contestant("copy, private", "copy", kind="copy")
-_RING = Contestant("copy into ring", "copy", {"ring": True}, kind="copy")
-_AT_ONCE = Contestant("copy in + copy out", "copy", kind="copies at once")
+_ROS = (Contestant("Cyclone DDS", "Cyclone DDS"), Contestant("rclpy", "rclpy"))
+_COPIES = (Contestant("copy, private", kind="copy"), Contestant(_RING, "", {"ring": True}, "copy"))
+_PING = _cortex(kind="roundtrip")
 
 
-def _small(name: str, size: str) -> Case:
-    return Case(
-        name,
-        f"{_LABELS[size]}, typed, decoded to the message object in a callback",
-        _SAMPLE,
-        SIZES[size],
-        (_cortex(), _ONE, _ZENOH, _LCM),
-        (Bar("cortex", (_ONE.name,), ">=", 0.85),),
-    )
+def _over(bound: float, *against: str, who: str = "cortex") -> Bar:
+    return Bar(who, against, ">=", bound)
 
 
-def _batch(name: str, size: str, bound: float) -> Case:
-    return Case(
-        name,
-        f"{_LABELS[size]}, type of fixed size, recv_batch as an array of structures",
-        f"stamp_ns: int64, data: float32[{SIZES[size]}]",
-        SIZES[size],
-        (_cortex(fixed=True, how="batch"), _ONE),
-        (Bar("cortex", (_ONE.name,), ">=", bound),),
-    )
+def _under(bound: float, *against: str, metric: str, who: str = "cortex") -> Bar:
+    return Bar(who, against, "<=", bound, metric)
+
+
+def _small(size: str, bound: float) -> Case:
+    title = f"{_LABELS[size]}, typed, decoded to the message object in a callback"
+    contestants = (_cortex(), _raw(1), _ZENOH, *_ROS)
+    return Case(f"typed-{size}", title, FLOATS[size], contestants, (_over(0.85, _RAW1),), bound=bound)
+
+
+def _batch(size: str, bound: float) -> Case:
+    title = f"{_LABELS[size]}, type of fixed size, recv_batch as an array of structures"
+    contestants = (_cortex(fixed=True, how="batch"), _raw(1))
+    return Case(f"batch-{size}", title, FLOATS[size], contestants, (_over(bound, _RAW1),))
 
 
 def _tcp(size: str) -> Case:
-    one, two = _pyzmq(_ONE.name, frames=1, tcp=True), _pyzmq(_TWO.name, frames=2, tcp=True)
-    raw = (two,) if size == "23.7M" else (one, two) if size in ("39k", "900k") else (one,)
+    frames = {"40": (1,), "4k": (1,), "23.7M": (2,)}.get(size, (1, 2))
+    raw = [_raw(number, tcp="127.0.0.1") for number in frames]
+    bar = _over(0.9, *(contestant.name for contestant in raw))
+    contestants = (_cortex(tcp="127.0.0.1"), *raw)
     return Case(
-        f"tcp-{size}",
-        f"{_LABELS[size]} over tcp on loopback, callback",
-        _SAMPLE,
-        SIZES[size],
-        (_cortex(tcp=True), *raw),
-        (Bar("cortex", tuple(contestant.name for contestant in raw), ">=", 0.9),),
+        f"tcp-{size}", f"{_LABELS[size]} over tcp on loopback, callback", FLOATS[size], contestants, (bar,)
     )
 
 
 def _latest(name: str, *, busy: bool) -> Case:
-    def paced(contestant: str, transport: str, **options: Any) -> Contestant:
-        return Contestant(contestant, transport, {"rate_hz": 10_000, "busy": busy, **options})
-
-    return Case(
-        name,
-        f"age of a datum at use, publisher at 10 kHz, 2 ms of {'busy work' if busy else 'sleep'} on each",
-        "stamp_ns: int64, sequence: int64, data: float32[n]",
-        SIZES["40"],
-        (
-            paced("cortex recv", "cortex-latest", how="recv"),
-            paced("cortex callback", "cortex-latest", how="callback"),
-            paced("pyzmq CONFLATE", "pyzmq-latest"),
-        ),
-        tuple(Bar(who, (), "<=", 1000.0, "age_p99_us") for who in ("cortex recv", "cortex callback")),
-        metrics=("age_p50_us", "age_p99_us"),
-        count=_AGE_COUNT,
-    )
+    options: dict[str, Any] = {"rate_hz": 10_000, "busy": busy, "latest": True}
+    title = f"age of a datum at use, publisher at 10 kHz, 2 ms of {'busy work' if busy else 'sleep'} on each"
+    ours = [_cortex(f"cortex {how}", how=how, **options) for how in ("recv", "callback")]
+    contestants = (*ours, Contestant("pyzmq CONFLATE", "pyzmq", options))
+    bars = tuple(_under(1000.0, metric="age_p99_us", who=contestant.name) for contestant in ours)
+    return Case(f"latest-{name}", title, FLOATS["40"], contestants, bars, _AGE, count=_AGE_COUNT)
 
 
-def _memory(name: str, size: str) -> Case:
+def _memory(size: str) -> Case:
     ways = tuple(_cortex(how, how=how) for how in ("callback", "recv", "async"))
-    return Case(
-        name,
-        f"memory of both sides over 10^6 messages of {_LABELS[size]}, by each way to receive",
-        _SAMPLE,
-        SIZES[size],
-        ways,
-        tuple(
-            Bar(way.name, (), "<=", bound, metric)
-            for way in ways
-            for metric, bound in (("grown_kb", 1024.0), ("shm_files", 0.0))
-        ),
-        metrics=("rate", "grown_kb", "shm_files"),
-        count=1_000_000,
-        repeats=1,
+    title = f"memory of both sides over 10^6 messages of {_LABELS[size]}, by each way to receive"
+    bounds = {"grown_kb": 1024.0, "shm_files": 0.0}
+    bars = tuple(
+        _under(bound, metric=metric, who=way.name) for way in ways for metric, bound in bounds.items()
     )
+    metrics = ("rate", *bounds)
+    return Case(f"memory-{size}", title, FLOATS[size], ways, bars, metrics, count=1_000_000, repeats=1)
 
 
-_HOWS = ("callback", "iterator", "recv", "async")
-_SWEEP = (256, 512, 1024, 2048, 4096, 8192, 16384)
-
-
-def _threshold(floats: int) -> Case:
-    size = f"{4 * floats // 1024} KiB"
-    inline: dict[str, Any] = {"inline_max": 1 << 20}
-    shared: dict[str, Any] = {"inline_max": 64}
-    return Case(
-        f"threshold-{4 * floats // 1024}k",
-        f"{size} in the frame or in shared memory: the larger rate says where `inline_max` belongs",
-        _SAMPLE,
-        floats,
-        (
-            _cortex("inline", **inline),
-            _cortex("shared memory", **shared),
-            _cortex("inline, round trip", kind="roundtrip", **inline),
-            _cortex("shared memory, round trip", kind="roundtrip", **shared),
-        ),
-        metrics=("rate", "rtt_p50_us", "rtt_p99_us"),
+def _threshold(kib: int) -> Case:
+    """Compare both ways: `inline_max` is right if the frame carries more up to it, and less above."""
+    inline, shared = 1 << 20, 64
+    contestants = (
+        _cortex("inline", inline_max=inline),
+        _cortex("shared memory", inline_max=shared),
+        _cortex("inline, round trip", kind="roundtrip", inline_max=inline),
+        _cortex("shared memory, round trip", kind="roundtrip", inline_max=shared),
     )
+    bar = Bar("shared memory", ("inline",), ">=" if kib > 16 else "<=", 1.0)
+    title = f"{kib} KiB in the frame or in shared memory: the larger rate says where `inline_max` belongs"
+    return Case(f"threshold-{kib}k", title, 256 * kib, contestants, (bar,), ("rate", *_RTT))
 
-
-_HUGE = SIZES["23.7M"]
-_RTT_ONE = _pyzmq(_ONE.name, kind="roundtrip", frames=1)
-_RTT_TWO = _pyzmq(_TWO.name, kind="roundtrip", frames=2)
-_RTT = ("rtt_p50_us", "rtt_p99_us")
 
 CASES: tuple[Case, ...] = (
-    _small("typed-40", "40"),
-    _small("typed-4k", "4k"),
-    _batch("batch-40", "40", 1.25),
-    _batch("batch-4k", "4k", 1.5),
-    Case(
-        "medium",
-        "39 kB through shared memory, callback",
-        _SAMPLE,
-        SIZES["39k"],
-        (_cortex(), _ONE, _TWO, _ZENOH, _ICEORYX),
-        (Bar("cortex", (_ONE.name, _TWO.name), ">=", 2.0),),
-    ),
-    Case(
-        "large",
-        "0.9 MB through shared memory, callback",
-        _SAMPLE,
-        SIZES["900k"],
-        (_cortex(), _ONE, _TWO, _ZENOH, _ICEORYX, _PRIVATE, _RING),
-        (
-            Bar("cortex", (_ONE.name, _TWO.name), ">=", 3.0),
-            Bar("cortex", (_RING.name,), ">=", 0.7),
-        ),
-    ),
-    Case(
-        "huge",
-        "23.7 MB through shared memory, as a view, callback",
-        _SAMPLE,
-        _HUGE,
-        (_cortex(), _TWO, _ZENOH, _ICEORYX, _PRIVATE, _RING),
-        (
-            Bar("cortex", (_RING.name,), ">=", 0.85),
-            Bar("cortex", (_TWO.name,), ">=", 1.8),
-            Bar("cortex", (_ICEORYX.name,), ">=", 0.95),
-        ),
-    ),
-    Case(
-        "consume",
-        "23.7 MB, the subscriber copies every byte out",
-        _SAMPLE,
-        _HUGE,
-        (
-            _cortex(consume=True),
-            _pyzmq(_TWO.name, frames=2, consume=True),
-            Contestant(_ICEORYX.name, "iceoryx2", {"consume": True}),
-            _AT_ONCE,
-        ),
-        (Bar("cortex", (_AT_ONCE.name,), ">=", 0.85),),
-    ),
-    Case(
-        "loan",
-        "23.7 MB, the producer writes into the slot",
-        _SAMPLE,
-        _HUGE,
-        (_cortex(loan=True),),
-        (Bar("cortex", (), ">=", 10_000.0),),
-    ),
-    Case(
-        "roundtrip-40",
-        "round trip, 40 B out, 40 B back",
-        _SAMPLE,
-        SIZES["40"],
-        (_cortex(kind="roundtrip"), _RTT_ONE),
-        (
-            Bar("cortex", (_ONE.name,), "<=", 1.15, "rtt_p50_us"),
-            Bar("cortex", (_ONE.name,), "<=", 1.3, "rtt_p99_us"),
-        ),
-        metrics=_RTT,
-    ),
-    Case(
-        "roundtrip-900k",
-        "round trip, 0.9 MB out, 40 B back",
-        _SAMPLE,
-        SIZES["900k"],
-        (_cortex(kind="roundtrip"), _RTT_ONE, _RTT_TWO),
-        (Bar("cortex", (_ONE.name, _TWO.name), "<=", 0.6, "rtt_p50_us"),),
-        metrics=_RTT,
-    ),
-    *(_tcp(size) for size in SIZES),
-    Case(
-        "async",
-        "40 B, async iterator beside the blocking ways to receive",
-        _SAMPLE,
-        SIZES["40"],
-        (_cortex("async iterator", how="async"), _cortex("recv", how="recv")),
-        (Bar("async iterator", ("recv",), ">=", 0.8),),
-    ),
-    Case(
-        "fanout",
-        "40 B to 8 subscribers, each in its own process, callback; the slowest one's rate",
-        _SAMPLE,
-        SIZES["40"],
-        (_cortex(), _ONE),
-        (Bar("cortex", (_ONE.name,), ">=", 0.8), Bar("cortex", (), ">=", 100_000.0)),
-        subscribers=8,
-    ),
-    _latest("latest-busy", busy=True),
-    _latest("latest-asleep", busy=False),
-    *(
-        Case(
-            f"cpp-{size}",
-            f"{_LABELS[size]}, Python publisher, C++ subscriber beside the Python one (callback)",
-            _SAMPLE,
-            SIZES[size],
-            (_cortex("C++ subscriber", transport="cortex-cpp"), _cortex("Python subscriber")),
-            (Bar("C++ subscriber", ("Python subscriber",), ">=", 1.0),),
-        )
-        for size in ("40", "900k")
-    ),
-    _memory("memory-40", "40"),
-    _memory("memory-39k", "39k"),
-    *(_threshold(floats) for floats in _SWEEP),
-    Case(
-        "receive",
-        "40 B: what each way to receive costs",
-        _SAMPLE,
-        SIZES["40"],
-        tuple(_cortex(how, how=how) for how in _HOWS),
-        metrics=("rate", "cpu_us"),
-    ),
-)
+    _small("40", 2.0),
+    _small("4k", 1.8),
+    _batch("40", 1.25),
+    _batch("4k", 1.5),
+    Case("medium", "39 kB through shared memory, callback", FLOATS["39k"],
+         (_cortex(), _raw(1), _raw(2), _ZENOH, *_ROS), (_over(2.0, _RAW1, _RAW2),)),
+    Case("large", "0.9 MB through shared memory, callback", FLOATS["900k"],
+         (_cortex(), _raw(1), _raw(2), _ZENOH, *_COPIES), (_over(3.0, _RAW1, _RAW2), _over(0.7, _RING))),
+    Case("huge", "23.7 MB through shared memory, as a view, callback", FLOATS["23.7M"],
+         (_cortex(), _raw(2), _ZENOH, *_COPIES),
+         (_over(0.85, _RING), _over(1.8, _RAW2)), bound=1.0),
+    Case("consume", "23.7 MB, the subscriber copies every byte out", FLOATS["23.7M"],
+         (_cortex(consume=True), _raw(2, consume=True),
+          Contestant(_AT_ONCE, "", {"out": True}, "copy")), (_over(0.85, _AT_ONCE),)),
+    Case("loan", "23.7 MB, the producer writes into the slot", FLOATS["23.7M"], (_cortex(loan=True),),
+         (_over(10_000.0),)),
+    Case("roundtrip-40", "round trip, 40 B out, 40 B back", FLOATS["40"], (_PING, _raw(1, "roundtrip")),
+         (_under(1.15, _RAW1, metric="rtt_p50_us"), _under(1.3, _RAW1, metric="rtt_p99_us")), _RTT,
+         bound=1 / 1.05),
+    Case("roundtrip-900k", "round trip, 0.9 MB out, 40 B back", FLOATS["900k"],
+         (_PING, _raw(1, "roundtrip"), _raw(2, "roundtrip")),
+         (_under(0.6, _RAW1, _RAW2, metric="rtt_p50_us"),), _RTT),
+    *map(_tcp, FLOATS),
+    Case("async", "40 B, async iterator beside the blocking ways to receive", FLOATS["40"],
+         (_cortex("async iterator", how="async"), _cortex("recv", how="recv")),
+         (_over(0.8, "recv", who="async iterator"),)),
+    Case("fanout", "40 B to 8 subscribers, each in its own process, callback; the slowest one's rate",
+         FLOATS["40"], (_cortex(), _raw(1)), (_over(0.8, _RAW1), _over(100_000.0)), subscribers=8),
+    _latest("busy", busy=True),
+    _latest("asleep", busy=False),
+    _memory("40"),
+    _memory("39k"),
+    Case("deaths", "from the kill of a process under load until the other side knows", FLOATS["40"],
+         (_cortex("publisher", kind="publisher dies"),
+          _cortex("reader", kind="reader dies", max_wait_s=30.0)),
+         tuple(_under(10.0, metric="known_ms", who=who) for who in ("publisher", "reader")), ("known_ms",)),
+    *map(_threshold, (1, 2, 4, 8, 16, 32, 64)),
+    Case("receive", "40 B: what each way to receive costs", FLOATS["40"],
+         tuple(_cortex(how, how=how) for how in ("callback", "iterator", "recv", "async")), (),
+         ("rate", "cpu_us")),
+)  # fmt: skip
 
 
 def choose(names: list[str]) -> list[Case]:
@@ -340,11 +230,11 @@ def choose(names: list[str]) -> list[Case]:
     Raises:
         ValueError: A name fits none.
     """
+
+    def fits(case: Case, name: str) -> bool:
+        return case.name == name or case.name.startswith(f"{name}-")
+
     for name in names:
-        if not any(_fits(case, name) for case in CASES):
+        if not any(fits(case, name) for case in CASES):
             raise ValueError(f"unknown case {name!r}, known: {', '.join(case.name for case in CASES)}")
-    return [case for case in CASES if not names or any(_fits(case, name) for name in names)]
-
-
-def _fits(case: Case, name: str) -> bool:
-    return case.name == name or case.name.startswith(f"{name}-")
+    return [case for case in CASES if not names or any(fits(case, name) for name in names)]

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import importlib
 import os
-import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
-from cortex.bench.cases import CASES, Case, choose
-from cortex.bench.measure import CaseResult, Settings, private_folder, run_case
-from cortex.bench.report import case_lines, header, summary_lines, threshold_lines, write_csv
+from cortex.bench import peer_cortex  # noqa: F401  # here, so that its children need not
+from cortex.bench.cases import choose
+from cortex.bench.measure import CaseResult, Settings, run_case
+from cortex.bench.peers import import_cortex, runtime_dir
+from cortex.bench.processes import Child
+from cortex.bench.report import make_console, print_case, print_header, print_list, print_summary, write_csv
 
 _AGAIN = 4
 """So many times as many repetitions are made at most, where a bar lies within the noise."""
@@ -21,52 +26,27 @@ _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
 _QUICK_COUNT = 5_000
 _REGISTRY_START_S = 10.0
-_REGISTRY_LINGER_S = 60.0
-"""The registry ends itself so long after the last node, should this process be killed."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `cortex bench`."""
-    parser.add_argument(
-        "case", nargs="*", help="cases to run, all by default; `tcp` stands for every `tcp-…`"
-    )
-    parser.add_argument(
-        "--repeats",
-        type=int,
-        default=9,
-        help=f"repetitions of each contestant (9), {_AGAIN} times as many where a bar lies within the noise",
-    )
-    parser.add_argument("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
-    parser.add_argument(
-        "--quick", action="store_true", help="tiny runs: shows that it works, measures nothing"
-    )
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write every figure there, too")
-    parser.add_argument("--list", action="store_true", help="name the cases and their bars")
+_PARENT_MAX = 40
+"""Longest directory of temporary files [characters]: paths of sockets end at 107."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return the exit status (2: wrong arguments)."""
     parser = argparse.ArgumentParser("cortex bench", description="Cortex beside its peers on this machine.")
-    add_arguments(parser)
-    return run(parser.parse_args(arguments))
-
-
-def run(options: argparse.Namespace) -> int:
-    """Run what the parsed options ask for; return the exit status."""
+    add = parser.add_argument
+    add("case", nargs="*", help="cases to run, all by default; `tcp` stands for every `tcp-…`")
+    add("--repeats", type=int, default=9, help=f"repetitions of each contestant (9), {_AGAIN} times as many "
+        "where a bar lies within the noise")  # fmt: skip
+    add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
+    add(
+        "--against", type=Path, metavar="CHECKOUT", help="measure Cortex of this checkout (built) beside ours"
+    )
+    add("--quick", action="store_true", help="tiny runs: shows that it works, measures nothing")
+    add("--csv", type=Path, metavar="FILE", help="write every figure there, too")
+    add("--list", action="store_true", help="name the cases and their bars")
+    options = parser.parse_args(arguments)
     try:
-        cases = choose(options.case)
-        if options.list:
-            _list(cases)
-            return 0
-        with private_folder() as folder, _own_registry(folder):
-            settings = Settings(
-                folder=folder,
-                repeats=min(options.repeats, _QUICK_REPEATS) if options.quick else options.repeats,
-                repeats_max=0 if options.quick else _AGAIN * options.repeats,
-                seconds=min(options.seconds, _QUICK_SECONDS) if options.quick else options.seconds,
-                count_max=_QUICK_COUNT if options.quick else 0,
-            )
-            results = _run_all(cases, settings, quick=options.quick)
+        results = _run(options)
     except ValueError as error:
         print(f"cortex bench: {error}", file=sys.stderr)
         return 2
@@ -75,78 +55,67 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_all(cases: list[Case], settings: Settings, *, quick: bool) -> list[CaseResult]:
-    print("\n".join(header()))
-    print(
-        f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved, up to "
-        f"{max(settings.repeats, settings.repeats_max)} where a bar lies within the noise;\n"
-        "median ± half of its 95 % interval\n"
+def _run(options: argparse.Namespace) -> list[CaseResult]:
+    """Run the cases, each printed when it is over."""
+    console = make_console()
+    cases = choose(options.case)
+    if options.against is not None:
+        cases = [case.beside(str(options.against.resolve())) for case in cases]
+    if options.list:
+        print_list(console, cases)
+        return []
+    if options.repeats < 1 or not 0.0 < options.seconds <= 600.0:  # also refuses nan
+        raise ValueError(
+            f"wants repeats >= 1 and 0 < seconds <= 600, got {options.repeats}, {options.seconds}"
+        )
+    quick = options.quick
+    settings = Settings(
+        repeats=min(options.repeats, _QUICK_REPEATS) if quick else options.repeats,
+        repeats_max=0 if quick else _AGAIN * options.repeats,
+        seconds=min(options.seconds, _QUICK_SECONDS) if quick else options.seconds,
+        count_max=_QUICK_COUNT if quick else 0,
     )
     results: list[CaseResult] = []
-    try:
-        for case in cases:
-            results.append(run_case(case, settings, progress=_progress))
-            _progress("")
-            print("\n".join(case_lines(results[-1], quick=quick)), end="\n\n", flush=True)
-    except KeyboardInterrupt:
-        _progress("")
-        print("interrupted; what was measured until then:", end="\n\n")
-    for table in (threshold_lines(results, quick=quick), summary_lines(results, quick=quick)):
-        if text := "\n".join(table):
-            print(text, end="\n\n")
+    with ExitStack() as stack:
+        _make_place(stack, options.against)
+        print_header(console)
+        console.print(
+            f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved, up to "
+            f"{max(settings.repeats, settings.repeats_max)} where a bar lies within the noise;\n"
+            "median ± half of its 95 % interval\n"
+        )
+        try:
+            for case in cases:
+                results.append(run_case(case, settings))
+                print_case(console, results[-1], judged=not quick)
+        except KeyboardInterrupt:
+            console.print("interrupted; what was measured until then:\n")
+    print_summary(console, results, judged=not quick)
     return results
 
 
-@contextlib.contextmanager
-def _own_registry(folder: Path) -> Iterator[None]:
-    """Keep the run to itself: other nodes of this host neither see it nor are disturbed by it."""
-    saved = os.environ.get("CORTEX_RUNTIME_DIR")
-    (folder / "rt").mkdir(mode=0o700)
-    os.environ["CORTEX_RUNTIME_DIR"] = str(folder / "rt")
-    os.environ["CORTEX_BENCH_DIR"] = str(folder)
-    command = [sys.executable, "-m", "cortex.discovery", "--embedded", "--linger", str(_REGISTRY_LINGER_S)]
-    root = str(Path(__file__).parents[2])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-    with open(folder / "registry.log", "ab") as log:
-        registry = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": path})
-    try:
-        _await_socket(folder)
-        yield
-    finally:
-        registry.terminate()
-        try:
-            registry.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            registry.kill()
-            registry.wait()
-        if saved is None:
-            del os.environ["CORTEX_RUNTIME_DIR"]
-        else:
-            os.environ["CORTEX_RUNTIME_DIR"] = saved
+def _make_place(stack: ExitStack, checkout: Path | None) -> None:
+    """Keep the run to itself: a directory and a registry of its own, and one of the other checkout."""
+    parent = tempfile.gettempdir()
+    short = parent if len(parent) <= _PARENT_MAX else "/tmp"
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cxb", dir=short))
+    os.environ["CORTEX_BENCH_DIR"] = folder
+    for name in ("", str(checkout.resolve())) if checkout else ("",):
+        place = runtime_dir(name)
+        place.mkdir(mode=0o700)
+        registry = stack.enter_context(Child(_serve_registry, name, deadline_s=_REGISTRY_START_S))
+        stack.callback(registry.kill)
+        # A node that finds no registry would start another, which we could not end.
+        deadline = time.monotonic() + _REGISTRY_START_S
+        while not list(place.glob("*/registry")):
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"no registry within {_REGISTRY_START_S} s")
+            time.sleep(0.005)
+    os.environ["CORTEX_RUNTIME_DIR"] = str(runtime_dir())
 
 
-def _await_socket(folder: Path) -> None:
-    """Wait until the registry answers: a node that finds none would start another, which we could not end."""
-    deadline = time.monotonic() + _REGISTRY_START_S
-    while not list((folder / "rt").glob("*/registry")):
-        if time.monotonic() > deadline:
-            raise RuntimeError(
-                f"no registry within {_REGISTRY_START_S} s: {(folder / 'registry.log').read_text()}"
-            )
-        time.sleep(0.005)
-
-
-def _progress(text: str) -> None:
-    """Show what runs now, on a terminal only."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
-
-def _list(cases: list[Case]) -> None:
-    for case in cases:
-        print(f"{case.name:<18}{case.title}")
-        for bar in case.bars:
-            print(f"{'':<18}  {bar.text}")
-
-
-__all__ = ["CASES", "add_arguments", "main", "run"]
+def _serve_registry(_pipe: Any, checkout: str) -> None:
+    os.environ["CORTEX_RUNTIME_DIR"] = str(runtime_dir(checkout))
+    if checkout:
+        import_cortex(checkout)
+    importlib.import_module("cortex.discovery").main(["--embedded", "--linger", "3600"])

@@ -7,37 +7,41 @@ of what was measured is measured again, up to a limit, whichever side of it the 
 
 from __future__ import annotations
 
-import contextlib
-import statistics
+import math
+import os
+import socket
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from cortex.bench import roles
 from cortex.bench.cases import METRICS, Bar, Case, Contestant
-from cortex.bench.children import Child, ChildFailed
-from cortex.bench.copies import copy_alone, copy_in, copy_out, make_ring, slots_of
-from cortex.bench.job import Job
-from cortex.bench.spread import Spread
-from cortex.bench.transports import missing
+from cortex.bench.peers import Job, missing
+from cortex.bench.processes import Child, ChildFailed
+from cortex.bench.tally import make_payloads
 
+_CONFIDENCE = 0.95
 _SHM = Path("/dev/shm")
 _GRACE_S = 120.0
 _SLOWEST_HZ = 2_000.0
-_PARENT_MAX = 40
-"""Longest directory of temporary files [characters]: paths of sockets end at 107."""
+_LOADED_S = 0.3
+"""So long after the beginning of a flood a process is killed [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
+Report = dict[str, Any]
+"""What one repetition gave: a figure by metric, counts; `error` or `absent` if it gave none."""
+
+
+class Settings(NamedTuple):
     """How long and how often to measure."""
 
-    folder: Path
-    """Private directory of the run."""
     repeats: int = 5
     repeats_max: int = 0
     """Up to which a bar is measured again that lies within the noise; 0: it is not."""
@@ -45,52 +49,48 @@ class Settings:
     count_max: int = 0
     """Bounds the messages of cases that count them; 0: no bound."""
 
-    def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ValueError(f"repeats must be >= 1, got {self.repeats}")
-        if not 0.0 < self.seconds <= 600.0:  # also refuses nan
-            raise ValueError(f"seconds must be > 0 and <= 600, got {self.seconds}")
+
+class Spread(NamedTuple):
+    """A median, and between what the true one lies."""
+
+    median: float
+    low: float
+    """With `high`, the 95 % interval of the median, whatever the distribution; the range of 8 or fewer."""
+    high: float
 
 
-@dataclass
-class Outcome:
-    """What one contestant did in all its repetitions."""
+def spread_of(values: list[float]) -> Spread | None:
+    """Return the spread of some figures; None if there are none.
 
-    contestant: Contestant
-    repetitions: list[dict[str, Any]] = field(default_factory=list)
-    """Reports, in order; one that failed has only the key ``error``."""
-    absent: str = ""
-    """Why it did not take part."""
-
-    def values(self, metric: str) -> list[float]:
-        """Return one figure per repetition that has it."""
-        return [float(report[metric]) for report in self.repetitions if metric in report]
-
-    def total(self, count: str) -> int:
-        """Return the sum of a count over all repetitions."""
-        return sum(int(report.get(count, 0)) for report in self.repetitions)
-
-    @property
-    def errors(self) -> list[str]:
-        """What went wrong, one text for each repetition that failed."""
-        return [str(report["error"]) for report in self.repetitions if "error" in report]
-
-    @property
-    def faults(self) -> str:
-        """Losses, disorder and damage in words; empty if there were none."""
-        counts = {
-            "LOST": self.total("lost"),
-            "OUT OF ORDER": self.total("misordered"),
-            "CORRUPT": self.total("corrupt"),
-        }
-        parts = [f"{name} {count:,}" for name, count in counts.items() if count]
-        if counts["LOST"]:
-            parts[0] += f" ({100.0 * counts['LOST'] / max(1, self.total('sent')):.1f} %)"
-        return ", ".join(parts)
+    The true median exceeds each figure with probability 1/2: so how many lie below it is binomial.
+    """
+    if not values:
+        return None
+    ordered = sorted(values)
+    count, outside, below = len(ordered), 0, 1 + len(ordered)
+    while 2 * below <= (1.0 - _CONFIDENCE) * 2**count:
+        outside += 1
+        below += math.comb(count, outside + 1)
+    return Spread(float(np.median(ordered)), ordered[outside], ordered[-1 - outside])
 
 
-@dataclass(frozen=True)
-class Verdict:
+def values_of(reports: list[Report], metric: str) -> list[float]:
+    """Return one figure per repetition that has it."""
+    return [float(report[metric]) for report in reports if metric in report]
+
+
+def faults_of(reports: list[Report]) -> str:
+    """Return what spoils a contestant's figures, in words; empty if nothing does."""
+    errors = [str(report["error"]) for report in reports if "error" in report]
+    parts = [str(report["absent"]) for report in reports if "absent" in report]
+    parts += [f"{len(errors)} of {len(reports)} failed: {errors[0]}"] if errors else []
+    for count, word in {"lost": "LOST", "misordered": "OUT OF ORDER", "corrupt": "CORRUPT"}.items():
+        if total := sum(values_of(reports, count)):
+            parts.append(f"{word} {total:,.0f} of {sum(values_of(reports, 'sent')):,.0f}")
+    return ", ".join(parts)
+
+
+class Verdict(NamedTuple):
     """A bar and what was measured."""
 
     bar: Bar
@@ -103,195 +103,161 @@ class Verdict:
     @property
     def word(self) -> str:
         """Met, missed, or not measured."""
-        if self.measured is None:
-            return f"not measured ({self.note})"
+        if self.measured is None or self.note:
+            return f"{'missed' if self.measured else 'not measured'} ({self.note})"
         value, bound = self.measured.median, self.bar.bound
-        met = value >= bound if self.bar.wanted == ">=" else value <= bound
-        if self.note:
-            return f"missed ({self.note})"
-        return "met" if met else "missed"
+        return "met" if (value >= bound if self.bar.wanted == ">=" else value <= bound) else "missed"
 
     @property
     def is_open(self) -> bool:
         """Whether the bar lies within the noise: more repetitions might give another verdict."""
-        return self.measured is not None and not self.note and self.measured.leaves_open(self.bar.bound)
+        return bool(
+            self.measured and not self.note and self.measured.low < self.bar.bound < self.measured.high
+        )
+
+
+def judge(bar: Bar, results: dict[str, list[Report]]) -> Verdict:
+    """Compare: ratios are taken within each repetition, so that what slows the machine slows both sides."""
+    ours, metric = results[bar.who], bar.metric
+    values, note = values_of(ours, metric), faults_of(ours)
+    if not bar.against or not values:
+        return Verdict(bar, spread_of(values), "", note)
+    rivals = [name for name in bar.against if values_of(results[name], metric)]
+    if not rivals:
+        return Verdict(bar, None, "", f"{bar.against[0]}: {faults_of(results[bar.against[0]])}")
+    pick = max if METRICS[metric].larger_is_better else min
+    best = pick(rivals, key=lambda name: float(np.median(values_of(results[name], metric))))
+    pairs = zip(ours, results[best], strict=True)
+    ratios = [own[metric] / other[metric] for own, other in pairs if metric in own and other.get(metric)]
+    return Verdict(bar, spread_of(ratios), best, note if ratios else "never both in one repetition")
 
 
 @dataclass
 class CaseResult:
-    """Everything about one case."""
+    """What the contestants of a case did, by name, one report for each repetition."""
 
     case: Case
-    outcomes: dict[str, Outcome]
+    reports: dict[str, list[Report]]
 
     def verdicts(self) -> list[Verdict]:
         """Return the case's bars with what was measured."""
-        return [judge(bar, self.outcomes) for bar in self.case.bars]
+        return [judge(bar, self.reports) for bar in self.case.bars]
 
 
-def run_case(
-    case: Case, settings: Settings, *, progress: Callable[[str], None] = lambda _: None
-) -> CaseResult:
+def run_case(case: Case, settings: Settings) -> CaseResult:
     """Measure all contestants of a case, interleaved: A B C, C B A, and so on.
 
     A repetition that fails is recorded, and the next one begins afresh.
     """
-    outcomes = {c.name: Outcome(c, absent=_absent(c)) for c in case.contestants}
-    result = CaseResult(case, outcomes)
     repeats = min(settings.repeats, case.repeats or settings.repeats)
     repeats_max = max(repeats, 0 if case.repeats else settings.repeats_max)
+    absent = {c.name: [{"absent": missing(c.peer)}] if missing(c.peer) else [] for c in case.contestants}
+    result = CaseResult(case, absent)
+    present = [contestant for contestant in case.contestants if not absent[contestant.name]]
     for repetition in range(repeats_max):
         if repetition >= repeats and not any(verdict.is_open for verdict in result.verdicts()):
             break
-        present = [outcome for outcome in outcomes.values() if not outcome.absent]
-        for outcome in reversed(present) if repetition & 1 else present:
-            progress(f"{case.name} {repetition + 1}/{repeats} {outcome.contestant.name}")
-            outcome.repetitions.append(_repeat(case, outcome.contestant, settings))
+        for contestant in reversed(present) if repetition & 1 else present:
+            result.reports[contestant.name].append(_repeat(case, contestant, settings))
     return result
-
-
-def judge(bar: Bar, outcomes: dict[str, Outcome]) -> Verdict:
-    """Compare: ratios are taken within each repetition, so that what slows the machine slows both sides."""
-    who = outcomes[bar.who]
-    values = who.values(bar.metric)
-    if not values:
-        return Verdict(bar, None, "", who.absent or next(iter(who.errors), "no figure"))
-    note = who.faults or (f"{len(who.errors)} repetitions failed" if who.errors else "")
-    if not bar.against:
-        return Verdict(bar, Spread.of(values), "", note)
-    rivals = [outcomes[name] for name in bar.against if outcomes[name].values(bar.metric)]
-    if not rivals:
-        rival = outcomes[bar.against[0]]
-        return Verdict(
-            bar, None, "", f"{rival.contestant.name}: {rival.absent or next(iter(rival.errors), '?')}"
-        )
-    pick = max if METRICS[bar.metric].larger_is_better else min
-    best = pick(rivals, key=lambda rival: statistics.median(rival.values(bar.metric)))
-    ratios = [
-        float(ours[bar.metric]) / float(theirs[bar.metric])
-        for ours, theirs in zip(who.repetitions, best.repetitions, strict=True)
-        if bar.metric in ours and theirs.get(bar.metric)
-    ]
-    return Verdict(
-        bar, Spread.of(ratios), best.contestant.name, note if ratios else "never both in one repetition"
-    )
-
-
-def _absent(contestant: Contestant) -> str:
-    return "" if contestant.transport == "copy" else missing(contestant.transport)
 
 
 def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str, Any]:
     """Do one repetition in a directory of its own; a failure becomes the report's ``error``."""
-    count = min(case.count, settings.count_max) if settings.count_max else case.count
-    with tempfile.TemporaryDirectory(dir=settings.folder, prefix="r") as folder:
+    runs: dict[str, Callable[..., dict[str, Any]]] = {
+        "flood": partial(_flood, subscribers=case.subscribers),
+        "roundtrip": _round_trips,
+        "copy": _copies,
+        "publisher dies": _publisher_dies,
+        "reader dies": _reader_dies,
+    }
+    with tempfile.TemporaryDirectory(dir=os.environ["CORTEX_BENCH_DIR"], prefix="r") as folder:
         job = Job(
-            transport=contestant.transport,
+            peer=contestant.peer,
             floats=case.floats,
             seconds=settings.seconds,
-            count=count,
+            count=min(case.count, settings.count_max) if settings.count_max else case.count,
             options=contestant.options,
             folder=Path(folder),
+            port=_free_port(),
         )
-        before = _shm_files()
+        deadline_s = _GRACE_S + 4.0 * job.seconds + job.count / _SLOWEST_HZ
+        before = set(_SHM.glob("*"))
         try:
-            if contestant.kind == "flood":
-                report = _flood(job, case.subscribers)
-            elif contestant.kind == "roundtrip":
-                report = _round_trips(job)
-            elif contestant.kind == "copy":
-                report = _copy(job)
-            else:
-                report = _copies_at_once(job)
+            report = runs[contestant.kind](job, partial(Child, deadline_s=deadline_s))
         except ChildFailed as failure:
             return {"error": str(failure)}
         finally:
-            left = _shm_files() - before
-            _sweep(left)
-        report["shm_files"] = len(left)
-        return report
+            left = set(_SHM.glob("*")) - before
+            for path in left:  # what a peer that was killed left behind
+                if path.suffix == ".zenoh":
+                    path.unlink(missing_ok=True)
+        return {**report, "shm_files": len(left)}
 
 
-def _flood(job: Job, subscribers: int) -> dict[str, Any]:
+def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> dict[str, Any]:
     """One publisher, some subscribers; the slowest one's rate counts, and the losses of all."""
-    child = partial(Child, log=job.folder / "log", deadline_s=_deadline_s(job))
     with ExitStack() as stack:
         publisher = stack.enter_context(child(roles.publish, job))
-        job = replace(job, address=publisher.expect("ready")["address"])
         receivers = [stack.enter_context(child(roles.receive, job)) for _ in range(subscribers)]
         for receiver in receivers:
-            receiver.expect("connected", beside=[publisher, *receivers])
+            receiver.expect([publisher, *receivers])
         publisher.tell("go")
-        sent = publisher.expect("sent", beside=receivers)
-        reports = [receiver.expect("result", beside=[publisher]) for receiver in receivers]
+        sent = publisher.expect(receivers)
+        reports = [receiver.expect([publisher, *receivers]) for receiver in receivers]
         publisher.tell("stop")
-        publisher.expect("closed")
-    first = reports[0]
+        publisher.expect()
     total = {key: sum(report[key] for report in reports) for key in ("received", "misordered", "corrupt")}
-    result: dict[str, Any] = {**total, "sent": sent["sent"] * subscribers}
-    if "rate" in first:
+    result = {**reports[0], **total, "sent": sent["sent"] * subscribers}
+    if "rate" in result:  # messages under `latest` are passed over on purpose
         result["rate"] = min(report["rate"] for report in reports)
         result["lost"] = result["sent"] - result["received"]
-        result["grown_kb"] = max([sent["grown_kb"], *(report["grown_kb"] for report in reports)])
-        if total["received"]:
-            result["cpu_us"] = 1e6 * sum(report["cpu_s"] for report in reports) / total["received"]
-    return result | {key: value for key, value in first.items() if key.startswith("age_")}
+        result["grown_kb"] = max(sent["grown_kb"], *(report["grown_kb"] for report in reports))
+        result["cpu_us"] = 1e6 * sum(report["cpu_s"] for report in reports) / max(1, result["received"])
+    return result
 
 
-def _round_trips(job: Job) -> dict[str, Any]:
-    child = partial(Child, log=job.folder / "log", deadline_s=_deadline_s(job))
-    with child(roles.ask, job) as client:
-        job = replace(job, address=client.expect("ready")["address"])
-        with child(roles.answer, job) as server:
-            report = client.expect("result", beside=[server])
-            server.expect("closed")
-    return {key: value for key, value in report.items() if key != "event"}
+def _round_trips(job: Job, child: Callable[..., Child]) -> Any:
+    with child(roles.ask, job) as client, child(roles.answer, job) as server:
+        report = client.expect([server])
+        server.expect()
+    return report
 
 
-def _copy(job: Job) -> dict[str, Any]:
-    with Child(copy_alone, job, log=job.folder / "log", deadline_s=_deadline_s(job)) as copier:
-        copier.expect("ready")
-        copier.tell("go")
-        return _without_event(copier.expect("result"))
+def _publisher_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
+    job = replace(job, seconds=_GRACE_S)
+    with child(roles.publish, job) as publisher, child(roles.await_death, job) as reader:
+        reader.expect([publisher])
+        publisher.tell("go")
+        time.sleep(_LOADED_S)
+        killed_ns = publisher.kill()
+        return {"known_ms": (reader.expect() - killed_ns) / 1e6}
 
 
-def _copies_at_once(job: Job) -> dict[str, Any]:
-    ring = make_ring(job.floats, slots_of(job.payload_bytes))
-    child = partial(Child, job=job, log=job.folder / "log", deadline_s=_deadline_s(job))
-    with child(partial(copy_in, ring=ring)) as writer, child(partial(copy_out, ring=ring)) as reader:
-        for copier in (writer, reader):
-            copier.expect("ready")
-        for copier in (writer, reader):
+def _reader_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
+    with child(roles.publish_until_freed, job) as publisher, child(roles.stop_reading, job) as reader:
+        reader.expect([publisher])
+        publisher.tell("go")
+        time.sleep(_LOADED_S)
+        killed_ns = reader.kill()
+        return {"known_ms": (publisher.expect() - killed_ns) / 1e6}
+
+
+def _copies(job: Job, child: Callable[..., Child]) -> Any:
+    """Copy into a private array, into a ring, or, in two processes at once, into a ring and out of it."""
+    payloads, private = list(make_payloads(job.floats)), [np.zeros(job.floats, np.float32)]
+    ring = roles.make_ring(job) if job.options else private
+    pairs = [(payloads, ring)] + ([(ring, private)] if job.options.get("out") else [])
+    with ExitStack() as stack:
+        copiers = [stack.enter_context(child(roles.copy, (job.seconds, *pair))) for pair in pairs]
+        for copier in copiers:
+            copier.expect()
+        for copier in copiers:
             copier.tell("go")
-        reports = [copier.expect("result") for copier in (writer, reader)]
-    return _without_event(min(reports, key=lambda report: float(report["rate"])))
+        return min((copier.expect() for copier in copiers), key=lambda report: float(report["rate"]))
 
 
-def _without_event(report: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in report.items() if key != "event"} | {"sent": report["received"]}
-
-
-def _deadline_s(job: Job) -> float:
-    return _GRACE_S + 4.0 * job.seconds + job.count / _SLOWEST_HZ
-
-
-def _shm_files() -> set[Path]:
-    return set(_SHM.glob("*")) if _SHM.is_dir() else set()
-
-
-def _sweep(left: set[Path]) -> None:
-    """Remove what a peer that was killed left behind: only names that the peers of this benchmark give."""
-    for path in left:
-        if path.name.startswith("iox2_") or path.suffix == ".zenoh":
-            with contextlib.suppress(OSError):
-                path.unlink()
-
-
-@contextlib.contextmanager
-def private_folder() -> Iterator[Path]:
-    """Make the run's directory, with a path short enough for the sockets in it, and remove it afterwards."""
-    parent = tempfile.gettempdir()
-    with tempfile.TemporaryDirectory(
-        prefix="cxb", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"
-    ) as folder:
-        yield Path(folder)
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

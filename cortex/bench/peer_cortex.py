@@ -1,302 +1,149 @@
-"""Cortex itself, used as its documentation says: typed messages, decoded to objects."""
+"""Cortex itself, used as its documentation says: typed messages, decoded to objects.
+
+Options: ``fixed``, ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`` (an address).
+"""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import os
-import subprocess
 import threading
-import time
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import cortex.node
-from cortex.bench.age import Ages
-from cortex.bench.cpp_subscriber import binary, cpp_missing
-from cortex.bench.job import PATIENCE_S, PONG_FLOATS, Job, Sender
-from cortex.bench.samples import FIXED, Reading, Sample
-from cortex.bench.tally import END, Finished, Floats, Tally, make_payloads
+from cortex.bench.peers import PATIENCE_S, Job, Peer, Send
+from cortex.bench.tally import Finished, Floats, Handler
+from cortex.message import Array, message
 from cortex.node import Node
-from cortex.policy import Policy, latest, reliable
-
-__all__ = [
-    "client",
-    "cpp_missing",
-    "reading_sender",
-    "receive",
-    "receive_cpp",
-    "receive_latest",
-    "sender",
-    "serve",
-]
+from cortex.policy import latest, reliable
 
 
-def sender(job: Job) -> Sender:
-    """Make a node with one publisher; options: ``fixed``, ``loan``, ``inline_max``, ``tcp``."""
-    return _Sender(job)
+@message(name="bench/Sample")
+class Sample:
+    """A stamp and an array of any length; the stamp counts the messages, or says when each was published."""
+
+    stamp_ns: int
+    data: Array["float32", "n"]
 
 
-class _Sender:
-    def __init__(self, job: Job) -> None:
-        self.address: Mapping[str, Any] = {}
-        self._node = _listening_node("bench_publisher", job)
-        kind = _type(job)
-        self._publisher = self._node.publisher(_topic(job), kind, **_publisher_options(job))
-        self.send = self._loaning(job) if job.options.get("loan") else self._publishing(kind)
-        self._refused = 0
+@message(name="bench/Sample10")
+class Sample10:
+    """The same with 40 bytes of array, known beforehand."""
 
-    def _publishing(self, kind: Any) -> Callable[[int, Floats], None]:
-        publish = self._publisher.publish
+    stamp_ns: int
+    data: Array["float32", 10]
 
-        def send(sequence: int, data: Floats) -> None:
-            if not publish(kind(sequence, data)):
-                self._refused += 1
 
-        return send
+@message(name="bench/Sample1000")
+class Sample1000:
+    """The same with 4 kB of array, known beforehand."""
 
-    def _loaning(self, job: Job) -> Callable[[int, Floats], None]:
+    stamp_ns: int
+    data: Array["float32", 1000]
+
+
+_FIXED = {10: Sample10, 1000: Sample1000}
+
+
+_NODES: list[Node] = []
+"""This process's node, once it is made."""
+
+
+def _node(job: Job, *, listens: bool) -> Node:
+    """Return the node: over tcp, who publishes the flood listens."""
+    address = job.options.get("tcp")
+    if not _NODES:
+        if address and not listens:
+            # To a node of another host the only way is tcp; no two hosts are needed to measure it.
+            cortex.node.host_id = lambda: "another host"  # type: ignore[attr-defined]
+        _NODES.append(Node("bench", listen=address if listens else None, insecure=address is not None))
+    return _NODES[0]
+
+
+def _topic(job: Job, topic: str) -> str:
+    """Name a topic of this repetition's own: the last one's nodes may still be known."""
+    return f"/bench/{job.folder.name}/{topic}"
+
+
+def _type(job: Job, topic: str) -> Any:
+    return _FIXED[job.floats] if job.options.get("fixed") and topic != "pong" else Sample
+
+
+def _publisher(job: Job, topic: str) -> Send:
+    kind, floats = _type(job, topic), job.floats
+    options = {key: job.options[key] for key in ("inline_max", "max_wait_s") if key in job.options}
+    publisher = _node(job, listens=topic != "pong").publisher(_topic(job, topic), kind, **options)
+    publish, loan = publisher.publish, publisher.loan
+
+    def send(sequence: int, data: Floats) -> None:
+        publish(kind(sequence, data))
+
+    def send_loan(sequence: int, data: Floats) -> None:
         """Write the stamp and the three items that are checked, as a producer would that fills the slot."""
-        loan, floats = self._publisher.loan, job.floats
+        with loan(n=floats) as draft:
+            draft.stamp_ns = sequence
+            draft.data[0] = draft.data[floats // 2] = draft.data[-1] = data[0]
 
-        def send(sequence: int, data: Floats) -> None:
-            with loan(n=floats) as draft:
-                draft.stamp_ns = sequence
-                draft.data[0] = draft.data[floats // 2] = draft.data[-1] = data[0]
-
-        return send
-
-    def report(self) -> dict[str, Any]:
-        return {"refused": self._refused}
-
-    def close(self) -> None:
-        self._node.close()
+    return send_loan if job.options.get("loan") else send
 
 
-def receive(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
-    """Count the messages of one flood in the way that option ``how`` names."""
+def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
+    # Large messages wait in the publisher's ring, which bounds their memory.
+    patient = reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
+    policy = latest() if job.options.get("latest") else patient
+    subscribe, kind = _node(job, listens=False).subscriber, _type(job, topic)
     done = threading.Event()
-    how = job.options.get("how", "callback")
-
-    def finish() -> None:
-        done.set()
-        if how != "callback":
-            raise Finished
-
-    tally = Tally(job.floats, connected=connected, finish=finish, settle_at=job.count // 10)
-    node = _connecting_node("bench_subscriber", job)
-    try:
-        policy = _reliable(job)
-        if how == "callback":
-            _by_callback(node, job, policy, tally, done)
-        else:
-            _BY[how](node.subscriber(_topic(job), _type(job), policy=policy), tally, job)
-        return tally.report()
-    finally:
-        node.close()
-
-
-def _by_callback(node: Node, job: Job, policy: Any, tally: Tally, done: threading.Event) -> None:
-    handle = tally.copying_handler() if job.options.get("consume") else tally.handler()
 
     def on_message(sample: Any) -> None:
+        try:
+            handle(sample.stamp_ns, sample.data)
+        except Finished:
+            done.set()
+
+    if how == "callback":
+        subscribe(_topic(job, topic), kind, on_message, policy=policy)
+        done.wait()  # the runner kills a child that waits for ever
+    else:
+        _BY[how](subscribe(_topic(job, topic), kind, policy=policy), handle)
+
+
+def _by_recv(subscriber: Any, handle: Handler) -> None:
+    recv = subscriber.recv
+    while True:
+        sample = recv(timeout_s=PATIENCE_S)
         handle(sample.stamp_ns, sample.data)
 
-    node.subscriber(_topic(job), _type(job), on_message, policy=policy)
-    # The runner kills a child that waits for ever; this wait only has to be longer than any flood.
-    done.wait(job.seconds + 600.0)
+
+def _by_iterator(subscriber: Any, handle: Handler) -> None:
+    for sample in subscriber:
+        handle(sample.stamp_ns, sample.data)
 
 
-def _by_iterator(subscriber: Any, tally: Tally, job: Job) -> None:
-    handle = tally.handler()
-    try:
-        for sample in subscriber:
-            handle(sample.stamp_ns, sample.data)
-    except Finished:
-        return
+def _by_batch(subscriber: Any, handle: Handler) -> None:
+    while True:
+        records = subscriber.recv_batch(timeout_s=PATIENCE_S)
+        handle(records["stamp_ns"], records["data"])
 
 
-def _by_recv(subscriber: Any, tally: Tally, job: Job) -> None:
-    handle = tally.handler()
-    recv = subscriber.recv
-    try:
-        while True:
-            sample = recv(timeout_s=PATIENCE_S)
-            handle(sample.stamp_ns, sample.data)
-    except Finished:
-        return
-
-
-def _by_batch(subscriber: Any, tally: Tally, job: Job) -> None:
-    handle = tally.batch_handler()
-    recv_batch = subscriber.recv_batch
-    try:
-        while True:
-            handle(recv_batch(timeout_s=PATIENCE_S))
-    except Finished:
-        return
-
-
-def _by_async(subscriber: Any, tally: Tally, job: Job) -> None:
-    handle = tally.handler()
-
+def _by_async(subscriber: Any, handle: Handler) -> None:
     async def loop() -> None:
-        try:
-            async for sample in subscriber:
-                handle(sample.stamp_ns, sample.data)
-        except Finished:
-            return
+        async for sample in subscriber:
+            handle(sample.stamp_ns, sample.data)
 
     asyncio.run(loop())
 
 
-_BY: Mapping[str, Callable[[Any, Tally, Job], None]] = {
-    "iterator": _by_iterator,
-    "recv": _by_recv,
-    "batch": _by_batch,
-    "async": _by_async,
-}
+_BY = {"recv": _by_recv, "iterator": _by_iterator, "batch": _by_batch, "async": _by_async}
 
 
-def client(job: Job) -> Client:
-    """Make the asking node of a round trip."""
-    return Client(job)
+def tell_death(job: Job, callback: Any) -> None:
+    """Call back when the publisher of a flood has died."""
+    node, topic = _node(job, listens=False), _topic(job, "flood")
+    node.watch(topic, lambda change: None if change.alive else callback())
 
 
-class Client:
-    """Publishes the payload; receives 40 bytes in the way that option ``how`` names (recv, or a callback)."""
-
-    def __init__(self, job: Job) -> None:
-        self.address: Mapping[str, Any] = {}
-        self._node = _listening_node("bench_client", job)
-        self._type = _type(job)
-        self._publish = self._node.publisher(
-            _topic(job, "ping"), self._type, **_publisher_options(job)
-        ).publish
-        self._payload = make_payloads(job.floats)[0]
-        self._recv = self._node.subscriber(
-            _topic(job, "pong"), Sample, policy=reliable(depth=64, timeout_s=PATIENCE_S)
-        ).recv
-
-    def ping(self, sequence: int, data: Floats, timeout_s: float) -> bool:
-        """Send one message and wait for its answer."""
-        self._publish(self._type(sequence, data))
-        recv = self._recv
-        try:
-            while recv(timeout_s=timeout_s).stamp_ns != sequence:
-                pass
-        except TimeoutError:
-            return False
-        return True
-
-    def close(self) -> None:
-        """End the server and close."""
-        self._publish(self._type(END, self._payload))
-        self._node.close()
-
-
-def serve(job: Job) -> None:
-    """Answer each message from the callback that gets it."""
-    done = threading.Event()
-    node = _connecting_node("bench_server", job)
-    publish = node.publisher(_topic(job, "pong"), Sample).publish
-    answer = make_payloads(PONG_FLOATS)[0]
-
-    def on_ping(sample: Any) -> None:
-        if sample.stamp_ns == END:
-            done.set()
-        else:
-            publish(Sample(sample.stamp_ns, answer))
-
-    node.subscriber(_topic(job, "ping"), _type(job), on_ping, policy=_reliable(job))
-    done.wait(job.seconds + 600.0)
-    node.close()
-
-
-def reading_sender(job: Job) -> Sender:
-    """Make a publisher of messages that are stamped with the time at which they are published."""
-    return _ReadingSender(job)
-
-
-class _ReadingSender:
-    def __init__(self, job: Job) -> None:
-        self.address: Mapping[str, Any] = {}
-        self._node = _listening_node("bench_publisher", job)
-        self._publish = self._node.publisher(_topic(job), Reading).publish
-
-    def send(self, sequence: int, data: Floats) -> None:
-        self._publish(Reading(time.monotonic_ns(), sequence, data))
-
-    def report(self) -> dict[str, Any]:
-        return {}
-
-    def close(self) -> None:
-        self._node.close()
-
-
-def receive_latest(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
-    """Use messages under `latest()`, from `recv` or in a callback (option ``how``); return their ages."""
-    ages = Ages(job, connected)
-    node = _connecting_node("bench_subscriber", job)
-    try:
-        if job.options.get("how") == "callback":
-            done = threading.Event()
-
-            def on_reading(reading: Reading) -> None:
-                ages.use(reading.sequence, reading.stamp_ns)
-                if ages.done:
-                    done.set()
-
-            node.subscriber(_topic(job), Reading, on_reading, policy=latest())
-            done.wait(job.seconds + 600.0)
-        else:
-            subscriber = node.subscriber(_topic(job), Reading, policy=latest())
-            while not ages.done:
-                reading = subscriber.recv(timeout_s=PATIENCE_S)
-                ages.use(reading.sequence, reading.stamp_ns)
-        return ages.report()
-    finally:
+def _close() -> None:
+    for node in _NODES:
         node.close()
 
 
-def receive_cpp(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
-    """Run the C++ subscriber, which prints one line when it is connected and one when the flood is over."""
-    command = [str(binary()), _topic(job), str(job.floats), str(job.depth)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("connected"):
-                connected()
-            elif line.startswith("{"):
-                report: dict[str, Any] = json.loads(line)
-                return report
-    raise RuntimeError(f"the C++ subscriber ended with status {process.returncode} and no result")
-
-
-def _topic(job: Job, role: str = "flood") -> str:
-    """Name a topic of this repetition's own: the last one's nodes may still be known."""
-    return f"/bench/{job.folder.name or 'here'}/{role}"
-
-
-def _reliable(job: Job) -> Policy:
-    """Lose nothing; large messages wait in the publisher's ring, which bounds their memory."""
-    return reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
-
-
-def _type(job: Job) -> Any:
-    return FIXED[job.floats] if job.options.get("fixed") else Sample
-
-
-def _publisher_options(job: Job) -> dict[str, Any]:
-    return {key: job.options[key] for key in ("inline_max",) if key in job.options}
-
-
-def _listening_node(name: str, job: Job) -> Node:
-    return Node(name, listen="127.0.0.1" if job.options.get("tcp") else None)
-
-
-def _connecting_node(name: str, job: Job) -> Node:
-    if job.options.get("tcp"):
-        # To a node of another host the only way is tcp; no two network namespaces are needed to measure it.
-        cortex.node.host_id = lambda: "another host"  # type: ignore[attr-defined]
-    return Node(name)
+PEER = Peer(_publisher, _receive, close=_close)

@@ -2,128 +2,222 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import mmap
+import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from cortex.bench.age import percentiles
-from cortex.bench.children import Channel, ChildFailed
-from cortex.bench.job import PATIENCE_S, Job
-from cortex.bench.tally import END, WARM, Floats, make_payloads, resident_kb
-from cortex.bench.transports import TRANSPORTS
+import numpy as np
+
+from cortex.bench.peers import PATIENCE_S, PONG_FLOATS, Job, Peer, Send, peer_of
+from cortex.bench.tally import (
+    END,
+    WARM,
+    Ages,
+    Finished,
+    Floats,
+    Handler,
+    Tally,
+    make_payloads,
+    percentiles,
+    resident_kb,
+)
 
 _WARM_PINGS = 20
+_WARM_S = 0.005
+"""Between two WARM messages [s]."""
+_BLOCKED_NS = 50_000_000
+"""A call of `publish` that takes longer was waiting for a reader."""
+
+Ring = list[Floats]
 
 
-def publish(channel: Channel, job: Job) -> None:
-    """Publish WARM messages until told "go", then a flood, then END messages until told "stop"."""
-    factory = TRANSPORTS[job.transport].sender
-    assert factory is not None
-    sender = factory(job)
-    channel.tell("ready", address=dict(sender.address))
+def publish(pipe: Any, job: Job) -> None:
+    """Publish WARM messages until told to go, then a flood, then END messages until told to stop."""
+    peer = peer_of(job)
+    send = peer.publisher(job, "flood")
     payloads = make_payloads(job.floats)
     deadline = time.monotonic() + PATIENCE_S
-    while channel.wait(0.005) is None:
+    while not pipe.poll(_WARM_S):
         if time.monotonic() > deadline:
             raise TimeoutError("no subscriber received anything")
-        sender.send(WARM, payloads[0])
-    cpu_s = time.process_time()
-    sent, grown_kb = _flood(sender.send, payloads, job)
-    channel.tell("sent", sent=sent, cpu_s=time.process_time() - cpu_s, grown_kb=grown_kb, **sender.report())
-    while channel.wait(0.02) is None:
-        sender.send(END, payloads[0])
-    sender.close()
-    channel.tell("closed", shm=sorted(str(path) for path in Path("/dev/shm").glob("*")))
+        send(WARM, payloads[0])
+    pipe.recv()
+    sent, grown_kb = _flood(send, payloads, job)
+    pipe.send({"sent": sent, "grown_kb": grown_kb})
+    while not pipe.poll(4 * _WARM_S):
+        send(END, payloads[0])
+    peer.close()
+    pipe.send("closed")
 
 
-def receive(channel: Channel, job: Job) -> None:
-    """Count a flood: report "connected" at the first message of any kind, "result" at the END message."""
-    function = TRANSPORTS[job.transport].receive
-    assert function is not None
+def receive(pipe: Any, job: Job) -> None:
+    """Count a flood: report "connected" at the first message of any kind, the result at the END message."""
     cpu_s = 0.0
 
     def connected() -> None:
         nonlocal cpu_s
         cpu_s = time.process_time()
-        channel.tell("connected")
+        pipe.send("connected")
 
-    report = function(job, connected)
-    report.setdefault("cpu_s", time.process_time() - cpu_s)
-    channel.tell("result", **report)
+    peer = peer_of(job)
+    how = job.options.get("how", "callback")
+    counts: Tally | Ages
+    handle: Handler
+    if job.options.get("latest"):
+        counts = Ages(connected, busy=job.options["busy"])
+        handle = counts.use
+    else:
+        counts = tally = Tally(job.floats, connected, settle_at=job.count // 10)
+        consume = bool(job.options.get("consume"))
+        handle = tally.batch_handler() if how == "batch" else tally.handler(consume=consume)
+    _receive(peer, job, "flood", handle, how)
+    pipe.send({"cpu_s": time.process_time() - cpu_s, **counts.report})
+    peer.close()
 
 
-def ask(channel: Channel, job: Job) -> None:
-    """Make round trips for the job's time, and report their percentiles."""
-    factory = TRANSPORTS[job.transport].client
-    assert factory is not None
-    client = factory(job)
-    channel.tell("ready", address=dict(client.address))
+def ask(pipe: Any, job: Job) -> None:
+    """Make round trips for the job's time: each answer sends the next message. Report their percentiles."""
+    peer = peer_of(job)
+    send = peer.publisher(job, "ping")
     payload = make_payloads(job.floats)[0]
-    deadline = time.monotonic() + PATIENCE_S
-    while not client.ping(WARM, payload, 0.05):
-        if time.monotonic() > deadline:
-            raise TimeoutError("no server answered")
-    for k in range(_WARM_PINGS):
-        _ping(client.ping, k, payload)
     times_ns: list[int] = []
-    end = time.monotonic() + job.seconds
-    while len(times_ns) < job.count if job.count else time.monotonic() < end:
-        begin = time.perf_counter_ns()
-        _ping(client.ping, _WARM_PINGS + len(times_ns), payload)
-        times_ns.append(time.perf_counter_ns() - begin)
-    client.close()
-    channel.tell(
-        "result",
-        **percentiles(times_ns, "rtt"),
-        sent=len(times_ns),
-        received=len(times_ns),
-        lost=0,
-        misordered=0,
-        corrupt=0,
+    connected = threading.Event()
+    now = time.perf_counter_ns
+    expected = begin_ns = end_ns = 0
+
+    def warm() -> None:
+        while not connected.wait(_WARM_S):
+            send(WARM, payload)
+
+    def on_pong(sequence: int, _data: Floats) -> None:
+        nonlocal expected, begin_ns, end_ns
+        arrived_ns = now()
+        if sequence == WARM and not connected.is_set():
+            connected.set()
+            warmer.join()
+        elif sequence == expected:
+            times_ns.append(arrived_ns - begin_ns)
+            expected += 1
+            if expected == _WARM_PINGS:
+                times_ns.clear()
+                end_ns = arrived_ns + int(1e9 * job.seconds)
+        else:
+            return
+        if end_ns and arrived_ns > end_ns:
+            raise Finished
+        begin_ns = now()
+        send(expected, payload)
+
+    warmer = threading.Thread(target=warm, daemon=True)
+    warmer.start()
+    _receive(peer, job, "pong", on_pong, "recv")
+    send(END, payload)
+    peer.close()
+    count = len(times_ns)
+    pipe.send({"sent": count, "received": count, **percentiles(times_ns, "rtt")})
+
+
+def answer(pipe: Any, job: Job) -> None:
+    """Answer each message with 40 bytes until the client ends."""
+    peer = peer_of(job)
+    send = peer.publisher(job, "pong")
+    payload = make_payloads(PONG_FLOATS)[0]
+
+    def on_ping(sequence: int, _data: Floats) -> None:
+        if sequence == END:
+            raise Finished
+        send(sequence, payload)
+
+    _receive(peer, job, "ping", on_ping, job.options.get("how", "callback"))
+    peer.close()
+    pipe.send("closed")
+
+
+def publish_until_freed(pipe: Any, job: Job) -> None:
+    """Publish to a reader that takes nothing; report the time at which a blocked `publish` returns."""
+    send = peer_of(job).publisher(job, "flood")
+    payload = make_payloads(job.floats)[0]
+    while not pipe.poll(_WARM_S):
+        send(WARM, payload)
+    pipe.recv()
+    before_ns = time.monotonic_ns()
+    for sequence in range(1 << 62):
+        send(sequence, payload)
+        now_ns = time.monotonic_ns()
+        if now_ns - before_ns > _BLOCKED_NS:
+            break
+        before_ns = now_ns
+    pipe.send(now_ns)
+
+
+def stop_reading(pipe: Any, job: Job) -> None:
+    """Receive one message, and stand still in its callback for ever."""
+
+    def handle(_sequence: int, _data: Floats) -> None:
+        pipe.send("connected")
+        threading.Event().wait()
+
+    peer_of(job).receive(job, "flood", handle, "callback")
+
+
+def await_death(pipe: Any, job: Job) -> None:
+    """Receive a flood; report the time at which the publisher is known to be dead."""
+    peer = peer_of(job)
+    importlib.import_module("cortex.bench.peer_cortex").tell_death(
+        job, lambda: pipe.send(time.monotonic_ns())
     )
+    tally = Tally(job.floats, lambda: pipe.send("connected"))
+    peer.receive(job, "flood", tally.handler(), "callback")
 
 
-def answer(channel: Channel, job: Job) -> None:
-    """Answer round trips until the client ends them."""
-    function = TRANSPORTS[job.transport].serve
-    assert function is not None
-    function(job)
-    channel.tell("closed")
+def copy(pipe: Any, job: tuple[float, Ring, Ring]) -> None:
+    """Copy arrays in turn into others, again and again for some seconds, once told to go."""
+    seconds, sources, targets = job
+    for k in range(max(len(sources), len(targets))):  # touches every page before the clock starts
+        np.copyto(targets[k % len(targets)], sources[k % len(sources)])
+    pipe.send("ready")
+    pipe.recv()
+    copied = 0
+    begin = now = time.perf_counter()
+    while now - begin < seconds:
+        for _ in range(max(1, min(64, 250_000 // len(sources[0])))):
+            np.copyto(targets[copied % len(targets)], sources[copied % len(sources)])
+            copied += 1
+        now = time.perf_counter()
+    pipe.send({"rate": copied / (now - begin), "sent": copied, "received": copied})
 
 
-def _flood(send: Callable[[int, Floats], Any], payloads: tuple[Floats, Floats], job: Job) -> tuple[int, int]:
+def make_ring(job: Job) -> Ring:
+    """Return the slots of a mapping that forked children share, each at the start of a page, all touched."""
+    stride = -(-job.payload_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    memory = np.frombuffer(mmap.mmap(-1, stride * job.slots), np.float32)
+    memory[:] = 0.0
+    return [memory[k * stride // 4 :][: job.floats] for k in range(job.slots)]
+
+
+def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> None:
+    with contextlib.suppress(Finished):
+        peer.receive(job, topic, handle, how)
+
+
+def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> tuple[int, int]:
     """Send the payloads in turn; return how many, and by how much memory grew after the first tenth [kB]."""
-    first, second = payloads
-    if rate_hz := job.options.get("rate_hz"):
-        return _paced(send, first, second, job, rate_hz), 0
     pairs = max(1, min(32, 500_000 // job.payload_bytes))
-    sent = 0
-    settled_kb: int | None = None
-    end = time.perf_counter() + job.seconds
-    while sent < job.count if job.count else time.perf_counter() < end:
-        for _ in range(pairs):
-            send(sent, first)
-            send(sent + 1, second)
-            sent += 2
-        if settled_kb is None and job.count and sent >= job.count // 10:
-            settled_kb = resident_kb()
-    return sent, 0 if settled_kb is None else resident_kb() - settled_kb
-
-
-def _paced(
-    send: Callable[[int, Floats], Any], first: Floats, second: Floats, job: Job, rate_hz: float
-) -> int:
-    """Send at a rate, on an absolute schedule, so that a late message does not delay those after it."""
+    sent = settled_kb = 0
     begin = time.perf_counter()
-    for sent in range(job.count or int(job.seconds * rate_hz)):
-        early_s = begin + sent / rate_hz - time.perf_counter()
-        if early_s > 0.0:
-            time.sleep(early_s)
-        send(sent, second if sent & 1 else first)
-    return job.count or int(job.seconds * rate_hz)
-
-
-def _ping(ping: Callable[[int, Floats, float], bool], sequence: int, payload: Floats) -> None:
-    if not ping(sequence, payload, PATIENCE_S):
-        raise ChildFailed(f"round trip {sequence} got no answer in {PATIENCE_S} s")
+    if rate_hz := job.options.get("rate_hz"):  # stamps, on an absolute schedule: a late one delays no other
+        for sent in range(job.count):
+            time.sleep(max(0.0, begin + sent / rate_hz - time.perf_counter()))
+            send(time.monotonic_ns(), payloads[0])
+        return job.count, 0
+    while sent < job.count if job.count else time.perf_counter() < begin + job.seconds:
+        for _ in range(pairs):
+            send(sent, payloads[0])
+            send(sent + 1, payloads[1])
+            sent += 2
+        if job.count and not settled_kb and sent >= job.count // 10:
+            settled_kb = resident_kb()
+    return sent, resident_kb() - settled_kb if settled_kb else 0

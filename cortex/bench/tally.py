@@ -1,10 +1,10 @@
-"""What a subscriber counts: messages, gaps, order, payload; and what it costs in time and memory."""
+"""What a subscriber counts: messages, gaps, order, payload, age; and what it costs in time and memory."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ WARM = -1
 """Sequence of a message that only shows that the two sides are connected."""
 END = -2
 """Sequence of the message after the last one."""
+WORK_S = 0.002
+"""Work on each message whose age is measured [s]."""
 
 Floats = NDArray[np.float32]
-Handler = Callable[[int, Floats], None]
+Handler = Callable[[Any, Any], None]
 
 _LARGE_FLOATS = 8192  # from here on the check of a message costs nothing beside its transport
 
@@ -32,42 +34,40 @@ def make_payloads(floats: int) -> tuple[Floats, Floats]:
 
 
 class Tally:
-    """Counts the messages of one flood.
+    """Counts the messages of one flood; its handlers raise `Finished` at the END message.
 
     Every message's sequence is checked; the payload's first, middle and last item at every 64th message, and
     at every message of 32 kB or more.
+
+    Args:
+        floats: Items of each payload.
+        connected: Called at the first message of any kind.
+        settle_at: Sequence from which on memory must not grow.
     """
 
-    def __init__(
-        self, floats: int, *, connected: Callable[[], None], finish: Callable[[], None], settle_at: int = 0
-    ) -> None:
-        """Begin with nothing received.
-
-        Args:
-            floats: Items of each payload.
-            connected: Called at the first message of any kind.
-            finish: Called at the END message; may raise `Finished`.
-            settle_at: Sequence from which on memory must not grow.
-        """
-        self.lost = 0
-        self.misordered = 0
-        self.corrupt = 0
-        self.received = 0
+    def __init__(self, floats: int, connected: Callable[[], None], *, settle_at: int = 0) -> None:
+        self.report: dict[str, Any] = {
+            "rate": 0.0, "received": 0, "lost": 0, "misordered": 0, "corrupt": 0, "grown_kb": 0
+        }  # fmt: skip
         self._floats = floats
         self._mask = 0 if floats >= _LARGE_FLOATS else 63
         self._connected = connected
-        self._finish = finish
-        self._seen_any = False
-        self._first: tuple[int, float] | None = None
-        self._last: tuple[int, float] | None = None
+        self._is_connected = False
+        self._marks: list[tuple[int, float]] = []
+        """Messages received and the time, at the first check and at the last."""
         self._settle_at = settle_at
-        self._settled_kb: int | None = None
+        self._settled_kb = 0
 
-    def handler(self) -> Handler:
-        """Return the function to call with each message's sequence and payload."""
+    def handler(self, *, consume: bool = False) -> Handler:
+        """Return the function to call with each message's sequence and payload.
+
+        Args:
+            consume: It also copies every byte of the payload out.
+        """
         expected = 0
         mask = self._mask
         check = self._check
+        out = np.zeros(self._floats, np.float32)
 
         def handle(sequence: int, data: Floats) -> None:
             nonlocal expected
@@ -78,84 +78,105 @@ class Tally:
             else:
                 expected = self._jump(sequence, expected, data)
 
-        return handle
-
-    def copying_handler(self) -> Handler:
-        """Return a handler that also copies every byte of the payload out."""
-        handle = self.handler()
-        out = np.zeros(self._floats, np.float32)
-
         def copy_and_handle(sequence: int, data: Floats) -> None:
             np.copyto(out, data)
             handle(sequence, out)
 
-        return copy_and_handle
+        return copy_and_handle if consume else handle
 
-    def batch_handler(self) -> Callable[[NDArray[Any]], None]:
-        """Return the function to call with each structured array of messages (fields stamp_ns and data)."""
+    def batch_handler(self) -> Handler:
+        """Return the function to call with the arrays of sequences and payloads of each batch."""
         expected = 0
 
-        def handle(records: NDArray[Any]) -> None:
+        def handle(sequences: NDArray[np.int64], payloads: NDArray[np.float32]) -> None:
             nonlocal expected
-            stamps = records["stamp_ns"]
-            count = len(records)
-            if stamps[0] == expected and stamps[-1] == expected + count - 1:
-                if count > 2 and not (stamps[1:] > stamps[:-1]).all():
-                    self.misordered += 1
+            count = len(sequences)
+            if sequences[0] == expected and sequences[-1] == expected + count - 1:
+                if count > 2 and not (sequences[1:] > sequences[:-1]).all():
+                    self.report["misordered"] += 1
                 expected += count
-                self._check(expected - count, records["data"][0])
+                self._check(expected - count, payloads[0])
             else:  # a marker or a gap within the batch
-                for record in records:
-                    sequence = int(record["stamp_ns"])
+                for sequence, data in zip(sequences.tolist(), payloads, strict=True):
                     if sequence == expected:
                         expected += 1
                     else:
-                        expected = self._jump(sequence, expected, record["data"])
+                        expected = self._jump(sequence, expected, data)
 
         return handle
-
-    def report(self) -> dict[str, Any]:
-        """Return the counts and the rate [messages/s] between the first and the last check."""
-        rate = 0.0
-        if self._first is not None and self._last is not None and self._last[1] > self._first[1]:
-            rate = (self._last[0] - self._first[0]) / (self._last[1] - self._first[1])
-        return {
-            "rate": rate,
-            "received": self.received,
-            "lost": self.lost,
-            "misordered": self.misordered,
-            "corrupt": self.corrupt,
-            "grown_kb": 0 if self._settled_kb is None else resident_kb() - self._settled_kb,
-        }
 
     def _check(self, sequence: int, data: Floats) -> None:
         tag = 1.0 + (sequence & 1)
         if len(data) != self._floats or not (data[0] == tag == data[-1] == data[self._floats // 2]):
-            self.corrupt += 1
-        mark = (sequence - self.lost, time.perf_counter())
-        if self._first is None:
-            self._first = mark
-        self._last = mark
-        if self._settle_at and self._settled_kb is None and sequence >= self._settle_at:
+            self.report["corrupt"] += 1
+        self._marks[1:] = [(sequence - self.report["lost"], time.perf_counter())]
+        if self._settle_at and not self._settled_kb and sequence >= self._settle_at:
             self._settled_kb = resident_kb()
 
     def _jump(self, sequence: int, expected: int, data: Floats) -> int:
         """Take a message that is not the expected one; return what is expected next."""
-        if not self._seen_any:
-            self._seen_any = True
+        if not self._is_connected:
+            self._is_connected = True
             self._connected()
         if sequence == END:
-            self.received = expected - self.lost
-            self._finish()
-            return expected
+            self._finish(expected)
         if sequence == WARM:
             return expected
         if sequence < expected:
-            self.misordered += 1
+            self.report["misordered"] += 1
             return expected
-        self.lost += sequence - expected
+        self.report["lost"] += sequence - expected
         self._check(sequence, data)
         return sequence + 1
+
+    def _finish(self, expected: int) -> None:
+        """Count up: the rate is that between the first and the last check."""
+        if len(self._marks) > 1:
+            (first, begin_s), (last, end_s) = self._marks
+            self.report["rate"] = (last - first) / (end_s - begin_s)
+        self.report["received"] = expected - self.report["lost"]
+        if self._settled_kb:
+            self.report["grown_kb"] = resident_kb() - self._settled_kb
+        raise Finished
+
+
+class Ages:
+    """Records the age of each datum at the start of its use, then works 2 ms: busy, or asleep."""
+
+    def __init__(self, connected: Callable[[], None], *, busy: bool) -> None:
+        self.report: dict[str, Any] = {"received": 0, "lost": 0, "misordered": 0, "corrupt": 0}
+        self._busy = busy
+        self._connected = connected
+        self._is_connected = False
+        self._ages_ns: list[int] = []
+        self._last_ns = 0
+
+    def use(self, stamp_ns: int, _data: object) -> None:
+        """Use one message, stamped with CLOCK_MONOTONIC when it was published."""
+        now_ns = time.monotonic_ns()
+        if not self._is_connected:
+            self._is_connected = True
+            self._connected()
+        if stamp_ns == END:
+            self.report |= {"received": len(self._ages_ns), **percentiles(self._ages_ns, "age")}
+            raise Finished
+        if stamp_ns != WARM:
+            self._ages_ns.append(now_ns - stamp_ns)
+            self.report["misordered"] += stamp_ns <= self._last_ns
+            self._last_ns = stamp_ns
+            if self._busy:
+                while time.monotonic_ns() < now_ns + WORK_S * 1e9:
+                    pass
+            else:
+                time.sleep(WORK_S)
+
+
+def percentiles(times_ns: Sequence[int], name: str) -> dict[str, float]:
+    """Return ``{name}_p50_us`` and ``{name}_p99_us`` of some times."""
+    if not times_ns:
+        return {}
+    p50, p99 = np.percentile(times_ns, [50, 99], method="higher") / 1e3
+    return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99)}
 
 
 def resident_kb() -> int:

@@ -230,6 +230,22 @@ def nothing(flags: int) -> bytes:
     raise zmq.Again
 
 
+def place_of(node: Node, topic: str) -> tuple[int, str]:
+    """Source and strict address of the only publisher of a topic."""
+
+    def found() -> list[tuple[int, str]]:
+        return [
+            (publisher.source, record.endpoints[0].strict)
+            for record in node.nodes()
+            for publisher in record.publishers
+            if publisher.topic == topic
+        ]
+
+    wait_for(lambda: bool(found()))
+    (place,) = found()
+    return place
+
+
 class SlowReader:
     """A reliable reader of a C++ publisher that attaches by hand, and reads when it is told to.
 
@@ -242,16 +258,7 @@ class SlowReader:
     def __init__(self, node: Node, publisher: Peer, topic: str) -> None:
         self.publisher = publisher
 
-        def found() -> list[tuple[int, str]]:
-            return [
-                (publisher.source, record.endpoints[0].strict)
-                for record in node.nodes()
-                for publisher in record.publishers
-                if publisher.topic == topic
-            ]
-
-        wait_for(lambda: bool(found()))
-        ((self.source, address),) = found()
+        self.source, address = place_of(node, topic)
         self.key = wire.attach_key(wire.AttachKey(self.source, 1, True, True, 10, 1), stamped=True)
         path = address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
         self._idle = socket.socketpair()
@@ -321,6 +328,34 @@ def test_what_a_closed_publisher_has_taken_stays(
     assert result["published"] == result["taken"] + 1
     with pytest.raises(zmq.Again):
         reader.frame()
+
+
+def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """To a reader of its socket: what libzmq has no room for gets lost without a word."""
+    start("fill", "/scan", 5, 10)
+    source, address = place_of(make_node(), "/scan")
+    key = wire.attach_key(wire.AttachKey(source, 1, False, True, 10, 60_000, True), stamped=True)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        reader = context.socket(zmq.SUB)
+        reader.connect(address)
+        for kind in (wire.MESSAGE, wire.NEXT):
+            reader.subscribe(wire.prefix(kind, source, stamped=True))
+        reader.subscribe(key)
+        kinds = []
+        while kinds.count(b"N") < 4:
+            assert reader.poll(1e3 * SOON_S), kinds
+            frame = reader.recv()
+            kinds.append(frame[3:4])
+            assert kinds[-1] != b"N" or sequence_of(frame) == 5
+        assert kinds.count(b"M") == 5
+        reader.subscribe(wire.resume_key(source, 1, 5, stamped=True))
+        while reader.poll(100.0):  # five times the time after which it would be said again
+            assert reader.recv()[3:4] == b"N"
+    finally:
+        context.destroy(linger=0)
 
 
 def test_cpp_reader_counts_what_it_had_no_time_for(

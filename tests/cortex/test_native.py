@@ -14,7 +14,7 @@ import zmq
 from hypothesis import given
 from random_schemas import any_message
 
-from cortex import gate, native, packer
+from cortex import gate, native
 from cortex.codec import codec_of
 from cortex.message import Array, Float32, Int8, UInt64, message
 from cortex.schema import schema_of
@@ -175,33 +175,36 @@ def frames_of(*sequences):
 
 
 @pytest.mark.parametrize(
-    ("frames", "expected", "limit"),
+    ("frames", "expected", "limit", "taken", "ended_by"),
     [
-        (frames_of(*range(20)), 0, 64),
-        (frames_of(*range(20)), 0, 7),
-        (frames_of(0, 1, 3, 4), 0, 64),
-        (frames_of(4, 5), -1, 64),
-        (frames_of(3, 2), 3, 64),
-        ([*frames_of(0), b"other", *frames_of(1)], 0, 64),
-        ([], 0, 64),
+        (frames_of(*range(20)), 0, 64, range(20), None),
+        (frames_of(*range(20)), 0, 7, range(7), None),
+        (frames_of(0, 1, 3, 4), 0, 64, range(2), 2),
+        (frames_of(4, 5), -1, 64, [], 0),
+        (frames_of(3, 2), 3, 64, [3], 1),
+        ([*frames_of(0), b"other", *frames_of(1)], 0, 64, [0], 1),
+        ([], 0, 64, [], None),
     ],
 )
 @pytest.mark.parametrize("may_wait", [False, True])
-def test_drain_is_that_of_python(frames, expected, limit, may_wait):
-    def drain(reader):
-        messages, latency, script, flags = deque(), [0] * 8, Script(frames), []
+def test_drain_takes_what_follows_and_hands_back_what_ends_it(
+    frames, expected, limit, taken, ended_by, may_wait
+):
+    messages, latency, script, flags = deque(), [0] * 8, Script(frames), []
 
-        def receive(flag):
-            flags.append(flag)
-            return script(zmq.DONTWAIT)
+    def receive(flag):
+        flags.append(flag)
+        return script(zmq.DONTWAIT)
 
-        result = reader(receive, zmq.Again, messages, expected, limit, latency, 10**12, may_wait)
-        assert flags[1:] == [zmq.DONTWAIT] * (len(flags) - 1)
-        return result, list(messages), latency, len(script.frames), flags
-
-    reader = packer.make_reader(codec_of(Sample), HEAD)
-    coder = coder_of(Sample, HEAD)
-    assert drain(coder.drain) == drain(lambda *rest: packer.drain(reader.read, *rest))
+    found = coder_of(Sample, HEAD).drain(
+        receive, zmq.Again, messages, expected, limit, latency, 10**12, may_wait
+    )
+    end = None if ended_by is None else frames[ended_by]
+    assert found == (expected + len(taken), len(taken), end)
+    assert list(messages) == [sample(sequence) for sequence in taken]
+    assert sum(latency) == (len(taken) + 7) // 8
+    assert flags[0] == (0 if may_wait else zmq.DONTWAIT)
+    assert flags[1:] == [zmq.DONTWAIT] * (len(flags) - 1)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +221,7 @@ def test_gather_joins_the_bodies_that_follow_one_another(kept, more, limit, coun
     coder, codec = coder_of(Numbers3, HEAD), codec_of(Numbers3)
     frames = [coder.frame(Numbers3(s, float(s)), s, 0, 1000) for s in kept]
     script, latency = Script([*frames, *more]), [0] * 8
-    expected, bodies, found, frame = packer.make_reader(codec, HEAD).gather(
+    expected, bodies, found, frame = coder_of(Numbers3, HEAD).gather(
         script, zmq.Again, 0, limit, latency, 10**12
     )
     assert (expected, found, len(script.frames)) == (count, count, left)

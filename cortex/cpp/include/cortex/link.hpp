@@ -12,7 +12,6 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/pace.hpp"
 #include "cortex/broadcast.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/runtime.hpp"
@@ -91,13 +90,12 @@ class Link {
   }
 
   // Reads at most `budget` frames into the queue, those of the ring first; false if there may be more.
-  bool drain(std::deque<Item>& queue, std::size_t budget, Pace& pace) {
+  bool drain(std::deque<Item>& queue, std::size_t budget) {
     for (; budget > 0; --budget) {
       if (in_ring_) {
         const auto bytes = end_->next();
         if (end_->is_crowded()) return true;
         if (!bytes.empty()) {
-          pace.count(bytes.size());
           take_in({bytes, nullptr}, queue);
           continue;
         }

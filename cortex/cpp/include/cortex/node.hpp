@@ -126,7 +126,6 @@ class Node {
     {
       const std::lock_guard<std::mutex> lock(outlets_->mutex);
       outlets_->closed = true;
-      outlets_->leftovers.clear();
       outlets_->lossy.socket.close();
       outlets_->strict.socket.close();
     }
@@ -147,7 +146,7 @@ class Node {
   static constexpr std::int64_t tick_ns = 20'000'000;
   static constexpr std::int64_t short_tick_ns = 2'000'000;  // for a while after a change, so that peers meet soon
   static constexpr std::int64_t busy_ns = 300'000'000;
-  static constexpr std::int64_t linger_ns = 500'000'000;
+  static constexpr std::int64_t linger_ns = 1'000'000'000;
 
   void check_addresses() const {
     if (options_.insecure || keys_ != nullptr) return;
@@ -268,7 +267,7 @@ class Node {
     return record;
   }
 
-  // Waits until readers have got what publishers have left behind, if that is soon.
+  // Waits a little until readers have confirmed all that closed publishers had sent.
   void linger() {
     detail::Backoff backoff(linger_ns);
     bool in_time = true;
@@ -276,8 +275,8 @@ class Node {
       {
         const detail::Lock lock(outlets_->mutex);
         outlets_->refresh();
-        outlets_->leftovers.deliver();
-        if (outlets_->leftovers.empty()) return;
+        outlets_->ended.repeat(monotonic_ns());
+        if (outlets_->ended.empty()) return;
       }
       in_time = backoff.wait();
     }
@@ -326,7 +325,7 @@ class Node {
       const detail::Lock lock(outlets_->mutex, std::try_to_lock);
       if (lock.owns_lock()) {
         outlets_->refresh();
-        outlets_->leftovers.deliver();
+        outlets_->ended.repeat(monotonic_ns());
       }
     }
     changed = directory_->take_changed() || changed;

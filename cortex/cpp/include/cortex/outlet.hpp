@@ -10,13 +10,13 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <set>
 #include <string>
 #include <thread>
 #include <utility>
 #include <vector>
 
 #include "cortex/broadcast.hpp"
-#include "cortex/leftovers.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
@@ -50,6 +50,67 @@ inline zmq::message_t share(zmq::message_t& message) {
 
 inline zmq::message_t message_of(const std::string& bytes) { return zmq::message_t(bytes.data(), bytes.size()); }
 
+// Publishers that have closed and still wait for readers of sockets to say that they have everything. Calls are made
+// under the lock of the outlets.
+class EndedPublishers {
+ public:
+  struct Reader {
+    std::string key;
+    Outlet* outlet = nullptr;
+    std::uint64_t number = 0;  // the reader's own
+  };
+
+  // `last` is the frame that says how many messages there were.
+  void add(std::uint64_t sequence, std::string last, std::vector<Reader> readers) {
+    if (!readers.empty()) list_.push_back({sequence, std::move(last), std::move(readers)});
+  }
+
+  // A reader has left or died.
+  void detach(const std::string& key) {
+    settle([&](const Ended&, const Reader& reader) { return reader.key == key; });
+  }
+
+  // A reader has accounted for all below a sequence.
+  void confirm(std::uint64_t number, std::uint64_t up_to) {
+    settle([&](const Ended& ended, const Reader& reader) { return reader.number == number && up_to >= ended.sequence; });
+  }
+
+  // Says again how many messages there were: libzmq drops it where a queue is full.
+  void repeat(std::int64_t now_ns) {
+    if (now_ns - told_ns_ < repeat_ns) return;
+    told_ns_ = now_ns;
+    for (const auto& ended : list_) {
+      std::set<Outlet*> outlets;
+      for (const auto& reader : ended.readers) outlets.insert(reader.outlet);
+      for (Outlet* outlet : outlets) outlet->try_send(message_of(ended.last));
+    }
+  }
+
+  bool empty() const noexcept { return list_.empty(); }
+
+ private:
+  static constexpr std::int64_t repeat_ns = 20'000'000;
+
+  struct Ended {
+    std::uint64_t sequence;  // of the message that would have come next
+    std::string last;
+    std::vector<Reader> readers;  // those that have not said so yet
+  };
+
+  template <class Settled>
+  void settle(Settled settled) {
+    for (auto& ended : list_) {
+      const auto is_settled = [&](const Reader& reader) { return settled(ended, reader); };
+      ended.readers.erase(std::remove_if(ended.readers.begin(), ended.readers.end(), is_settled), ended.readers.end());
+    }
+    const auto is_done = [](const Ended& ended) { return ended.readers.empty(); };
+    list_.erase(std::remove_if(list_.begin(), list_.end(), is_done), list_.end());
+  }
+
+  std::vector<Ended> list_;
+  std::int64_t told_ns_ = 0;
+};
+
 // Both outlets of a node under one lock, and the publishers whose readers come and go through them.
 class Outlets {
  public:
@@ -69,7 +130,7 @@ class Outlets {
   Outlet strict;
   std::map<std::uint64_t, PublisherCore*> publishers;
   std::map<std::string, Outlet*> attached;
-  Leftovers leftovers;  // of publishers that have closed
+  EndedPublishers ended;
   bool closed = false;
 };
 

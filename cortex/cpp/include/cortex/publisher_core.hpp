@@ -15,7 +15,6 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/leftovers.hpp"
 #include "cortex/outlet.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/readers.hpp"
@@ -198,7 +197,7 @@ class PublisherCore {
     closed_ = true;
     outlets_->publishers.erase(source);
     try {
-      leave_behind();
+      say_end();
     } catch (...) {  // no memory to keep it: it is lost, as with the end of the process
       readers_.release();
     }
@@ -228,24 +227,21 @@ class PublisherCore {
     outlets_->refresh();
   }
 
-  // Tells readers that this was all; the node waits for the word of those that read sockets.
-  void leave_behind() {
-    Leftover leftover;
+  // Tells readers that this was all; the node says it again to those that read sockets, until they confirm it.
+  void say_end() {
     std::uint8_t last[wire::header_size];
     write_header(last, 'N', sequence_, 0, 0, 0);
     readers_.end({last, sizeof last});  // what is in the ring stays the readers'
-    leftover.sequence = sequence_;
-    if (!outlets_->closed && told_ != sequence_) {
-      zmq::message_t frame(last, sizeof last);
-      if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
-      if (has_sockets(outlets_->strict)) outlets_->strict.send_anyway(std::move(frame));
-    }
+    if (outlets_->closed) return;
+    zmq::message_t frame(last, sizeof last);
+    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
+    if (has_sockets(outlets_->strict)) outlets_->strict.try_send(std::move(frame));
+    std::vector<EndedPublishers::Reader> owed;
     for (const auto& reader : readers_.release()) {
-      const bool owes = reader->request.confirms && reader->outlet->strict && reader->member < 0 &&
-                        reader->confirmed < sequence_;
-      leftover.readers.push_back({reader->key, reader->outlet, reader->request.reader, owes});
+      const bool owes = reader->request.confirms && reader->member < 0 && reader->confirmed < sequence_;
+      if (owes) owed.push_back({reader->key, reader->outlet, reader->request.reader});
     }
-    if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
+    outlets_->ended.add(sequence_, std::string(reinterpret_cast<const char*>(last), sizeof last), std::move(owed));
   }
 
   void answer(const Reader& reader, const std::string& latched) {
@@ -409,11 +405,11 @@ inline void Outlets::refresh() {
         std::uint64_t reader = 0;
         std::uint64_t sequence = 0;
         const auto resumed = publishers.find(wire::read_resume(subscription, reader, sequence));
-        if (!outlet->strict || bytes[0] != 1) continue;
+        if (bytes[0] != 1) continue;
         if (resumed != publishers.end()) {
           resumed->second->resume(reader, sequence);
         } else {
-          leftovers.confirm(reader, sequence);
+          ended.confirm(reader, sequence);
         }
         continue;
       }
@@ -421,7 +417,7 @@ inline void Outlets::refresh() {
       const auto publisher = publishers.find(request.source);
       if (publisher == publishers.end()) {
         attached.erase(key);
-        if (bytes[0] == 0) leftovers.detach(key);
+        if (bytes[0] == 0) ended.detach(key);
       } else if (bytes[0] == 1) {
         attached[key] = outlet;
         publisher->second->attach(*outlet, key, request);

@@ -18,7 +18,6 @@
 
 #include "cortex/codec.hpp"
 #include "cortex/link.hpp"
-#include "cortex/pace.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/socket.hpp"
 
@@ -92,8 +91,7 @@ class SubscriptionCore {
         schema_(std::move(schema)),
         type_(type),
         policy_(policy),
-        complaints_(std::move(complaints)),
-        pace_(policy_) {}
+        complaints_(std::move(complaints)) {}
   ~SubscriptionCore() { close(); }
 
   const std::string& topic() const noexcept { return topic_; }
@@ -148,8 +146,7 @@ class SubscriptionCore {
     while (true) {
       std::vector<pollfd> fds;
       {
-        std::unique_lock<std::mutex> lock(mutex_);
-        if (queue_.empty() && exhausted_) gather(lock, deadline_ns);
+        const std::lock_guard<std::mutex> lock(mutex_);
         if (closed_) return std::nullopt;
         if (!problems_.empty()) {
           const TypeMismatch problem = std::move(problems_.front());
@@ -224,17 +221,6 @@ class SubscriptionCore {
   static constexpr std::int64_t tend_ns = 20'000'000;
   static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way, after all that is there
 
-  // Lets the messages of a flood gather, if there is time for that, without the lock.
-  void gather(std::unique_lock<std::mutex>& lock, std::int64_t deadline_ns) const {
-    if (pace_.gather_ns() == 0) return;
-    const std::int64_t look_ns = drained_ns_.load(std::memory_order_relaxed) + pace_.gather_ns();
-    const std::int64_t left_ns = look_ns - monotonic_ns();
-    if (left_ns <= 0 || look_ns > deadline_ns) return;
-    lock.unlock();
-    Pace::sleep(left_ns);
-    lock.lock();
-  }
-
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
   // the last one was there within `spin_ns`, this looks for the next one for so long. It looks every `gather_ns`, since
   // each look in vain has whoever writes to the ring wake us.
@@ -277,17 +263,16 @@ class SubscriptionCore {
       Link& link = *links_[(first_ + index) % count];
       const std::size_t room = policy_.depth - std::min(policy_.depth, queue_.size());
       const std::size_t share = (room + count - index - 1) / (count - index);
-      if (policy_.is_reliable ? link.drain(queue_, share, pace_) : drain_lossy(link)) continue;
+      if (policy_.is_reliable ? link.drain(queue_, share) : drain_lossy(link)) continue;
       link.stay(now_ns);
       exhausted_ = false;
     }
-    pace_.looked(now_ns);
   }
 
   // Reads all that has arrived, but not for ever, and keeps the last of it; whether nothing is left.
   bool drain_lossy(Link& link) {
     for (std::size_t read = 0; read < drain_lossy_count; read += drain_count) {
-      const bool empty = link.drain(queue_, drain_count, pace_);
+      const bool empty = link.drain(queue_, drain_count);
       while (queue_.size() > policy_.depth) {
         queue_.pop_front();
         ++counters_->overtaken;
@@ -330,7 +315,6 @@ class SubscriptionCore {
   std::deque<std::uint64_t> mismatched_;
   std::size_t first_ = 0;  // the link that was read first the last time
   std::atomic<std::int64_t> drained_ns_{0};
-  Pace pace_;
   std::atomic<bool> in_rush_{false};  // messages follow one another within `spin_ns`
   bool exhausted_ = true;
   bool closed_ = false;
