@@ -64,7 +64,7 @@ QUESTIONS: Sequence[Question] = (
     ),
     Question(
         name="pixel",
-        help="a test bench of the event pixel: ramp, step, sine, darkness, readout",
+        help="a test bench of the event pixel: ramp, step, sine, noise of the presets",
         options=("device",),
     ),
     Question(

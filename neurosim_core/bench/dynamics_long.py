@@ -1,9 +1,8 @@
-"""An hour of hover, still and turning, and of a free top: what drifts; and steps of vehicles a second."""
+"""An hour of hover, still and turning, and of a free top: what drifts."""
 
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -69,44 +68,3 @@ def measure_drifts(quick: bool, progress: Progress) -> list[Row]:
                     row["position [m]"] = math.hypot(*state[POSITION])
                 rows.append(row)
     return rows
-
-
-def measure_rates(quick: bool, progress: Progress) -> list[Row]:
-    """Time one vehicle and 4096, short calls and long, in steps of 1 ms."""
-    windy = {"flapping_kg_m": 1e-5, "wind_m_s": (2.0, -1.0, 0.5)}
-    rest = {
-        "gusts": ({"velocity_m_s": (3.0, 0.0, 0.0), "start_s": 1.0, "rise_s": 2.0},),
-        "turbulence": {"wind_20ft_m_s": 7.7},
-        "ground": {"height_m": -1e6, "rotor_radius_m": 0.1},
-        "motor_time_constant_scale": (1.0, 1.05, 0.95, 1.0),
-    }
-    loads = {
-        "air and wind": preset("hummingbird", **windy),
-        "everything": preset("hummingbird", **windy, **rest),
-    }
-    rows: list[Row] = []
-    for load, count, steps in [
-        (load, n, steps) for load in loads for n in (1, 4096) for steps in (1, 10, 100)
-    ]:
-        progress(f"{count} vehicles, {steps} steps a call, {load}")
-        vehicle = Multirotor(loads[load], count=count)
-        rate = best_rate(vehicle, steps, repetitions=3 if quick else 5, cpu_s=0.05 if quick else 0.5)
-        row: Row = {"what acts": load, "terms": len(vehicle.terms), "vehicles": count}
-        rows.append({**row, "steps a call": steps, "vehicle-steps/s": rate})
-    return rows
-
-
-def best_rate(vehicle: Multirotor, steps: int, *, repetitions: int, cpu_s: float) -> float:
-    """Return the steps of vehicles per second of CPU time, the best of the repetitions."""
-
-    def spend(calls: int) -> float:
-        vehicle.reset()
-        begin_ns = time.thread_time_ns()
-        for _ in range(calls):
-            vehicle.advance(steps * 1_000_000)
-        return 1e-9 * (time.thread_time_ns() - begin_ns)
-
-    spend(2)  # compiles
-    calls = max(1, round(cpu_s / max(spend(3) / 3, 1e-9)))
-    best_s = min(spend(calls) for _ in range(repetitions))
-    return calls * steps * vehicle.count / best_s
