@@ -69,7 +69,7 @@ QUESTIONS: Sequence[Question] = (
     ),
     Question(
         name="render",
-        help="error against run time of rendering, and false events from aliasing",
+        help="error against run time of rendering",
         options=("scene", "device", "samples"),
     ),
     Question(

@@ -1,4 +1,4 @@
-"""Dynamics: error against run time, stiff and extreme flights, an hour of flight.
+"""Dynamics: error against run time, stiff and extreme flights.
 
 SciPy judges the vehicle on equations of its own (`dynamics_oracle`); RotorPy stands beside it. Times are CPU
 time of one core, the best of several repetitions; ratios are of times taken in one run.
@@ -16,7 +16,6 @@ import numpy as np
 
 from neurosim_core.bench import rotorpy_peer
 from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, MOTORS_S, Array, Flight, lagging
-from neurosim_core.bench.dynamics_long import measure_drifts
 from neurosim_core.bench.dynamics_oracle import Reference, compare, make_reference
 from neurosim_core.bench.engine import DynamicsError, Multirotor
 from neurosim_core.bench.options import Options, Progress, silent
@@ -49,12 +48,10 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         {f"{tau_s:g} s": (functools.partial(lagging, tau_s), False) for tau_s in MOTORS_S}, quick, progress
     )
     extremes = _hard(EXTREMES, quick, progress)
-    drifts = measure_drifts(quick, progress)
     claims = [
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
         _hard_claim("any motor time constant", motors, 1e-8),
         _hard_claim("every extreme flight that is flown", extremes, 1e-5),
-        _drift_claim(drifts),
         _peer_claim(peers),
     ]
     errors = {row["method"]: cell(_error_m(row)) for row in _at_one_ms(samples, "figure eight")}
@@ -72,17 +69,16 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         summary="At steps of 1 ms 5 s of a figure eight at 9 m/s end with position errors of "
         + ", ".join(f"{error} m by {method}" for method, error in errors.items())
         + f". Called alike from Python, against RotorPy's RK45: {claims[-1].measured}.\n\nExtreme flights (3 "
-        f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-3].measured}.",
+        f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-2].measured}.",
         claims=claims,
         tables=[
             Table("dynamics-1-ms", "Error at steps of 1 ms, or at rtol 1e-6", _at_one_ms(samples), sampled),
             Table("dynamics-rotorpy", "RotorPy on the same flights", peers, "Ratios of CPU times."),
             Table("dynamics-motor", "Stiff motors, 0.2 s", _pivot(motors), hard),
             Table("dynamics-extremes", "Extreme flights, 0.2 s", _pivot(extremes), hard),
-            Table("dynamics-long", "Drift over time", drifts),
             Table("dynamics-work-precision", "Error against CPU time and step", samples, sampled),
         ],
-        plots=_plots(samples, peers, motors, drifts),
+        plots=_plots(samples, peers, motors),
     )
 
 
@@ -235,17 +231,6 @@ def _hard_claim(what: str, rows: Sequence[Row], limit_m: float) -> Claim:
     )
 
 
-def _drift_claim(drifts: Sequence[Row]) -> Claim:
-    last = {row["run"]: row for row in drifts if row["method"] == RKMK4 and "hover" in row["run"]}
-    said = (f"{run}: {cell(row[POSITION_M])} m after {row['after [s]']} s" for run, row in last.items())
-    return Claim(
-        "an hour of hover, still and turning at 29 rad/s: the drift is <= 1e-4 m",
-        "closed form: the vehicle stays where it is",
-        ", ".join(said),
-        all(row[POSITION_M] <= 1e-4 and row["after [s]"] == 3600 for row in last.values()),
-    )
-
-
 def _peer_claim(peers: Sequence[Row]) -> Claim:
     text = "figure eight, called from Python once a command: >= 10 times as fast as RotorPy at 1 ms, no "
     "less exact"
@@ -286,7 +271,7 @@ def _pivot(rows: Sequence[Row]) -> list[Row]:
     return found
 
 
-def _plots(samples: list[Row], peers: list[Row], motors: list[Row], drifts: list[Row]) -> list[Plot]:
+def _plots(samples: list[Row], peers: list[Row], motors: list[Row]) -> list[Plot]:
     def panel(title: str, rows: Iterable[Row], x: str, y: str, **more: Any) -> Panel:
         series = lines(list(rows), x, y, by="method", y_floor=1e-17)
         return Panel(title=title, x_label=x, y_label=y, series=series, x_scale="log", y_scale="log", **more)
@@ -298,17 +283,12 @@ def _plots(samples: list[Row], peers: list[Row], motors: list[Row], drifts: list
     tau, none_s = "motor time constant [s]", 1e-7
     stiff = [{**row, tau: float(row["flight"].split()[0]) or none_s} for row in motors]
     ticks = {"none": none_s, **{f"{tau_s:g}": tau_s for tau_s in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)}}
-    runs = {"spinning hover": POSITION_M, "free top": "energy, relative"}
     timed, stepped = [row for row in (*samples, *peers) if CPU in row], [row for row in samples if row[STEP]]
     steps = [*panels(stepped, STEP, POSITION_M), *panels(stepped, STEP, ATTITUDE)]
     lost = "Stiff motors, steps of 1 ms or rtol 1e-6; no mark: not finite, or too slow"
     motor = panel("", stiff, tau, POSITION_M, x_ticks=ticks, x_lines={"step": 1e-3})
-    long_runs = [
-        panel(run, (r for r in drifts if r["run"] == run), "after [s]", y) for run, y in runs.items()
-    ]
     return [
         Plot("dynamics-work-precision", "Error against CPU time", panels(timed, CPU, POSITION_M), 2, True),
         Plot("dynamics-step", "Error against step size", steps, 4, True),
         Plot("dynamics-motor", lost, [motor]),
-        Plot("dynamics-drift", "Long runs", long_runs, 2),
     ]

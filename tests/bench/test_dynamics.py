@@ -79,16 +79,6 @@ def test_stiff_flights_are_judged_and_refusals_kept():
     assert refused[RKMK4].startswith("refused")
 
 
-def test_a_vehicle_that_drifts_is_seen():
-    rows = [
-        {"run": run, "method": RKMK4, "after [s]": 3600, "position [m]": 1e-9}
-        for run in ("hover", "spinning hover")
-    ]
-    assert dynamics._drift_claim(rows).met
-    assert not dynamics._drift_claim([rows[0], {**rows[1], "position [m]": 1e-3}]).met
-    assert not dynamics._drift_claim([rows[0], {**rows[1], "after [s]": 600}]).met
-
-
 @pytest.mark.skipif(rotorpy_peer.rotorpy_version() is None, reason="RotorPy is not installed")
 def test_rotorpy_flies_the_same_equations(rotor_step):
     """Its RK45 at 1 ms is at rounding where motors are slow: the equations are the same."""
