@@ -68,10 +68,7 @@ class Parameters:
         ):
             service = backend.service(f"{node}/{service_path(name)}", f"rcl_interfaces/srv/{name}", answer)
             self._resources.callback(service.close)
-
-    def close(self) -> None:
-        """Withdraw the services."""
-        self._resources.close()
+        self.close = self._resources.close  # withdraws the services
 
     def all(self) -> dict[str, Described]:
         """Return all parameters by their names."""

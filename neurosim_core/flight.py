@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import importlib
 import importlib.util
 import itertools
+import math
 import shutil
 import sys
 import tempfile
@@ -40,7 +43,7 @@ from neurosim_core.view.film import save_film
 from neurosim_core.view.overview import FlightSummary, Track
 from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
 from neurosim_core.view.rerun_shapes import scene_shapes
 from neurosim_core.warp_start import has_kernels
 
@@ -112,7 +115,9 @@ def fly(
         )
     with _new_folder(folder), console.status("preparing") as status:
         model = make_model(
-            config, on_phase=lambda phase: status.update(f"preparing: {phase}"), meanwhile=warm_flight
+            config,
+            on_phase=lambda phase: status.update(f"preparing: {phase}"),
+            meanwhile=functools.partial(_load, rerun=rerun),
         )
         status.update("preparing: kernels (compiled once, then kept)")
         state = make_state(model)
@@ -285,7 +290,7 @@ class _Files:
         self._model, self._folder, self._console = model, folder, console
         self._recording: RecordingWriter | None = None
         self._rerun: RerunLogger | None = None
-        self._checked_s = time.monotonic()
+        self._checked_s = -math.inf  # so before the first packet is in flight.h5
         header = header_of(model)
         if _has("h5py", console, "flight.h5"):
             self._recording = RecordingWriter(folder / "flight.h5", header)
@@ -362,6 +367,18 @@ class _Files:
                 markup=False,
                 soft_wrap=True,
             )
+
+
+def _load(model: Model, *, rerun: bool) -> None:
+    """Load what is used later, while the scene is lit: kernels, and the libraries of `_LIBRARIES`."""
+    warm_flight(model)
+    for library in _LIBRARIES:
+        if importlib.util.find_spec(library) is None or (library == "rerun" and not rerun):
+            continue
+        if library == "rerun":
+            import_rerun()  # which keeps it quiet
+        else:
+            importlib.import_module("matplotlib.figure" if library == "matplotlib" else library)
 
 
 def _planned_track(model: Model, end_ns: int) -> Track:
