@@ -14,10 +14,10 @@ import time
 from collections.abc import Iterable
 
 from cortex import Node
-from cortex_ros2_bridge import diagnostics
+from cortex_ros2_bridge import cdr, diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError
 from cortex_ros2_bridge.config import QOS, BridgeConfig
-from cortex_ros2_bridge.convert.records import status_record
+from cortex_ros2_bridge.convert.records import record, status_record, time_of
 from cortex_ros2_bridge.lifecycle import ACTIVE, FINALIZED, INACTIVE, STATES, UNCONFIGURED
 from cortex_ros2_bridge.links import Connections, Link
 from cortex_ros2_bridge.neighbours import Neighbours
@@ -278,8 +278,8 @@ class Bridge:
         ]
         if self._diagnostics.subscriber_count:
             newest = max((feed.newest for feed in feeds), default=(0.0, 0))
-            array = diagnostics.diagnostic_array(statuses, newest[1])
+            head = record("std_msgs/msg/Header")(time_of(newest[1]), "")
             try:
-                self._diagnostics.publish(array)
+                self._diagnostics.publish(cdr.encode(record(diagnostics.TYPE)(head, statuses)))
             except BackendError as error:
                 logger.warning("%s: %s", diagnostics.TOPIC, error)

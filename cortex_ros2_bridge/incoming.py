@@ -73,11 +73,6 @@ class Incoming:
         self._pending: tuple[Target, Any, float] | None = None
         self._told = 0
 
-    @property
-    def heard(self) -> bool:
-        """Whether anybody in ROS publishes; as of the last look."""
-        return self.publisher_count > 0
-
     def add(self, target: Target) -> None:
         """Add a target; there is more than one where the message says which (AttitudeTarget)."""
         with self._lock:

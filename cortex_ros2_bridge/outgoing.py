@@ -213,15 +213,17 @@ class Feed:
         self._told = (0, 0)
         self.newest = (0.0, 0)
 
-    def tap(self, function: Callable[[Any], None], wants: Callable[[], bool]) -> None:
-        """Give messages to a function of the bridge while it wants any, before the routes get them."""
+    def tap(
+        self, function: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
+    ) -> None:
+        """Give messages to a function while it wants any, before routes get them, until a stack closes."""
         with self._lock:
             self._taps[function] = wants
             if self._last is not None:
                 function(self._last)
+        stack.callback(self._untap, function)
 
-    def untap(self, function: Callable[[Any], None]) -> None:
-        """Give it no more of them."""
+    def _untap(self, function: Callable[[Any], None]) -> None:
         with self._lock:
             del self._taps[function]
 

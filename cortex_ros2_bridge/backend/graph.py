@@ -45,6 +45,7 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 Kind = Literal["writer", "reader"]
+_DISCOVERED = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 _CLOSE_S = 5.0
 _BATCH = 64
 _WITHOUT_HASH = next(name for name, distro in DISTROS.items() if not distro.shows_type_hash)
@@ -134,7 +135,9 @@ class Graph:
 
     def _follow(self) -> None:
         try:
-            waitset, readers = self._watch()
+            with ENTITIES:
+                readers = [BuiltinDataReader(self._participant, kind) for kind in _DISCOVERED]
+                waitset = wait_set(self._participant, self._guard, readers)
             while self._open:
                 self._take_participants(readers[0])
                 self._take_endpoints(readers[1], "writer")
@@ -144,13 +147,6 @@ class Graph:
         except (DDSException, Refused):
             if self._open:
                 _log.exception("the ROS graph is not followed any more")
-
-    def _watch(self) -> tuple[Any, list[Any]]:
-        """Return what wakes the thread up, and readers of participants, writers and readers of others."""
-        kinds = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
-        with ENTITIES:
-            readers = [BuiltinDataReader(self._participant, kind) for kind in kinds]
-            return wait_set(self._participant, self._guard, readers), readers
 
     def _take_participants(self, reader: Any) -> None:
         for sample, alive in _samples(reader):

@@ -37,7 +37,7 @@ def event_packet(message: messages.Events, context: Context) -> Any:
                 raise ConvertError(f"mono holds no time before 0, got {base_us} us")
             data = encode_mono(columns, **size, base_us=base_us)
         else:
-            data = context.remembered("evt3", Evt3Encoder).encode(columns, **size, end_us=base_us)
+            data = context.memory.setdefault("evt3", Evt3Encoder()).encode(columns, **size, end_us=base_us)
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
     return record("event_camera_msgs/msg/EventPacket")(

@@ -83,12 +83,12 @@ def _decode_evt3(message: Any, stamp_us: int, context: Context) -> EventColumns:
     stamp says the rest; the stamps of drivers are of another clock, so there wraps are counted.
     """
     size = {"width": message.width, "height": message.height}
-    if context.remembered("is_stamped", lambda: True):
+    if context.memory.setdefault("is_stamped", True):
         columns = Evt3Decoder(start_us=stamp_us).decode(message.events, **size)
         if not len(columns.t) or int(columns.t[0]) == stamp_us:
             return columns
         context.memory["is_stamped"] = False
-    decoder: Evt3Decoder = context.remembered("evt3", Evt3Decoder)
+    decoder: Evt3Decoder = context.memory.setdefault("evt3", Evt3Decoder())
     return decoder.decode(message.events, **size)
 
 

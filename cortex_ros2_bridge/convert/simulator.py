@@ -68,8 +68,10 @@ def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -
         None, if the array before is not a second old and the phase is the same.
     """
     before: messages.SimulatorStatus | None = context.memory.get("judged")
-    if before is not None and not _is_due(message, before):
-        return None
+    if before is not None:
+        waited_ns = abs(message.wall_ns - before.wall_ns)
+        if message.phase == before.phase and waited_ns < DIAGNOSTICS_INTERVAL_NS:
+            return None
     context.memory["judged"] = message
     judged = _Judged(message, before)
     statuses = [_of_simulator(message, judged)]
@@ -77,10 +79,6 @@ def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -
     statuses += [_of_vehicle(vehicle, judged) for vehicle in message.vehicles]
     array = record("diagnostic_msgs/msg/DiagnosticArray")
     return array(header(message.stamp_ns, "", context), statuses)
-
-
-def _is_due(message: messages.SimulatorStatus, before: messages.SimulatorStatus) -> bool:
-    return message.phase != before.phase or abs(message.wall_ns - before.wall_ns) >= DIAGNOSTICS_INTERVAL_NS
 
 
 class _Judged:
