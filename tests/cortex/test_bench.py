@@ -142,7 +142,7 @@ def _dies(_pipe: Any, _job: None) -> None:
 
 
 def _hangs(pipe: Any, _job: None) -> None:
-    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     pipe.send([os.getpid(), helper.pid])
     helper.wait()
 
