@@ -134,8 +134,6 @@ class Node:
         )
         _nodes.add(self)
 
-    # What users call
-
     def publisher(
         self,
         topic: str,
@@ -385,8 +383,6 @@ class Node:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    # Keeping track
 
     def _check_open(self) -> None:
         if self._pid != os.getpid():

@@ -72,9 +72,7 @@ class Subscriber(Generic[T]):
         self._leaving = self._intake.leaving
         self._on_close = on_close
         self._closed = False
-        self._async_receiver: AsyncReceiver[T] = AsyncReceiver(
-            self._intake, self.wakeup, self._take_now, self._watched, lambda: self._generation
-        )
+        self._async_receiver: AsyncReceiver[T] | None = None
         self._generation = 0
         self._raised = 0
         self.refused: set[int] = set()
@@ -177,7 +175,7 @@ class Subscriber(Generic[T]):
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
-        return self._async_receiver
+        return self._receiver_of_loops()
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
@@ -186,10 +184,18 @@ class Subscriber(Generic[T]):
         messages; then other tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
         try:
-            return await self._async_receiver.receive(timeout_s)
+            return await self._receiver_of_loops().receive(timeout_s)
         except TimeoutError:
             error = self._nothing_came(timeout_s)
         raise error
+
+    def _receiver_of_loops(self) -> AsyncReceiver[T]:
+        """What serves asyncio, made when wanted: it refers back to us, which delays our end."""
+        if self._async_receiver is None:
+            self._async_receiver = AsyncReceiver(
+                self._intake, self.wakeup, self._take_now, self._watched, lambda: self._generation
+            )
+        return self._async_receiver
 
     def _take_now(self) -> Any:
         """Take the next message if it is there; `NOTHING` if not, or if it could not be read."""
@@ -484,7 +490,8 @@ class Subscriber(Generic[T]):
             links = list(self._links)
             self._links.clear()
             self._leaving.clear()
-        self._async_receiver.stop()
+        if self._async_receiver is not None:
+            self._async_receiver.stop()
         for link in links:
             link.close()
         self.wakeup.set()
