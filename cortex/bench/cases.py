@@ -155,18 +155,6 @@ def _latest(name: str, *, busy: bool) -> Case:
     return Case(f"latest-{name}", title, FLOATS["40"], contestants, bars, _AGE, count=_AGE_COUNT)
 
 
-def _cpp(size: str) -> Case:
-    title = f"{_LABELS[size]}, Python publisher, C++ subscriber beside the Python one (callback)"
-    contestants = (_cortex("C++ subscriber", "cortex-cpp"), _cortex("Python subscriber"))
-    return Case(
-        f"cpp-{size}",
-        title,
-        FLOATS[size],
-        contestants,
-        (_over(1.0, "Python subscriber", who="C++ subscriber"),),
-    )
-
-
 def _memory(size: str) -> Case:
     ways = tuple(_cortex(how, how=how) for how in ("callback", "recv", "async"))
     title = f"memory of both sides over 10^6 messages of {_LABELS[size]}, by each way to receive"
@@ -223,8 +211,6 @@ CASES: tuple[Case, ...] = (
          FLOATS["40"], (_cortex(), _raw(1)), (_over(0.8, _RAW1), _over(100_000.0)), subscribers=8),
     _latest("busy", busy=True),
     _latest("asleep", busy=False),
-    _cpp("40"),
-    _cpp("900k"),
     _memory("40"),
     _memory("39k"),
     Case("deaths", "from the kill of a process under load until the other side knows", FLOATS["40"],

@@ -15,7 +15,7 @@ from typing import Any
 
 from cortex.bench import peer_cortex  # noqa: F401  # here, so that its children need not
 from cortex.bench.cases import choose
-from cortex.bench.measure import CaseResult, Outcome, Settings, run_case
+from cortex.bench.measure import CaseResult, Settings, run_case
 from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
 from cortex.bench.report import make_console, print_case, print_header, print_list, print_summary, write_csv
@@ -62,10 +62,12 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
     if options.against is not None:
         cases = [case.beside(str(options.against.resolve())) for case in cases]
     if options.list:
-        print_list(
-            console, [CaseResult(case, {c.name: Outcome(c) for c in case.contestants}) for case in cases]
-        )
+        print_list(console, cases)
         return []
+    if options.repeats < 1 or not 0.0 < options.seconds <= 600.0:  # also refuses nan
+        raise ValueError(
+            f"wants repeats >= 1 and 0 < seconds <= 600, got {options.repeats}, {options.seconds}"
+        )
     quick = options.quick
     settings = Settings(
         repeats=min(options.repeats, _QUICK_REPEATS) if quick else options.repeats,

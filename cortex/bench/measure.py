@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,21 @@ _LOADED_S = 0.3
 """So long after the beginning of a flood a process is killed [s]."""
 
 
+Report = dict[str, Any]
+"""What one repetition gave: a figure by metric, counts; `error` or `absent` if it gave none."""
+
+
+class Settings(NamedTuple):
+    """How long and how often to measure."""
+
+    repeats: int = 5
+    repeats_max: int = 0
+    """Up to which a bar is measured again that lies within the noise; 0: it is not."""
+    seconds: float = 0.5
+    count_max: int = 0
+    """Bounds the messages of cases that count them; 0: no bound."""
+
+
 class Spread(NamedTuple):
     """A median, and between what the true one lies."""
 
@@ -42,11 +57,6 @@ class Spread(NamedTuple):
     low: float
     """With `high`, the 95 % interval of the median, whatever the distribution; the range of 8 or fewer."""
     high: float
-
-    @property
-    def half_width(self) -> float:
-        """Half of the interval."""
-        return (self.high - self.low) / 2.0
 
 
 def spread_of(values: list[float]) -> Spread | None:
@@ -64,66 +74,23 @@ def spread_of(values: list[float]) -> Spread | None:
     return Spread(float(np.median(ordered)), ordered[outside], ordered[-1 - outside])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """How long and how often to measure."""
-
-    repeats: int = 5
-    repeats_max: int = 0
-    """Up to which a bar is measured again that lies within the noise; 0: it is not."""
-    seconds: float = 0.5
-    count_max: int = 0
-    """Bounds the messages of cases that count them; 0: no bound."""
-
-    def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ValueError(f"repeats must be >= 1, got {self.repeats}")
-        if not 0.0 < self.seconds <= 600.0:  # also refuses nan
-            raise ValueError(f"seconds must be > 0 and <= 600, got {self.seconds}")
+def values_of(reports: list[Report], metric: str) -> list[float]:
+    """Return one figure per repetition that has it."""
+    return [float(report[metric]) for report in reports if metric in report]
 
 
-@dataclass
-class Outcome:
-    """What one contestant did in all its repetitions."""
-
-    contestant: Contestant
-    repetitions: list[dict[str, Any]] = field(default_factory=list)
-    """Reports, in order; one that failed has only the key ``error``."""
-    absent: str = ""
-    """Why it did not take part."""
-
-    def values(self, metric: str) -> list[float]:
-        """Return one figure per repetition that has it."""
-        return [float(report[metric]) for report in self.repetitions if metric in report]
-
-    def total(self, count: str) -> int:
-        """Return the sum of a count over all repetitions."""
-        return sum(int(report.get(count, 0)) for report in self.repetitions)
-
-    @property
-    def errors(self) -> list[str]:
-        """What went wrong, one text for each repetition that failed."""
-        return [str(report["error"]) for report in self.repetitions if "error" in report]
-
-    @property
-    def why_not(self) -> str:
-        """Why there is no figure."""
-        return self.absent or next(iter(self.errors), "no figure")
-
-    @property
-    def faults(self) -> str:
-        """Losses, disorder and damage in words; empty if there were none."""
-        share = f" ({100.0 * self.total('lost') / max(1, self.total('sent')):.1f} %)"
-        words = {"lost": "LOST", "misordered": "OUT OF ORDER", "corrupt": "CORRUPT"}
-        return ", ".join(
-            f"{word} {self.total(count):,}{share if count == 'lost' else ''}"
-            for count, word in words.items()
-            if self.total(count)
-        )
+def faults_of(reports: list[Report]) -> str:
+    """Return what spoils a contestant's figures, in words; empty if nothing does."""
+    errors = [str(report["error"]) for report in reports if "error" in report]
+    parts = [str(report["absent"]) for report in reports if "absent" in report]
+    parts += [f"{len(errors)} of {len(reports)} failed: {errors[0]}"] if errors else []
+    for count, word in {"lost": "LOST", "misordered": "OUT OF ORDER", "corrupt": "CORRUPT"}.items():
+        if total := sum(values_of(reports, count)):
+            parts.append(f"{word} {total:,.0f} of {sum(values_of(reports, 'sent')):,.0f}")
+    return ", ".join(parts)
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """A bar and what was measured."""
 
     bar: Bar
@@ -136,10 +103,8 @@ class Verdict:
     @property
     def word(self) -> str:
         """Met, missed, or not measured."""
-        if self.measured is None:
-            return f"not measured ({self.note})"
-        if self.note:
-            return f"missed ({self.note})"
+        if self.measured is None or self.note:
+            return f"{'missed' if self.measured else 'not measured'} ({self.note})"
         value, bound = self.measured.median, self.bar.bound
         return "met" if (value >= bound if self.bar.wanted == ">=" else value <= bound) else "missed"
 
@@ -151,38 +116,32 @@ class Verdict:
         )
 
 
+def judge(bar: Bar, results: dict[str, list[Report]]) -> Verdict:
+    """Compare: ratios are taken within each repetition, so that what slows the machine slows both sides."""
+    ours, metric = results[bar.who], bar.metric
+    values, note = values_of(ours, metric), faults_of(ours)
+    if not bar.against or not values:
+        return Verdict(bar, spread_of(values), "", note)
+    rivals = [name for name in bar.against if values_of(results[name], metric)]
+    if not rivals:
+        return Verdict(bar, None, "", f"{bar.against[0]}: {faults_of(results[bar.against[0]])}")
+    pick = max if METRICS[metric].larger_is_better else min
+    best = pick(rivals, key=lambda name: float(np.median(values_of(results[name], metric))))
+    pairs = zip(ours, results[best], strict=True)
+    ratios = [own[metric] / other[metric] for own, other in pairs if metric in own and other.get(metric)]
+    return Verdict(bar, spread_of(ratios), best, note if ratios else "never both in one repetition")
+
+
 @dataclass
 class CaseResult:
-    """Everything about one case."""
+    """What the contestants of a case did, by name, one report for each repetition."""
 
     case: Case
-    outcomes: dict[str, Outcome]
+    reports: dict[str, list[Report]]
 
     def verdicts(self) -> list[Verdict]:
         """Return the case's bars with what was measured."""
-        return [judge(bar, self.outcomes) for bar in self.case.bars]
-
-
-def judge(bar: Bar, outcomes: dict[str, Outcome]) -> Verdict:
-    """Compare: ratios are taken within each repetition, so that what slows the machine slows both sides."""
-    who = outcomes[bar.who]
-    if not who.values(bar.metric):
-        return Verdict(bar, None, "", who.why_not)
-    note = who.faults or (f"{len(who.errors)} repetitions failed" if who.errors else "")
-    if not bar.against:
-        return Verdict(bar, spread_of(who.values(bar.metric)), "", note)
-    rivals = [outcomes[name] for name in bar.against if outcomes[name].values(bar.metric)]
-    if not rivals:
-        return Verdict(bar, None, "", f"{bar.against[0]}: {outcomes[bar.against[0]].why_not}")
-    pick = max if METRICS[bar.metric].larger_is_better else min
-    best = pick(rivals, key=lambda rival: float(np.median(rival.values(bar.metric))))
-    ratios = [
-        float(ours[bar.metric]) / float(theirs[bar.metric])
-        for ours, theirs in zip(who.repetitions, best.repetitions, strict=True)
-        if bar.metric in ours and theirs.get(bar.metric)
-    ]
-    note = note if ratios else "never both in one repetition"
-    return Verdict(bar, spread_of(ratios), best.contestant.name, note)
+        return [judge(bar, self.reports) for bar in self.case.bars]
 
 
 def run_case(case: Case, settings: Settings) -> CaseResult:
@@ -192,14 +151,14 @@ def run_case(case: Case, settings: Settings) -> CaseResult:
     """
     repeats = min(settings.repeats, case.repeats or settings.repeats)
     repeats_max = max(repeats, 0 if case.repeats else settings.repeats_max)
-    outcomes = {c.name: Outcome(c, absent=missing(c.peer)) for c in case.contestants}
-    result = CaseResult(case, outcomes)
+    absent = {c.name: [{"absent": missing(c.peer)}] if missing(c.peer) else [] for c in case.contestants}
+    result = CaseResult(case, absent)
+    present = [contestant for contestant in case.contestants if not absent[contestant.name]]
     for repetition in range(repeats_max):
         if repetition >= repeats and not any(verdict.is_open for verdict in result.verdicts()):
             break
-        present = [outcome for outcome in outcomes.values() if not outcome.absent]
-        for outcome in reversed(present) if repetition & 1 else present:
-            outcome.repetitions.append(_repeat(case, outcome.contestant, settings))
+        for contestant in reversed(present) if repetition & 1 else present:
+            result.reports[contestant.name].append(_repeat(case, contestant, settings))
     return result
 
 

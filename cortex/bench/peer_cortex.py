@@ -1,4 +1,4 @@
-"""Cortex itself, used as its documentation says: typed messages, decoded to objects; and its C++ subscriber.
+"""Cortex itself, used as its documentation says: typed messages, decoded to objects.
 
 Options: ``fixed``, ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`` (an address).
 """
@@ -6,25 +6,15 @@ Options: ``fixed``, ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`
 from __future__ import annotations
 
 import asyncio
-import functools
-import importlib
-import json
-import os
-import shutil
-import subprocess
 import threading
-from pathlib import Path
 from typing import Any
 
 import cortex.node
 from cortex.bench.peers import PATIENCE_S, Job, Peer, Send
-from cortex.bench.tally import WARM, Finished, Floats, Handler
+from cortex.bench.tally import Finished, Floats, Handler
 from cortex.message import Array, message
 from cortex.node import Node
 from cortex.policy import latest, reliable
-
-_SOURCE = Path(__file__).with_name("subscriber.cpp")
-_BUILD_S = 120.0
 
 
 @message(name="bench/Sample")
@@ -100,9 +90,7 @@ def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
     # Large messages wait in the publisher's ring, which bounds their memory.
     patient = reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
     policy = latest() if job.options.get("latest") else patient
-    subscribe = functools.partial(
-        _node(job, listens=False).subscriber, _topic(job, topic), _type(job, topic), policy=policy
-    )
+    subscribe, kind = _node(job, listens=False).subscriber, _type(job, topic)
     done = threading.Event()
 
     def on_message(sample: Any) -> None:
@@ -112,10 +100,10 @@ def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
             done.set()
 
     if how == "callback":
-        subscribe(on_message)
+        subscribe(_topic(job, topic), kind, on_message, policy=policy)
         done.wait()  # the runner kills a child that waits for ever
     else:
-        _BY[how](subscribe(), handle)
+        _BY[how](subscribe(_topic(job, topic), kind, policy=policy), handle)
 
 
 def _by_recv(subscriber: Any, handle: Handler) -> None:
@@ -153,45 +141,9 @@ def tell_death(job: Job, callback: Any) -> None:
     node.watch(topic, lambda change: None if change.alive else callback())
 
 
-def _program() -> Path:
-    return Path(os.environ["CORTEX_BENCH_DIR"], "subscriber")
-
-
-def _receive_cpp(job: Job, topic: str, handle: Handler, how: str) -> dict[str, Any]:
-    """Run the C++ subscriber, which prints a line when it is connected and one when the flood is over."""
-    command = [str(_program()), _topic(job, topic), str(job.depth)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("{"):
-                report: dict[str, Any] = json.loads(line)
-                return report
-            handle(WARM, ())
-    raise RuntimeError(f"the C++ subscriber ended with status {process.returncode} and no result")
-
-
-@functools.cache
-def cpp_missing() -> str:
-    """Build the C++ subscriber in this run's directory; return the first complaint, or nothing."""
-    if shutil.which("g++") is None or not Path("/usr/include/zmq.h").exists():
-        return "no g++, or no zmq.h"
-    folder, cppgen = _program().parent, importlib.import_module("cortex.cppgen")
-    cppgen.write_headers(folder)
-    (folder / "sample.hpp").write_text(cppgen.generate([Sample]))
-    include = Path(cortex.node.__file__).with_name("cpp") / "include"
-    command = ["g++", "-std=c++17", "-O2", f"-I{include}", f"-I{folder}", str(_SOURCE)]
-    command += ["-o", str(_program()), "-lzmq", "-pthread"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_S, check=False)
-    errors = [line for line in done.stderr.splitlines() if "error" in line] or ["?"]
-    return "" if done.returncode == 0 else f"does not build: {errors[0][-120:]}"
-
-
 def _close() -> None:
     for node in _NODES:
         node.close()
 
 
-PEERS = {
-    "cortex": Peer(_publisher, _receive, close=_close),
-    "cortex-cpp": Peer(_publisher, _receive_cpp, close=_close),
-}
+PEER = Peer(_publisher, _receive, close=_close)

@@ -82,9 +82,9 @@ class Peer(NamedTuple):
 
     publisher: Callable[[Job, str], Send]
     """Opens a topic, named by the second argument."""
-    receive: Callable[[Job, str, Handler, str], dict[str, Any] | None]
+    receive: Callable[[Job, str, Handler, str], None]
     """Hands each message of a topic to the handler until that raises `Finished`, in the way of receiving that
-    the last argument names, if there are several; may return a report of its own."""
+    the last argument names, if there are several."""
     needs: str = ""
     """A module that has to be importable."""
     close: Callable[[], object] = lambda: None
@@ -267,11 +267,8 @@ PEERS = {
 
 def missing(peer: str) -> str:
     """Return why a peer cannot be measured here, in words; empty if it can."""
-    if peer == "cortex-cpp":
-        return str(importlib.import_module("cortex.bench.peer_cortex").cpp_missing())
-    return (
-        "not installed" if peer in PEERS and not importlib.util.find_spec(PEERS[peer].needs or "zmq") else ""
-    )
+    needs = PEERS[peer].needs if peer in PEERS else ""
+    return "not installed" if needs and importlib.util.find_spec(needs) is None else ""
 
 
 def peer_of(job: Job) -> Peer:
@@ -280,8 +277,8 @@ def peer_of(job: Job) -> Peer:
         return PEERS[job.peer]
     if checkout := job.options.get("checkout"):
         import_cortex(checkout)
-    peers: dict[str, Peer] = importlib.import_module("cortex.bench.peer_cortex").PEERS
-    return peers[job.peer]
+    peer: Peer = importlib.import_module("cortex.bench.peer_cortex").PEER
+    return peer
 
 
 def import_cortex(checkout: str) -> None:

@@ -14,8 +14,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cortex.bench.cases import METRICS, Bar
-from cortex.bench.measure import CaseResult, Outcome, Verdict, spread_of
+from cortex.bench.cases import METRICS, Bar, Case
+from cortex.bench.measure import CaseResult, Spread, Verdict, faults_of, spread_of, values_of
 
 WIDTH = 110
 _PEERS = ("numpy", "eclipse-zenoh", "cyclonedds", "rclpy")
@@ -52,9 +52,9 @@ def print_case(console: Console, result: CaseResult, *, judged: bool) -> None:
     table = Table(box=None, show_header=False, padding=(0, 3, 0, 0))
     for _ in ("name", *case.metrics):
         table.add_column(no_wrap=True)
-    for outcome in result.outcomes.values():
-        cells = [_cell(outcome, metric) for metric in case.metrics]
-        table.add_row(f"  {outcome.contestant.name}", *cells, _remark(outcome))
+    for name, reports in result.reports.items():
+        cells = [_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics]
+        table.add_row(f"  {name}", *cells, faults_of(reports))
     console.print(table)
     if case.bars:
         bars = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
@@ -62,7 +62,7 @@ def print_case(console: Console, result: CaseResult, *, judged: bool) -> None:
             bars.add_row(
                 "  =>",
                 _measured(verdict),
-                f"{_what(verdict)}; bar {_bound(verdict.bar)}: {_word(verdict, judged)}",
+                f"{_what(verdict.bar, verdict.against)}; bar {_bound(verdict.bar)}: {_word(verdict, judged)}",
             )
         console.print(bars)
     console.print()
@@ -80,7 +80,11 @@ def print_summary(console: Console, results: list[CaseResult], *, judged: bool) 
                 _word(verdict, judged).partition(" (")[0]
             )  # the reason stands in the case's own block
             table.add_row(
-                result.case.name, _what(verdict), _measured(verdict), _bound(verdict.bar), words[-1]
+                result.case.name,
+                _what(verdict.bar, verdict.against),
+                _measured(verdict),
+                _bound(verdict.bar),
+                words[-1],
             )
     if words:
         console.print(table)
@@ -91,21 +95,21 @@ def print_summary(console: Console, results: list[CaseResult], *, judged: bool) 
     console.print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
 
 
-def print_list(console: Console, results: list[CaseResult]) -> None:
+def print_list(console: Console, cases: list[Case]) -> None:
     """Print the cases and their bars."""
-    for result in results:
-        console.print(f"{result.case.name:<18}{result.case.title}")
-        for verdict in result.verdicts():
-            console.print(f"{'':<18}  {_what(verdict)} {_bound(verdict.bar)}")
+    for case in cases:
+        console.print(f"{case.name:<18}{case.title}")
+        for bar in case.bars:
+            console.print(f"{'':<18}  {_what(bar)} {_bound(bar)}")
 
 
 def write_csv(path: Path, results: list[CaseResult]) -> None:
     """Write a line for each repetition of each contestant; one that did not take part has one line."""
     lines = [
-        {"case": result.case.name, "contestant": outcome.contestant.name, "repetition": number, **report}
+        {"case": result.case.name, "contestant": name, "repetition": number, **report}
         for result in results
-        for outcome in result.outcomes.values()
-        for number, report in enumerate(outcome.repetitions or [{"error": outcome.absent}])
+        for name, reports in result.reports.items()
+        for number, report in enumerate(reports)
     ]
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for line in lines for key in line)))
@@ -113,19 +117,12 @@ def write_csv(path: Path, results: list[CaseResult]) -> None:
         writer.writerows(lines)
 
 
-def _cell(outcome: Outcome, metric: str) -> str:
-    spread = spread_of(outcome.values(metric))
+def _cell(spread: Spread | None, metric: str) -> str:
     if spread is None:
         return ""
-    percent = 100.0 * spread.half_width / spread.median if spread.median else 0.0
+    percent = 50.0 * (spread.high - spread.low) / spread.median if spread.median else 0.0
     name = "" if metric == "rate" else f"{METRICS[metric].text} "
     return f"{name}{_number(spread.median)} {METRICS[metric].unit} ± {percent:.0f} %"
-
-
-def _remark(outcome: Outcome) -> str:
-    errors = outcome.errors
-    failed = f"{len(errors)} of {len(outcome.repetitions)} failed: {errors[0]}" if errors else ""
-    return "; ".join(filter(None, (outcome.absent, failed, outcome.faults)))
 
 
 def _number(value: float) -> str:
@@ -138,9 +135,8 @@ def _word(verdict: Verdict, judged: bool) -> str:
     return f"{verdict.word}, within noise" if verdict.is_open else verdict.word
 
 
-def _what(verdict: Verdict) -> str:
-    bar = verdict.bar
-    against = f" / {verdict.against or ' or '.join(bar.against)}" if bar.against else ""
+def _what(bar: Bar, best: str = "") -> str:
+    against = f" / {best or ' or '.join(bar.against)}" if bar.against else ""
     return f"{bar.who}{against}, {METRICS[bar.metric].text}"
 
 
@@ -149,7 +145,7 @@ def _measured(verdict: Verdict) -> str:
     if spread is None:
         return "-"
     if verdict.bar.against:
-        return f"{spread.median:.2f} ± {spread.half_width:.2f}"
+        return f"{spread.median:.2f} ± {(spread.high - spread.low) / 2:.2f}"
     return f"{_number(spread.median)} {METRICS[verdict.bar.metric].unit}".strip()
 
 

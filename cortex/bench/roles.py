@@ -73,8 +73,8 @@ def receive(pipe: Any, job: Job) -> None:
         counts = tally = Tally(job.floats, connected, settle_at=job.count // 10)
         consume = bool(job.options.get("consume"))
         handle = tally.batch_handler() if how == "batch" else tally.handler(consume=consume)
-    report = _receive(peer, job, "flood", handle, how) or counts.report
-    pipe.send({"cpu_s": time.process_time() - cpu_s, **report})
+    _receive(peer, job, "flood", handle, how)
+    pipe.send({"cpu_s": time.process_time() - cpu_s, **counts.report})
     peer.close()
 
 
@@ -117,8 +117,7 @@ def ask(pipe: Any, job: Job) -> None:
     send(END, payload)
     peer.close()
     count = len(times_ns)
-    counts = {"sent": count, "received": count, "lost": 0, "misordered": 0, "corrupt": 0}
-    pipe.send(percentiles(times_ns, "rtt") | counts)
+    pipe.send({"sent": count, "received": count, **percentiles(times_ns, "rtt")})
 
 
 def answer(pipe: Any, job: Job) -> None:
@@ -199,36 +198,26 @@ def make_ring(job: Job) -> Ring:
     return [memory[k * stride // 4 :][: job.floats] for k in range(job.slots)]
 
 
-def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> dict[str, Any] | None:
+def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> None:
     with contextlib.suppress(Finished):
-        return peer.receive(job, topic, handle, how)
-    return None
+        peer.receive(job, topic, handle, how)
 
 
 def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> tuple[int, int]:
     """Send the payloads in turn; return how many, and by how much memory grew after the first tenth [kB]."""
-    first, second = payloads
-    if rate_hz := job.options.get("rate_hz"):
-        return _paced(send, first, job, rate_hz), 0
     pairs = max(1, min(32, 500_000 // job.payload_bytes))
     sent = settled_kb = 0
-    end = time.perf_counter() + job.seconds
-    while sent < job.count if job.count else time.perf_counter() < end:
+    begin = time.perf_counter()
+    if rate_hz := job.options.get("rate_hz"):  # stamps, on an absolute schedule: a late one delays no other
+        for sent in range(job.count):
+            time.sleep(max(0.0, begin + sent / rate_hz - time.perf_counter()))
+            send(time.monotonic_ns(), payloads[0])
+        return job.count, 0
+    while sent < job.count if job.count else time.perf_counter() < begin + job.seconds:
         for _ in range(pairs):
-            send(sent, first)
-            send(sent + 1, second)
+            send(sent, payloads[0])
+            send(sent + 1, payloads[1])
             sent += 2
         if job.count and not settled_kb and sent >= job.count // 10:
             settled_kb = resident_kb()
     return sent, resident_kb() - settled_kb if settled_kb else 0
-
-
-def _paced(send: Send, payload: Floats, job: Job, rate_hz: float) -> int:
-    """Send stamps at a rate, on an absolute schedule, so that a late one does not delay those after it."""
-    begin = time.perf_counter()
-    for sent in range(job.count):
-        early_s = begin + sent / rate_hz - time.perf_counter()
-        if early_s > 0.0:
-            time.sleep(early_s)
-        send(time.monotonic_ns(), payload)
-    return job.count

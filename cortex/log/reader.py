@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -128,17 +129,8 @@ class Log:
                 channel = wanted.get(number)
                 if channel is None or log_ns < first_ns or (last_ns is not None and log_ns >= last_ns):
                     continue
-                info = LogInfo(
-                    channel.topic,
-                    channel.node,
-                    channel.source,
-                    sequence,
-                    _stamp_in(channel, body),
-                    publish_ns,
-                    log_ns,
-                    len(body),
-                )
-                yield info, body, channel.schema
+                who, stamp_ns = (channel.topic, channel.node, channel.source), _stamp_in(channel, body)
+                yield LogInfo(*who, sequence, stamp_ns, publish_ns, log_ns, len(body)), body, channel.schema
 
     def messages(
         self,
@@ -218,11 +210,10 @@ def open_log(path: str | os.PathLike[str]) -> Log:
     file = open(path, "rb")  # noqa: SIM115 - the log closes it
     try:
         return Log(path, file)
-    except LogError as error:
+    except BaseException as error:
         file.close()
-        raise LogError(f"{path}: {error}") from error
-    except BaseException:
-        file.close()
+        if isinstance(error, LogError):
+            raise LogError(f"{path}: {error}") from error
         raise
 
 
@@ -264,7 +255,7 @@ def _from_summary(file: BinaryIO) -> _Contents | None:
 
     file.seek(0)
     reader = SeekingReader(file, validate_crcs=True)
-    with _Damage("its summary cannot be read"):
+    with _damage("its summary cannot be read"):
         summary: Summary | None = reader.get_summary()
         if summary is None or summary.statistics is None:
             return None
@@ -302,7 +293,7 @@ def _scan(file: BinaryIO, size: int) -> _Contents:
             break
         if end > size:
             break
-        with _Damage(f"the record at byte {position} is damaged"):
+        with _damage(f"the record at byte {position} is damaged"):
             if code == opcode.CHUNK:
                 start_ns, end_ns = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))[:2]
                 contents.chunks.append(_Chunk(position, start_ns, end_ns))
@@ -327,7 +318,7 @@ def _learn_channels(file: BinaryIO, size: int, contents: _Contents) -> None:
         indexed = bool(chunk.counts)
         if not indexed or chunk.counts.keys() - contents.channels.keys():
             data = _read_chunk(file, chunk.position, size)
-            with _Damage(f"the chunk at byte {chunk.position} is damaged"):
+            with _damage(f"the chunk at byte {chunk.position} is damaged"):
                 for payload in _payloads(data, opcode.SCHEMA, chunk.position):
                     schema = read["Schema"](_stream(payload))
                     contents.schemas[schema.id] = schema
@@ -345,11 +336,8 @@ def _known_channels(contents: _Contents) -> tuple[dict[int, _Channel], set[str]]
     known, foreign = {}, set()
     for number, record in contents.channels.items():
         schema_record = contents.schemas.get(record.schema_id)
-        if (
-            record.message_encoding != MESSAGE_ENCODING
-            or schema_record is None
-            or schema_record.encoding != SCHEMA_ENCODING
-        ):
+        encodings = (record.message_encoding, schema_record.encoding if schema_record else "")
+        if schema_record is None or encodings != (MESSAGE_ENCODING, SCHEMA_ENCODING):
             foreign.add(record.topic)
             continue
         try:
@@ -400,7 +388,7 @@ def _stamp_in(channel: _Channel, body: bytes) -> int | None:
 def _read_chunk(file: BinaryIO, position: int, size: int) -> bytes:
     """Return the records of a chunk, uncompressed and checked."""
     file.seek(position)
-    with _Damage(f"the chunk at byte {position} is damaged"):
+    with _damage(f"the chunk at byte {position} is damaged"):
         code, length = _FRAME.unpack(file.read(_FRAME.size))
         if code != _opcodes().CHUNK or position + _FRAME.size + length > size:
             raise LogError("it is not there")
@@ -466,21 +454,17 @@ def _stream(data: bytes | memoryview) -> Any:
     return ReadDataStream(BytesIO(data))
 
 
-class _Damage:
-    """Turns whatever the library raises on damaged bytes into a `LogError` that says where."""
+@contextlib.contextmanager
+def _damage(what: str) -> Iterator[None]:
+    """Turn whatever the library raises on damaged bytes into a `LogError` that says where."""
+    from mcap.exceptions import McapError
 
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        from mcap.exceptions import McapError
-
-        # ValueError is a wrong check sum or text, RuntimeError comes from lz4, the others from wrong numbers.
-        wrong_numbers = (struct.error, OverflowError, EOFError, MemoryError, OSError)
+    # ValueError is a wrong check sum or text, RuntimeError comes from lz4, the others from wrong numbers.
+    wrong_numbers = (struct.error, OverflowError, EOFError, MemoryError, OSError)
+    try:
+        yield
+    except Exception as error:
         kinds = (McapError, ValueError, RuntimeError, *wrong_numbers)
-        is_zstd = kind is not None and kind.__name__ == "ZstdError"
-        if isinstance(error, kinds) or is_zstd:
-            raise LogError(f"{self._what}: {error}") from error
+        if isinstance(error, kinds) or type(error).__name__ == "ZstdError":
+            raise LogError(f"{what}: {error}") from error
+        raise
