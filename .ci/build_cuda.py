@@ -101,7 +101,7 @@ def make_kernels() -> None:
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_noisy_scan(frozenset(pixel))
     for errors in ((), IMU_TERMS):
-        make_imu(frozenset(errors), own_seeds=True)
+        make_imu(frozenset(errors))
     for adaptive in (False, True):
         make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
     mode_kernel("path", frozenset(AIR_TERMS))

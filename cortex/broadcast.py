@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -106,6 +107,15 @@ class Listener:
         while len(self._heard) > WAITING_MAX:
             self._heard.pop(next(iter(self._heard))).close()
         return self._heard.pop((source, reader), None)
+
+    def forget(self) -> None:
+        """Let go of what readers handed over that have left before they attached."""
+        poll = select.poll()
+        for hello in self._heard.values():
+            poll.register(hello.socket, 0)
+        gone = {fd for fd, _ in poll.poll(0)} if self._heard else set()
+        for key in [key for key, hello in self._heard.items() if hello.socket in gone]:
+            self._heard.pop(key).close()
 
     def close(self) -> None:
         """Listen no more."""

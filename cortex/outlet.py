@@ -174,11 +174,14 @@ class Outlets:
             logger.warning("%s", self._notes.popleft())
 
     def tick(self) -> None:
-        """Do `refresh`, unless a publisher is at it."""
+        """Do `refresh`, and forget readers that left early, unless a publisher is at it."""
         if self.lock.acquire(blocking=False):
             try:
                 if not self.closed:
                     self.refresh()
+                    for outlet in self._outlets:
+                        if outlet.listener is not None:
+                            outlet.listener.forget()
             finally:
                 self.lock.release()
 

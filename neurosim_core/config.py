@@ -29,11 +29,12 @@ from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
+from neurosim_core.scene.hall import HallConfig  # noqa: F401  registers a kind
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.sensors.base import SensorConfig, expand_stereo
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
-from neurosim_core.sensors.imu import ImuSensorConfig
+from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
 from neurosim_core.settings import Settings, documentation
@@ -60,7 +61,7 @@ def _default_sensors() -> dict[str, SensorConfig]:
         "events": EventSensorConfig(),
         "rgb": RgbSensorConfig(),
         "depth": DepthSensorConfig(),
-        "imu": ImuSensorConfig(),
+        "imu": ImuConfig(),
         "odometry": OdometrySensorConfig(),
     }
 

@@ -103,7 +103,7 @@ def test_examples_are_short_and_tested():
 def test_a_kind_that_is_taken_is_refused():
     from neurosim_core.sensors.base import StateSensorConfig
 
-    taken = r"the sensor kind 'imu' is taken by neurosim_core\.sensors\.imu\.ImuSensorConfig"
+    taken = r"the sensor kind 'imu' is taken by neurosim_core\.sensors\.imu\.ImuConfig"
     with pytest.raises(ValueError, match=taken):
 
         @ns.register("sensor", "imu")

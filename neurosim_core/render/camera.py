@@ -6,7 +6,7 @@ A renderer knows nothing of a lens but its table of rays, so that any lens can b
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,9 @@ class Intrinsics(NamedTuple):
 class PinholeConfig(Settings):
     """A pinhole camera, given by its field of view or by fx, fy, cx, cy, not by both."""
 
+    distortion_model: ClassVar[str] = ""
+    """It does not distort."""
+
     kind: Literal["pinhole"] = "pinhole"
     width: int = Field(gt=0, le=16384)
     """Width of the picture [px]."""
@@ -81,11 +84,6 @@ class PinholeConfig(Settings):
             missing = f": missing {[name for name in pixels if name not in given]}" if given else ""
             raise ValueError(f"give horizontal_fov_rad (such as 1.5), or all of fx, fy, cx, cy{missing}")
         return self
-
-    @property
-    def distortion_model(self) -> str:
-        """A pinhole does not distort."""
-        return ""
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:

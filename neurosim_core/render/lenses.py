@@ -1,8 +1,8 @@
 """Lenses other than a pinhole: each turns pixels into rays once, when it is loaded.
 
 A model projects a point of the optical frame C to u = fx x_d + cx, v = fy y_d + cy [px], where (x_d, y_d) is
-what distortion makes of the direction. Pixel centres are at +0.5, half a pixel more than in OpenCV, ROS and
-Kalibr. Directions of pixels are found in float64 by Newton's method, or in closed form.
+what distortion makes of the direction (`projection.py`). Pixel centres are at +0.5, half a pixel more than in
+OpenCV, ROS and Kalibr. Directions of pixels are found in float64 by Newton's method, or in closed form.
 
 A pixel that no ray reaches, because it is outside the image circle or beyond the range of the model, is
 *blind*: it is black, and its depth is infinite.
@@ -17,10 +17,10 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from neurosim_core.render.camera import Intrinsics, PinholeConfig
@@ -43,6 +43,8 @@ class _Lens(Settings):
     """Width of the picture [px]."""
     height: int = Field(gt=0, le=16384)
     """Height of the picture [px]."""
+    distortion_model: ClassVar[str]
+    """Name of the model in sensor_msgs/CameraInfo, which has none for double spheres and tables."""
 
     def rays(self, u: Vectors, v: Vectors) -> Vectors:
         """Return the unit rays of points of the picture [px], shape [..., 3]; nan where there is none."""
@@ -91,11 +93,6 @@ class _ModelLens(_Lens):
     """Row of the optical axis [px]; the centre of the first pixel is at 0.5."""
 
     @property
-    def distortion_model(self) -> str:
-        """Name of the model in sensor_msgs/CameraInfo."""
-        raise NotImplementedError
-
-    @property
     def distortion_coefficients(self) -> tuple[float, ...]:
         """Parameters of the model, in the order of sensor_msgs/CameraInfo."""
         raise NotImplementedError
@@ -104,27 +101,9 @@ class _ModelLens(_Lens):
         """Return fx, fy, cx, cy [px]."""
         return Intrinsics(self.fx, self.fy, self.cx, self.cy)
 
-    def distort(self, points: Vectors) -> Vectors:
-        """Return (x_d, y_d) of points in C, shape [..., 2]; nan where the model has none."""
-        raise NotImplementedError
-
     def undistort(self, x: Vectors, y: Vectors) -> Vectors:
         """Return the unit rays of (x_d, y_d), shape [..., 3]; nan where there is none."""
         raise NotImplementedError
-
-    def project(self, points_C: ArrayLike) -> Vectors:
-        """Return where points are in the picture.
-
-        Args:
-            points_C: Positions or directions in C, shape [..., 3].
-
-        Returns:
-            Column and row [px], shape [..., 2]; nan where the lens does not see the point.
-        """
-        return np.asarray(self.distort(np.asarray(points_C, np.float64))) * (self.fx, self.fy) + (
-            self.cx,
-            self.cy,
-        )
 
     def rays(self, u: Vectors, v: Vectors) -> Vectors:
         """Return the unit rays of points of the picture [px], shape [..., 3]; nan where there is none."""
@@ -190,14 +169,6 @@ class _PolynomialLens(_ModelLens):
         end = len(r) if grows.all() else int(np.argmin(grows)) + 1
         return r[:end], distorted[:end]
 
-    def distort(self, points: Vectors) -> Vectors:
-        """Return (x_d, y_d) of points in C, shape [..., 2]; nan where the model has none."""
-        with np.errstate(all="ignore"):
-            x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-            distorted = np.stack(self._evaluate(x, y)[:2], axis=-1)
-        seen = (points[..., 2] > 0.0) & (np.hypot(x, y) <= self._rising[0][-1])
-        return np.where(seen[..., None], distorted, np.nan)
-
     def undistort(self, x: Vectors, y: Vectors) -> Vectors:
         """Return the unit rays of (x_d, y_d), shape [..., 3]; nan where there is none."""
         radii, distorted = self._rising
@@ -223,13 +194,9 @@ class RadtanConfig(_PolynomialLens):
     """A lens with radial and tangential distortion: Kalibr's radtan, plumb_bob of ROS."""
 
     kind: Literal["radtan"] = "radtan"
+    distortion_model: ClassVar[str] = "plumb_bob"
     distortion: Annotated[tuple[float, ...], Field(min_length=4, max_length=5)]
     """Coefficients k1, k2, p1, p2 and, if there is one, k3."""
-
-    @property
-    def distortion_model(self) -> str:
-        """Name of the model in sensor_msgs/CameraInfo."""
-        return "plumb_bob"
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:
@@ -241,13 +208,9 @@ class RationalConfig(_PolynomialLens):
     """A lens with radial distortion by a quotient of polynomials, and tangential distortion."""
 
     kind: Literal["rational"] = "rational"
+    distortion_model: ClassVar[str] = "rational_polynomial"
     distortion: Annotated[tuple[float, ...], Field(min_length=8, max_length=8)]
     """Coefficients k1, k2, p1, p2, k3, k4, k5, k6."""
-
-    @property
-    def distortion_model(self) -> str:
-        """Name of the model in sensor_msgs/CameraInfo."""
-        return "rational_polynomial"
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:
@@ -274,13 +237,9 @@ class EquidistantConfig(_WideLens):
     """
 
     kind: Literal["equidistant"] = "equidistant"
+    distortion_model: ClassVar[str] = "equidistant"
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Coefficients k1, k2, k3, k4; zeros are the ideal equidistant projection."""
-
-    @property
-    def distortion_model(self) -> str:
-        """Name of the model in sensor_msgs/CameraInfo."""
-        return "equidistant"
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:
@@ -305,13 +264,6 @@ class EquidistantConfig(_WideLens):
         turns = [math.sqrt(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0.0]
         return np.linspace(0.0, min([self.angle_max_rad, *turns]), _TABLE_SIZE)
 
-    def distort(self, points: Vectors) -> Vectors:
-        """Return (x_d, y_d) of points in C, shape [..., 2]; nan where the model has none."""
-        size = np.hypot(points[..., 0], points[..., 1])
-        angle = np.arctan2(size, points[..., 2])
-        scale = self._radius(angle)[0] / np.where(size > 0.0, size, 1.0)
-        return np.where((angle <= self._rising[-1])[..., None], points[..., :2] * scale[..., None], np.nan)
-
     def undistort(self, x: Vectors, y: Vectors) -> Vectors:
         """Return the unit rays of (x_d, y_d), shape [..., 3]; nan where there is none."""
         angles = self._rising
@@ -334,34 +286,16 @@ class DoubleSphereConfig(_WideLens):
     """A fisheye lens whose rays are projected onto two unit spheres and then by a pinhole."""
 
     kind: Literal["double_sphere"] = "double_sphere"
+    distortion_model: ClassVar[str] = "double_sphere"
     xi: float = Field(gt=-1.0, lt=1.0)
     """Distance between the centres of the two spheres."""
     alpha: float = Field(ge=0.0, le=1.0)
     """Where the pinhole is: a / (1 - a) behind the centre of the second sphere."""
 
     @property
-    def distortion_model(self) -> str:
-        """Name of the model; sensor_msgs/CameraInfo has none for it."""
-        return "double_sphere"
-
-    @property
     def distortion_coefficients(self) -> tuple[float, ...]:
         """Return xi, alpha."""
         return (self.xi, self.alpha)
-
-    def distort(self, points: Vectors) -> Vectors:
-        """Return (x_d, y_d) of points in C, shape [..., 2]; nan where there is none: eq. (40) to (45)."""
-        xi, alpha = self.xi, self.alpha
-        x, y, z = np.moveaxis(points, -1, 0)
-        d1 = np.sqrt(x * x + y * y + z * z)
-        shifted = xi * d1 + z
-        d2 = np.sqrt(x * x + y * y + shifted * shifted)
-        w1 = alpha / (1.0 - alpha) if alpha <= 0.5 else (1.0 - alpha) / alpha
-        w2 = (w1 + xi) / math.sqrt(2.0 * w1 * xi + xi * xi + 1.0)
-        seen = (z > -w2 * d1) & (np.arctan2(np.hypot(x, y), z) <= self.angle_max_rad)
-        with np.errstate(all="ignore"):
-            distorted = points[..., :2] / (alpha * d2 + (1.0 - alpha) * shifted)[..., None]
-        return np.where(seen[..., None], distorted, np.nan)
 
     def undistort(self, x: Vectors, y: Vectors) -> Vectors:
         """Return the unit rays of (x_d, y_d), shape [..., 3]; nan where there is none: eq. (46) to (52)."""
@@ -378,6 +312,7 @@ class RayTableConfig(_Lens):
     """A lens given by the ray of each pixel, as a calibration of any camera model can write it."""
 
     kind: Literal["ray_table"] = "ray_table"
+    distortion_model: ClassVar[str] = "ray_table"
     file: Path
     """A NumPy file (.npy), float, shape [H, W, 3]: directions in C (x right, y down, z forward) through the
     centres of the pixels, of any length; nan or zero where a pixel sees nothing. Between centres rays are
@@ -391,11 +326,6 @@ class RayTableConfig(_Lens):
     def directions(self) -> Vectors:
         """Return the unit rays of the file, nan where there is none, shape [H, W, 3]."""
         return _read_rays(self.file, self.width, self.height)
-
-    @property
-    def distortion_model(self) -> str:
-        """Name of the model; sensor_msgs/CameraInfo has none for it."""
-        return "ray_table"
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:

@@ -110,3 +110,34 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
         APART=0,
     )
     return wp.func_native(code)(render_packet)
+
+
+@cache
+def face_caster(width: int) -> Any:
+    """Return the Warp function, for CPU kernels only, that writes the faces that 4 x 4 pixels see, -1: none.
+
+    It casts the rays of the last layer. Its parameters are those of `packet_program`, but for its last, of
+    which these pixels are written.
+
+    Args:
+        width: `embree.packet_width()`.
+    """
+
+    @wp.func_native(read_native(__file__, "cast_faces", N=16, SIDE=4, WIDTH=width))
+    def cast_faces(
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        first_pixel: int,
+        width: int,
+        origin: wp.vec3,
+        q_WC: wp.quat,
+        far_m: float,
+        instant: int,
+        top: int,
+        left: int,
+        rows: int,
+        columns: int,
+        face_out: wp.array3d[int],
+    ): ...
+
+    return cast_faces

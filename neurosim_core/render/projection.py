@@ -155,7 +155,8 @@ def velocity_projector(kind: str) -> wp.Function:
 def _pinhole(lens: LensData, p: wp.vec3d) -> wp.vec3d:
     if p[2] <= wp.float64(0.0):
         return wp.vec3d()
-    return wp.vec3d(p[0] / p[2], p[1] / p[2], wp.float64(1.0))
+    nearness = wp.float64(1.0) / p[2]
+    return wp.vec3d(nearness * p[0], nearness * p[1], wp.float64(1.0))
 
 
 @wp.func

@@ -56,7 +56,7 @@ class PyrenderScene:
 
 
 def _import_pyrender() -> Any:
-    """Import pyrender on current NumPy, on the platform that needs no display."""
+    """Import pyrender on current NumPy and Python, on the platform that needs no display."""
     if "PYOPENGL_PLATFORM" not in os.environ:  # read once, when OpenGL is imported
         if ctypes.util.find_library("EGL") is None:
             raise PyrenderError(_INSTALL_OPENGL)
@@ -67,8 +67,11 @@ def _import_pyrender() -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of libraries that pyrender brings
             import pyrender
+            from OpenGL.plugins import FormatHandler
     except ImportError as error:
         raise PyrenderError(f"pyrender cannot be used ({error}): {install_hint('render')}") from error
+    handler = "OpenGL.arrays.ctypesparameters.CtypesParameterHandler"
+    FormatHandler("ctypesparameter", handler, ["_ctypes.CArgObject"])  # its name from Python 3.12 on
     return pyrender
 
 

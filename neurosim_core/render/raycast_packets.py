@@ -20,7 +20,7 @@ from neurosim_core.render.outputs import (
     allocated_radiance_writer,
     requested_outputs,
 )
-from neurosim_core.render.packet_shading import packet_program, packet_shader
+from neurosim_core.render.packet_shading import face_caster, packet_program, packet_shader
 from neurosim_core.render.ray_intersection import (
     FAR_M,
     UNFUSED,
@@ -57,6 +57,9 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     render_packet = (
         packet_program(terms.embree, textured=terms.textured, emissive=terms.emissive) if fused else None
     )
+
+    plain = requested.faces and not (requested.radiance or terms.bodies or terms.timed or listed)
+    cast_faces = face_caster(terms.embree) if plain else None
 
     @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
     def raycast_packets(
@@ -106,6 +109,24 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     rows,
                     columns,
                     out.log_radiance,
+                )
+                return
+        if wp.static(plain):
+            if slot < 0 or wp.static(not requested.geometry):
+                cast_faces(
+                    scene,
+                    view.rays,
+                    first_ray + top * view.width + left,
+                    view.width,
+                    origin,
+                    q,
+                    FAR_M,
+                    instant,
+                    top,
+                    left,
+                    rows,
+                    columns,
+                    out.face,
                 )
                 return
         ray = wp.zeros(shape=(lanes,), dtype=wp.vec3)

@@ -27,10 +27,9 @@ from neurosim_core.render.projection import LensData, make_lens_data, projector
 from neurosim_core.scene.corners import find_corners
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
 from neurosim_core.sensors.edges import EdgeLimits, EdgesProcess
-from neurosim_core.sensors.optical_flow import Views, is_hidden, lens_kind, views_at
+from neurosim_core.sensors.occlusion import NEAR_RATIO, Views, is_hidden_by_bodies, views_at
+from neurosim_core.sensors.optical_flow import lens_kind
 
-_NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
-"""What hides a corner is nearer than it by this ratio: rays and points are float32."""
 _COLUMNS = 6
 """Numbers of a corner: column, row, position in C, edge."""
 
@@ -139,8 +138,11 @@ def _make_kernel(kind: str) -> Any:
             return  # of no corner p_C is nan
         if not (v >= 0.0 and v < float(model.height)):
             return
-        far = _NEAR_RATIO * float(wp.length(way))
-        if is_hidden(model.mesh[scene], model.body_mesh, here, view, p_WC, wp.normalize(way), far, False):
+        far = NEAR_RATIO * float(wp.length(way))
+        way_W = wp.vec3(wp.normalize(way))
+        if wp.mesh_query_ray_anyhit(model.mesh[scene], here.p_WC[view], way_W, far):
+            return
+        if is_hidden_by_bodies(model.body_mesh, here, view, here.p_WC[view], way_W, far):
             return
         label = int(0)
         for row in range(wp.max(int(v) - 1, 0), wp.min(int(v) + 2, model.height)):

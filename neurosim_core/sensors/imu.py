@@ -17,10 +17,9 @@ Reference: IEEE Std 952-1997, annex C, for the Allan variances: N^2 / T (white),
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
@@ -29,10 +28,10 @@ from neurosim_core.frames import Mount
 from neurosim_core.packets import ImuSample
 from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.registry import register
-from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
+from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
 from neurosim_core.sensors.imu_presets import PRESETS
+from neurosim_core.sensors.state_sampler import Motion, NonNegative, StateSampler
 from neurosim_core.settings import fill_from_preset
-from neurosim_core.vehicle import Multirotor
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
@@ -42,18 +41,16 @@ TERMS = ("white", "walk", "instability", "saturation", "quantisation")
 """All errors that may be compiled in."""
 
 _PROCESSES = len(CORRELATION_TIMES_S)
-_BLOCK_DIM = 32
-_SLOT_PARAMETER = 5  # position of `slot` among the kernel's parameters
 
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec_processes = wp.types.vector(length=_PROCESSES, dtype=wp.float64)
 
-NonNegative = Annotated[float, Field(ge=0.0)]
 
-
+@register("sensor", "imu")
 class ImuConfig(StateSensorConfig):
     """An inertial measurement unit: its place, its rate, and its errors, of which it has none by default."""
 
+    kind: Literal["imu"] = "imu"
     preset: str | None = None
     """A sensor whose errors these are, unless given here: bmi088, icm20948, adis16448 (sources in
     imu_presets.py)."""
@@ -89,27 +86,11 @@ class ImuConfig(StateSensorConfig):
     def _fill_from_preset(cls, given: Any) -> Any:
         return fill_from_preset(given, PRESETS)
 
-
-@register("sensor", "imu")
-class ImuSensorConfig(ImuConfig):
-    """An inertial measurement unit."""
-
-    kind: Literal["imu"] = "imu"
-
     packet_type = ImuSample
 
-    def make(self, context: SamplerContext) -> "ImuSampler":
+    def make(self, context: SamplerContext) -> "Imu":
         """Return the sensor at work."""
-        return ImuSampler(self, context)
-
-
-class ImuReading(NamedTuple):
-    """One sample of every vehicle on the host, float64."""
-
-    specific_force: NDArray[np.float64]
-    """In S [m/s^2], [N, 3]."""
-    angular_rate: NDArray[np.float64]
-    """In S [rad/s], [N, 3]."""
+        return Imu(self, context)
 
 
 @wp.struct
@@ -125,7 +106,6 @@ class _Model:
     process_decay: vec_processes
     limit: vec6d
     resolution: vec6d
-    seed: wp.uint64
     white_stream: wp.uint32
     walk_stream: wp.uint32
     instability_stream: wp.uint32
@@ -139,30 +119,9 @@ def _normal6(seed: wp.uint64, stream: wp.uint32, step: wp.int64, element: wp.int
     return vec6d(a[0], a[1], b[0], b[1], c[0], c[1])
 
 
-@wp.kernel(enable_backward=False)
-def _reset_some(
-    # In:
-    mask: wp.array[wp.int32],
-    # Out:
-    sample_out: wp.array[wp.int64],
-    walk_bias_out: wp.array[vec6d],
-):
-    vehicle = wp.tid()
-    if mask[vehicle] != 0:
-        sample_out[vehicle] = wp.int64(0)
-        if walk_bias_out.shape[0] > 0:
-            walk_bias_out[vehicle] = vec6d()
-
-
 @functools.cache
-def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
-    """Return the kernel that computes only the given errors.
-
-    Args:
-        terms: Some of `TERMS`.
-        own_seeds: Each vehicle has the errors of a vehicle that flies alone with a seed of its own, and is
-            measured or not.
-    """
+def make_kernel(terms: frozenset[str]) -> Any:
+    """Return the kernel that computes only the given errors, some of `TERMS`."""
     white = "white" in terms
     walk = "walk" in terms
     instability = "instability" in terms
@@ -170,70 +129,57 @@ def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
     quantisation = "quantisation" in terms
 
     @wp.kernel(
-        module=wp.get_module(
-            "neurosim_core.sensors.imu."
-            + ("_".join(sorted(terms)) or "exact")
-            + (".own_seeds" if own_seeds else "")
-        ),
+        module=wp.get_module("neurosim_core.sensors.imu." + ("_".join(sorted(terms)) or "exact")),
         enable_backward=False,
     )
     def measure(
-        # Model:
         model: _Model,
-        # In:
-        orientation: wp.array[wp.quatd],
-        body_rate: wp.array[wp.vec3d],
         acceleration: wp.array[wp.vec3d],
         angular_acceleration: wp.array[wp.vec3d],
-        slot: wp.int32,
-        seeds: wp.array[wp.uint64],
-        active: wp.array[wp.int32],
-        # In/out:
-        sample: wp.array[wp.int64],
         walk_bias: wp.array[vec6d],
         processes: wp.array2d[vec6d],
-        # Out:
+        motion: Motion,
+        seeds: wp.array[wp.uint64],
+        active: wp.array[wp.int32],
+        sample: wp.array[wp.int64],
+        memory: wp.array2d[wp.vec3d],
+        slot: int,
         specific_force_out: wp.array2d[wp.vec3d],
         angular_rate_out: wp.array2d[wp.vec3d],
     ):
-        vehicle = wp.tid()
-        w = body_rate[vehicle]
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        w = motion.body_rate[world]
         up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), model.gravity)
-        force = wp.quat_rotate_inv(orientation[vehicle], acceleration[vehicle] + up)
-        force += wp.cross(angular_acceleration[vehicle], model.position)
+        force = wp.quat_rotate_inv(motion.orientation[world], acceleration[world] + up)
+        force += wp.cross(angular_acceleration[world], model.position)
         force += wp.cross(w, wp.cross(w, model.position))
         force = wp.quat_rotate(model.q_SB, force)
         rate = wp.quat_rotate(model.q_SB, w)
         reading = vec6d(force[0], force[1], force[2], rate[0], rate[1], rate[2])
 
-        seed = model.seed
-        element = vehicle
-        if wp.static(own_seeds):
-            if active[vehicle] == 0:
-                return
-            seed = seeds[vehicle]
-            element = 0
-        k = sample[vehicle]
+        seed = seeds[world]
+        k = sample[world]
         if wp.static(walk):
+            bias = vec6d()
             if k > wp.int64(0):
-                walk_bias[vehicle] += wp.cw_mul(model.walk, _normal6(seed, model.walk_stream, k, element))
-            reading += walk_bias[vehicle]
+                bias = walk_bias[world] + wp.cw_mul(model.walk, _normal6(seed, model.walk_stream, k, 0))
+            walk_bias[world] = bias
+            reading += bias
         if wp.static(instability):
             process_count = processes.shape[1]  # no constant: unrolled, it compiles four times as long
             for process in range(process_count):
-                drive = wp.cw_mul(
-                    model.instability,
-                    _normal6(seed, model.instability_stream, k, element * process_count + process),
-                )
+                drive = wp.cw_mul(model.instability, _normal6(seed, model.instability_stream, k, process))
                 value = drive  # stationary from the first sample on
                 if k > wp.int64(0):
                     decay = model.process_decay[process]
-                    value = decay * processes[vehicle, process]
+                    value = decay * processes[world, process]
                     value += wp.sqrt(wp.float64(1.0) - decay * decay) * drive
-                processes[vehicle, process] = value
+                processes[world, process] = value
                 reading += value
         if wp.static(white):
-            reading += wp.cw_mul(model.white, _normal6(seed, model.white_stream, k, element))
+            reading += wp.cw_mul(model.white, _normal6(seed, model.white_stream, k, 0))
         for axis in range(6):
             if wp.static(saturation):
                 reading[axis] = wp.clamp(reading[axis], -model.limit[axis], model.limit[axis])
@@ -242,142 +188,43 @@ def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
                 if step > wp.float64(0.0):
                     reading[axis] = step * wp.rint(reading[axis] / step)
 
-        sample[vehicle] = k + wp.int64(1)
-        specific_force_out[slot, vehicle] = wp.vec3d(reading[0], reading[1], reading[2])
-        angular_rate_out[slot, vehicle] = wp.vec3d(reading[3], reading[4], reading[5])
+        sample[world] = k + wp.int64(1)
+        specific_force_out[slot, world] = wp.vec3d(reading[0], reading[1], reading[2])
+        angular_rate_out[slot, world] = wp.vec3d(reading[3], reading[4], reading[5])
 
     return measure
 
 
-class Imu:
-    """The inertial measurement units of a batch of vehicles.
-
-    `measure` is the device form: two launches (accelerations of the vehicle, reading), without allocation or
-    waiting. Noise is addressed by seed, name, vehicle and number of the sample since the reset, so it does
-    not depend on the size of the batch or on what else is computed.
-
-    Args:
-        config: Parameters.
-        vehicle: Who carries it; its state is read at each sample.
-        seed: Seed of the run, 0 <= seed < 2^64.
-        name: Name of the sensor; two sensors of one run with different names have independent noise.
-        slot_count: Samples that the output arrays hold.
-        terms: The errors to compile in, some of `TERMS`; by default those that the configuration asks for.
-        seeds: A seed for each vehicle, device array of uint64, shape [vehicle], in place of `seed`: its
-            errors are then those of a vehicle that flies alone with that seed.
-        active: With `seeds`: 0 where a vehicle is not measured, device array of int32, shape [vehicle].
-
-    Attributes:
-        specific_force: Output in S [m/s^2], device array of vec3d, shape [slot, vehicle].
-        angular_rate: Output in S [rad/s], likewise.
-        terms: The errors that are compiled in.
-    """
-
-    def __init__(
-        self,
-        config: ImuConfig,
-        vehicle: Multirotor,
-        *,
-        seed: int = 0,
-        name: str = "imu",
-        slot_count: int = 1,
-        terms: Sequence[str] | None = None,
-        seeds: Any = None,
-        active: Any = None,
-    ) -> None:
-        if slot_count < 1:
-            raise ValueError(f"slot_count must be >= 1, got {slot_count}")
-        self.config = config
-        self.terms = _terms(config) if terms is None else tuple(terms)
-        unknown = sorted(set(self.terms) - set(TERMS))
-        if unknown:
-            raise ValueError(f"unknown terms {unknown}, known: {', '.join(TERMS)}")
-        device, count = vehicle.device, vehicle.count
-        self.specific_force = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)
-        self.angular_rate = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)
-        self._vehicle = vehicle
-        self._sample = wp.zeros(count, dtype=wp.int64, device=device)
-        # arrays of terms that are not computed are empty
-        self._walk_bias = wp.zeros(count if "walk" in self.terms else 0, dtype=vec6d, device=device)
-        self._processes = wp.zeros(
-            (count if "instability" in self.terms else 0, _PROCESSES), dtype=vec6d, device=device
-        )
-        arrays = vehicle.arrays
-        self._launch = wp.launch(
-            make_kernel(frozenset(self.terms), own_seeds=seeds is not None),
-            dim=count,
-            inputs=[
-                _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, seed=seed, name=name),
-                arrays.orientation,
-                arrays.body_rate,
-                arrays.acceleration,
-                arrays.angular_acceleration,
-                0,
-                seeds,
-                active,
-            ],
-            outputs=[self._sample, self._walk_bias, self._processes, self.specific_force, self.angular_rate],
-            device=device,
-            block_dim=_BLOCK_DIM,
-            record_cmd=True,
-        )
-
-    def reset(self, mask: Any = None) -> None:
-        """Start again at sample 0: the noise of the next samples is that of a new IMU.
-
-        Args:
-            mask: Only of vehicles where it is not 0, device array of int32, shape [vehicle]; one launch, no
-                waiting. None: of all.
-        """
-        if mask is None:
-            self._sample.zero_()
-            self._walk_bias.zero_()
-        else:
-            wp.launch(
-                _reset_some,
-                dim=mask.shape[0],
-                inputs=[mask],
-                outputs=[self._sample, self._walk_bias],
-                device=mask.device,
-            )
-
-    def measure(self, slot: int = 0) -> None:
-        """Write the next sample of every vehicle, at its current state, into a slot of the output arrays."""
-        self._vehicle.accelerate()
-        self._launch.set_param_at_index(_SLOT_PARAMETER, slot)
-        self._launch.launch()
-
-    def sample(self) -> ImuReading:
-        """Take the next sample of every vehicle and wait for it; overwrites slot 0."""
-        self.measure(0)
-        return ImuReading(np.array(self.specific_force.numpy()[0]), np.array(self.angular_rate.numpy()[0]))
-
-
-class ImuSampler(Sampler):
+class Imu(StateSampler):
     """The IMUs of all worlds; arrays are named as the fields of an `ImuSample`."""
 
     def __init__(self, config: ImuConfig, context: SamplerContext) -> None:
-        self._imu = Imu(
-            config,
-            context.vehicle,
-            name=context.name,
-            slot_count=context.slot_count,
-            seeds=context.seeds,
-            active=context.active,
+        self._vehicle = vehicle = context.vehicle
+        terms = _terms(config)
+
+        def memory(term: str, *axes: int) -> Any:
+            return wp.zeros(
+                (vehicle.count if term in terms else 0, *axes), dtype=vec6d, device=vehicle.device
+            )
+
+        super().__init__(
+            context,
+            make_kernel(frozenset(terms)),
+            _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, name=context.name),
+            outputs={"specific_force": wp.vec3d, "angular_rate": wp.vec3d},
+            terms=terms,
+            further=(
+                vehicle.arrays.acceleration,
+                vehicle.arrays.angular_acceleration,
+                memory("walk"),
+                memory("instability", _PROCESSES),
+            ),
         )
-        self.terms = self._imu.terms
-        self.arrays = {
-            "specific_force": self._imu.specific_force,
-            "angular_rate": self._imu.angular_rate,
-        }
 
     def measure(self, slot: int) -> None:
-        """Measure all vehicles at their present state."""
-        self._imu.measure(slot)
-
-    def reset(self, mask: Any) -> None:
-        """Begin again at sample 0 in some worlds."""
-        self._imu.reset(mask)
+        """Measure all vehicles at their present state, of which the accelerations are computed here."""
+        self._vehicle.accelerate()
+        super().measure(slot)
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> ImuSample:
         """Return one sample as a packet."""
@@ -396,7 +243,7 @@ def _terms(config: ImuConfig) -> tuple[str, ...]:
     return tuple(term for term, needed in present.items() if needed)
 
 
-def _model(config: ImuConfig, *, gravity_m_s2: float, seed: int, name: str) -> Any:
+def _model(config: ImuConfig, *, gravity_m_s2: float, name: str) -> Any:
     def six(accelerometer: float, gyroscope: float, scale: float = 1.0) -> Any:
         return vec6d(*(3 * [scale * accelerometer] + 3 * [scale * gyroscope]))
 
@@ -420,7 +267,6 @@ def _model(config: ImuConfig, *, gravity_m_s2: float, seed: int, name: str) -> A
         math.inf if config.gyroscope_range_rad_s is None else config.gyroscope_range_rad_s,
     )
     model.resolution = six(config.accelerometer_resolution_m_s2, config.gyroscope_resolution_rad_s)
-    model.seed = seed
     model.white_stream = stream_id(f"{name}/imu/white")
     model.walk_stream = stream_id(f"{name}/imu/walk")
     model.instability_stream = stream_id(f"{name}/imu/instability")

@@ -7,9 +7,8 @@ The point that the ray of a pixel hits is fixed to what it is a part of, the sce
 projected with the poses of the other time, through the lens. So flow is exact whatever moves and turns. A
 pixel that sees nothing sees a direction: its flow is that of the rotation of the camera.
 
-Whether something hides it at the other time is known for most pixels from their own picture: nothing is on
-the way from the other camera to the point where the picture shows only what is further than that way, and
-near the camera where no surface is as near. Elsewhere a second ray is cast, from there to the point.
+Whether something hides it at the other time is known for most pixels from their own picture (`occlusion.py`).
+Elsewhere a second ray is cast, from there to the point: on CUDA, for all such pixels together.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -30,20 +29,24 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, projector, velocity_projector
 from neurosim_core.render.ray_times import RayTimes
-from neurosim_core.scene.bodies import Motion, body_velocity, make_body_poses
+from neurosim_core.scene.bodies import Motion, body_velocity
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
+from neurosim_core.sensors.occlusion import (
+    NEAR_RATIO,
+    TILE,
+    Views,
+    is_hidden_by_bodies,
+    is_way_free,
+    measure_clearance,
+    measure_tiles,
+    views_at,
+)
 
-VISIBLE, HIDDEN, OUTSIDE = 0, 1, 2
+VISIBLE, HIDDEN, OUTSIDE = (wp.constant(value) for value in (0, 1, 2))
 """Values of the mask: seen at both times; hidden by something at the other time; outside the picture then."""
 _FAR_M = wp.constant(1.0e9)
-_NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
-"""What hides a point is nearer than it by this ratio: rays and points are float32."""
-_CLEARANCE_M = wp.constant(0.5)
-"""No surface is looked for that is further from a camera than this."""
-_HORIZON_M = wp.constant(1.0e5)
-"""Where a way to the sky ends [m]."""
-_WAY_PX = wp.constant(64.0)
-"""Longest way in a picture that is followed."""
+_LISTED_THREADS = 2**17
+"""Threads that cast the rays of unresolved pixels: more than any device runs at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,135 +159,41 @@ class _Model:
     scene_of_world: wp.array[int]
     motions: wp.array[Motion]
     body_mesh: wp.array[wp.uint64]
+    # Of each view, of C with respect to T, the camera at the other time:
+    R_TC: wp.array[wp.mat33d]
+    p_TC: wp.array[wp.vec3d]
+    p_CT: wp.array[wp.vec3]
     clearance: wp.array[float]
-
-
-@wp.struct
-class Views:
-    """`PictureViews` at one time."""
-
-    p_WC: wp.array[wp.vec3]
-    q_WC: wp.array[wp.quat]
-    stamps: wp.array2d[wp.int64]
-    p_WO: wp.array2d[wp.vec3d]
-    q_WO: wp.array2d[wp.quatd]
-
-
-@wp.func
-def is_hidden(
-    mesh: wp.uint64,
-    bodies: wp.array[wp.uint64],
-    views: Views,
-    view: int,
-    p_W: wp.vec3d,
-    ray_W: wp.vec3d,
-    far: float,
-    free: bool,
-) -> bool:
-    """Return whether something is on the ray from the camera, nearer than a distance [m].
-
-    Where it is `free`, the scene is not, and bodies may be.
-    """
-    if not free:
-        if wp.mesh_query_ray_anyhit(mesh, wp.vec3(p_W), wp.vec3(ray_W), far):
-            return True
-    for body in range(bodies.shape[0]):
-        q_WO = views.q_WO[view, body]
-        p_O = wp.vec3(wp.quat_rotate_inv(q_WO, p_W - views.p_WO[view, body]))
-        ray_O = wp.vec3(wp.quat_rotate_inv(q_WO, ray_W))
-        if wp.mesh_query_ray_anyhit(bodies[body], p_O, ray_O, far):
-            return True
-    return False
+    # Where the picture does not tell what is hidden:
+    nearest: wp.array3d[float]
+    unresolved: wp.array[int]
+    unresolved_count: wp.array[int]
+    thread_count: int
 
 
 @wp.kernel(enable_backward=False)
-def _measure_clearance(
+def _relate_views(
     # Model:
     model: _Model,
+    focal_px: float,
     # In:
     instant_count: int,
     here: Views,
+    there: Views,
 ):
-    """Write the distance from the camera within which there is no surface of the scene [m]."""
     world = wp.tid() // instant_count
     view = world * model.stride + wp.tid() % instant_count
-    mesh = model.mesh[model.scene_of_world[world]]
-    clearance = _CLEARANCE_M
-    found = wp.mesh_query_point_no_sign(mesh, here.p_WC[view], _CLEARANCE_M)
-    if found.result:
-        nearest = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
-        clearance = wp.length(nearest - here.p_WC[view])
-    model.clearance[view] = _NEAR_RATIO * clearance
-
-
-@wp.func
-def _is_way_free(
-    model: _Model,
-    lens: LensData,
-    ranges: wp.array2d[float],
-    other: wp.vec3,
-    point: wp.vec3,
-    clearance: float,
-) -> bool:
-    """Return whether the picture of a pinhole camera shows that a way is free, but for its last pixel.
-
-    Args:
-        model: Of the picture.
-        lens: Of the camera.
-        ranges: The picture [m].
-        other: Where the way begins, in C [m].
-        point: Where it ends, in C [m].
-        clearance: Distance from the camera within which there is no surface [m].
-    """
-    length = wp.length(point - other)
-    along = (point - other) / length
-    middle = wp.dot(other, along)
-    inside = middle * middle + clearance * clearance - wp.dot(other, other)
-    leaving = wp.sqrt(wp.max(inside, 0.0)) - middle
-    if wp.dot(other, other) >= clearance * clearance:
-        return False
-    if leaving >= length:
-        return True
-    begin = other + leaving * along
-    if begin[2] <= 0.0:
-        return False
-    scale = wp.vec2(float(lens.fx), float(lens.fy))
-    center = wp.vec2(float(lens.cx), float(lens.cy))
-    here = wp.vec3(point[0] / point[2], point[1] / point[2], 1.0)
-    step = wp.vec3(begin[0] / begin[2], begin[1] / begin[2], 1.0) - here
-    count = wp.max(wp.abs(step[0] * scale[0]), wp.abs(step[1] * scale[1]))
-    if count > _WAY_PX:
-        return False
-    nearness = 1.0 / point[2]
-    for k in range(1, int(wp.ceil(count))):
-        share = float(k) / count
-        toward = here + share * step
-        away = wp.length(toward) / (nearness + share * (1.0 / begin[2] - nearness))
-        left = int(wp.floor(toward[0] * scale[0] + center[0] - 0.5))
-        top = int(wp.floor(toward[1] * scale[1] + center[1] - 0.5))
-        if left < 0 or top < 0 or left + 1 >= model.width or top + 1 >= model.height:
-            return False
-        least = wp.min(
-            wp.min(ranges[top, left], ranges[top, left + 1]),
-            wp.min(ranges[top + 1, left], ranges[top + 1, left + 1]),
-        )
-        if _NEAR_RATIO * least <= away:
-            return False
-    return True
-
-
-def views_at(views: PictureViews, device: Any) -> Any:
-    """Return the poses of one time for a kernel."""
-    bodies = views.bodies or _no_bodies(str(device))
-    at = Views()
-    at.p_WC, at.q_WC, at.stamps = views.p_WC, views.q_WC, views.stamps
-    at.p_WO, at.q_WO = bodies.p_WO, bodies.q_WO
-    return at
-
-
-@functools.cache
-def _no_bodies(device: str) -> Any:
-    return make_body_poses(0, 0, device)
+    q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
+    q_WT = wp.normalize(wp.quatd(there.q_WC[view]))
+    p_W = wp.vec3d(here.p_WC[view]) - wp.vec3d(there.p_WC[view])
+    model.R_TC[view] = wp.quat_to_matrix(wp.quat_inverse(q_WT) * q_WC)
+    model.p_TC[view] = wp.quat_rotate_inv(q_WT, p_W)
+    model.p_CT[view] = wp.vec3(wp.quat_rotate_inv(q_WC, -p_W))
+    if focal_px > 0.0:
+        mesh = model.mesh[model.scene_of_world[world]]
+        model.clearance[view] = measure_clearance(mesh, here.p_WC[view], model.p_CT[view], focal_px)
+    if wp.tid() == 0:
+        model.unresolved_count[0] = 0
 
 
 def lens_kind(context: PictureContext) -> str:
@@ -305,12 +214,10 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
     project_velocity = velocity_projector(kind)
     name = "_".join((kind, *terms)).replace(" ", "_")
 
-    @wp.kernel(module=wp.get_module("neurosim_core.sensors.optical_flow." + name), enable_backward=False)
-    def measure_flow(
-        first: int,
-        # Model:
+    @wp.func
+    def measure_pixel(
+        index: int,
         model: _Model,
-        # In:
         instant_count: int,
         image_slot: wp.array[int],
         active: wp.array[int],
@@ -319,10 +226,8 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         twist: wp.array[wp.spatial_vectord],
         ranges: wp.array3d[float],
         instance: wp.array3d[int],
-        # Out:
         flow_out: wp.array3d[wp.vec3],
     ):
-        index = first + wp.tid()
         pixel = index % model.pixel_count
         view = index // model.pixel_count
         world = view // instant_count
@@ -336,10 +241,13 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         row = pixel // model.width
         col = pixel % model.width
         lens = model.lenses[model.lens_of_world[world]]
-        ray_C = wp.normalize(wp.vec3d(model.rays[model.lens_of_world[world], pixel]))
-        p_WC = wp.vec3d(here.p_WC[view])
-        q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
-        ray_W = wp.quat_rotate(q_WC, ray_C)
+        ray_C = wp.vec3d(model.rays[model.lens_of_world[world], pixel])
+        # Rounded to float32: a step of Newton's method makes it of unit length.
+        ray_C *= wp.float64(1.5) - wp.float64(0.5) * wp.dot(ray_C, ray_C)
+        if wp.static("bodies" in terms or "velocity" in terms):
+            p_WC = wp.vec3d(here.p_WC[view])
+            q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
+            ray_W = wp.quat_rotate(q_WC, ray_C)
         r = wp.float64(ranges[slot, row, col])
         found = ranges[slot, row, col] < _FAR_M
         body = -1
@@ -363,48 +271,105 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
             rate = project_velocity(lens, p_C, v_C)
             flow_out[slot, row, col] = wp.vec3(float(rate[0]), float(rate[1]), 0.0)
             if rate[2] == wp.float64(0.0):
-                flow_out[slot, row, col] = wp.vec3(wp.nan, wp.nan, 2.0)
+                flow_out[slot, row, col] = wp.vec3(wp.nan, wp.nan, float(OUTSIDE))
             return
-        p_WT = wp.vec3d(there.p_WC[view])  # T: the camera at the other time
-        q_WT = wp.normalize(wp.quatd(there.q_WC[view]))
-        d_W = ray_W
+        p_T = model.R_TC[view] * ray_C  # T: the camera at the other time
         if found:
-            p_W = p_WC + r * ray_W
+            p_T = r * p_T + model.p_TC[view]
             if wp.static("bodies" in terms):
                 if body >= 0:
+                    p_W = p_WC + r * ray_W
                     p_O = wp.quat_rotate_inv(here.q_WO[view, body], p_W - here.p_WO[view, body])
                     p_W = there.p_WO[view, body] + wp.quat_rotate(there.q_WO[view, body], p_O)
-            d_W = p_W - p_WT
-        seen = project(lens, wp.quat_rotate_inv(q_WT, d_W))
+                    q_WT = wp.normalize(wp.quatd(there.q_WC[view]))
+                    p_T = wp.quat_rotate_inv(q_WT, p_W - wp.vec3d(there.p_WC[view]))
+        seen = project(lens, p_T)
         if seen[2] == wp.float64(0.0):
-            flow_out[slot, row, col] = wp.vec3(wp.nan, wp.nan, 2.0)
+            flow_out[slot, row, col] = wp.vec3(wp.nan, wp.nan, float(OUTSIDE))
             return
         u = float(seen[0] - wp.float64(col) - wp.float64(0.5))
         v = float(seen[1] - wp.float64(row) - wp.float64(0.5))
-        mask = 0.0
+        mask = int(VISIBLE)
         inside = seen[0] >= wp.float64(0.0) and seen[0] < wp.float64(model.width)
         inside = inside and seen[1] >= wp.float64(0.0) and seen[1] < wp.float64(model.height)
         if not inside:
-            mask = 2.0
+            mask = int(OUTSIDE)
         elif wp.static("occlusion" in terms):
-            far = _FAR_M
-            if found:
-                far = _NEAR_RATIO * float(wp.length(d_W))
             free = bool(False)
-            if wp.static(kind == "pinhole"):
+            if wp.static("way" in terms):
                 if body < 0:
-                    free = _is_way_free(
-                        model,
+                    free = is_way_free(
                         lens,
                         ranges[slot],
-                        wp.vec3(wp.quat_rotate_inv(q_WC, p_WT - p_WC)),
-                        wp.min(ranges[slot, row, col], _HORIZON_M) * wp.vec3(ray_C),
+                        model.nearest[slot],
+                        row,
+                        col,
+                        model.p_CT[view],
+                        ranges[slot, row, col] * wp.vec3(ray_C),
                         model.clearance[view],
                     )
-            mesh = model.mesh[model.scene_of_world[world]]
-            if is_hidden(mesh, model.body_mesh, there, view, p_WT, wp.normalize(d_W), far, free):
-                mask = 1.0
-        flow_out[slot, row, col] = wp.vec3(u, v, mask)
+            p_WT = there.p_WC[view]
+            way_W = wp.vec3(wp.quat_rotate(wp.quatd(there.q_WC[view]), wp.normalize(p_T)))
+            far = wp.where(found, NEAR_RATIO * float(wp.length(p_T)), _FAR_M)
+            if wp.static("list" in terms):
+                if not free:
+                    model.unresolved[wp.atomic_add(model.unresolved_count, 0, 1)] = index
+            elif not free:
+                if wp.mesh_query_ray_anyhit(model.mesh[model.scene_of_world[world]], p_WT, way_W, far):
+                    mask = int(HIDDEN)
+            if wp.static("bodies" in terms):
+                if is_hidden_by_bodies(model.body_mesh, there, view, p_WT, way_W, far):
+                    mask = int(HIDDEN)
+        flow_out[slot, row, col] = wp.vec3(u, v, float(mask))
+
+    @wp.kernel(module=wp.get_module("neurosim_core.sensors.optical_flow." + name), enable_backward=False)
+    def measure_flow(
+        first: int,
+        # Model:
+        model: _Model,
+        # In:
+        instant_count: int,
+        image_slot: wp.array[int],
+        active: wp.array[int],
+        here: Views,
+        there: Views,
+        twist: wp.array[wp.spatial_vectord],
+        ranges: wp.array3d[float],
+        instance: wp.array3d[int],
+        # Out:
+        flow_out: wp.array3d[wp.vec3],
+    ):
+        index = first + wp.tid()
+        if wp.static("listed" not in terms):
+            measure_pixel(
+                index,
+                model,
+                instant_count,
+                image_slot,
+                active,
+                here,
+                there,
+                twist,
+                ranges,
+                instance,
+                flow_out,
+            )
+        else:
+            while index < model.unresolved_count[0]:
+                measure_pixel(
+                    model.unresolved[index],
+                    model,
+                    instant_count,
+                    image_slot,
+                    active,
+                    here,
+                    there,
+                    twist,
+                    ranges,
+                    instance,
+                    flow_out,
+                )
+                index += model.thread_count
 
     return measure_flow
 
@@ -438,7 +403,9 @@ class FlowProcess:
         model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
         lens_rows = list(context.lens_of_world)
         model.lens_of_world = wp.array(lens_rows, dtype=int, device=device)
-        model.clearance = wp.zeros(len(lens_rows) * context.stride, dtype=float, device=device)
+        view_count = len(lens_rows) * context.stride
+        for name, dtype in (("R_TC", wp.mat33d), ("p_TC", wp.vec3d), ("p_CT", wp.vec3), ("clearance", float)):
+            setattr(model, name, wp.zeros(view_count, dtype=dtype, device=device))
         mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
         model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
         model.scene_of_world = context.scene_of_world
@@ -446,34 +413,56 @@ class FlowProcess:
             scene = context.scenes[0]
             model.scene_instances = len(scene.scene.instance_names)
             model.motions, model.body_mesh = context.motions, scene.bodies.mesh
-        self._kernel = _make_kernel(lens_kind(context), self.terms)
+        kind, variants = lens_kind(context), [self.terms]
+        self._focal_px = 0.0
+        if "occlusion" in self.terms and kind == "pinhole":
+            self._focal_px = max(float(lens.fx) for lens in self._lenses)
+            tiles = (source.shape[0], *(-(-size // TILE) for size in source.shape[1:]))
+            model.nearest = wp.zeros(tiles, dtype=float, device=device)
+            variants = [(*self.terms, "way")]
+            if wp.get_device(device).is_cuda:
+                model.unresolved = wp.zeros(source.size, dtype=int, device=device)
+                model.thread_count = _LISTED_THREADS
+                variants = [(*self.terms, "way", "list"), (*self.terms, "listed")]
+        model.unresolved_count = wp.zeros(1, dtype=int, device=device)
+        self._kernels = [_make_kernel(kind, variant) for variant in variants]
 
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
-        world_count = views.image_slot.shape[0] // self._context.stride
+        view_count = views.image_slot.shape[0] // self._context.stride * views.instant_count
         sources = self._context.sources
-        here = views_at(views, self._device)
-        if "occlusion" in self.terms:
+        here, there = views_at(views, self._device), views_at(views.then or views, self._device)
+        if "velocity" not in self.terms:
             wp.launch(
-                _measure_clearance,
-                dim=world_count * views.instant_count,
-                inputs=[self._model, views.instant_count, here],
+                _relate_views,
+                dim=view_count,
+                inputs=[self._model, self._focal_px, views.instant_count, here, there],
                 device=self._device,
             )
-        launch_split(
-            self._kernel,
-            dim=world_count * views.instant_count * self._model.pixel_count,
-            inputs=[
-                self._model,
-                views.instant_count,
-                views.image_slot,
-                views.active,
-                here,
-                views_at(views.then or views, self._device),
-                views.twist,
-                sources["range"],
-                sources["instance"],
-            ],
-            outputs=[self.picture],
-            device=self._device,
-        )
+        if self._focal_px:
+            nearest = self._model.nearest
+            wp.launch_tiled(
+                measure_tiles,
+                dim=nearest.shape,
+                inputs=[sources["range"], nearest],
+                block_dim=64,
+                device=self._device,
+            )
+        for number, kernel in enumerate(self._kernels):
+            launch_split(
+                kernel,
+                dim=_LISTED_THREADS if number else view_count * self._model.pixel_count,
+                inputs=[
+                    self._model,
+                    views.instant_count,
+                    views.image_slot,
+                    views.active,
+                    here,
+                    there,
+                    views.twist,
+                    sources["range"],
+                    sources["instance"],
+                ],
+                outputs=[self.picture],
+                device=self._device,
+            )

@@ -153,8 +153,11 @@ def test_what_a_link_did_is_read_as_whole_numbers(tmp_path):
         assert_same(list(flight.packets("command_link")), sent)
 
 
-def test_many_packets_cross_chunks_and_blocks(tmp_path):
-    """More events than a chunk, more rows than a chunk and than a block of the reader."""
+@pytest.mark.parametrize("deflate", ["isal", "zlib"])
+def test_many_packets_cross_chunks_and_blocks(tmp_path, monkeypatch, deflate):
+    """More events than a chunk, more rows than a chunk and than a block of the reader; by both libraries."""
+    if deflate == "zlib":
+        monkeypatch.setitem(sys.modules, "isal", None)
     rng = np.random.default_rng(0)
     packets: list[Packet] = []
     for k in range(5000):

@@ -13,7 +13,7 @@ from neurosim_core.record import Intrinsics, describe_sensors
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
-from neurosim_core.sensors.imu import ImuSensorConfig
+from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
 
@@ -27,7 +27,7 @@ def test_every_kind_is_described():
             "dvs": EventSensorConfig(lens=LENS, mount=mount, sampling_rate_hz=1000.0, packet_rate_hz=50.0),
             "rgb": RgbSensorConfig(lens=LENS, mount=mount, rate_hz=30.0),
             "z": DepthSensorConfig(lens=LENS, mount=mount, rate_hz=15.0),
-            "imu": ImuSensorConfig(mount=mount, rate_hz=333.0),
+            "imu": ImuConfig(mount=mount, rate_hz=333.0),
             "truth": OdometrySensorConfig(rate_hz=10.0),
         }
     )

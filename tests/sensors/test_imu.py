@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import warp as wp
 from pydantic import ValidationError
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.sensors.imu import CORRELATION_TIMES_S, TERMS, Imu, ImuConfig
+from neurosim_core.sensors.base import SamplerContext
+from neurosim_core.sensors.imu import CORRELATION_TIMES_S, Imu, ImuConfig
 from neurosim_core.vehicle import Multirotor, preset
 
 MS = 1_000_000
@@ -29,11 +33,31 @@ def isolated(device: str, **overrides) -> Multirotor:
     return Multirotor(preset("hummingbird", **{**AT_REST, **overrides}), device=device)
 
 
+def make(
+    config: ImuConfig, vehicle: Multirotor, *, seed: int = 0, name: str = "imu", slot_count: int = 1
+) -> Imu:
+    """The IMU of each vehicle, with seeds from 1,000 `seed` on."""
+    seeds = wp.array(1000 * seed + np.arange(vehicle.count), dtype=wp.uint64, device=vehicle.device)
+    active = wp.ones(vehicle.count, dtype=wp.int32, device=vehicle.device)
+    context = SamplerContext(name=name, vehicle=vehicle, slot_count=slot_count, seeds=seeds, active=active)
+    return config.make(context)
+
+
+def sample(imu: Imu) -> SimpleNamespace:
+    """The next sample of every vehicle, each [count, 3]."""
+    imu.measure(0)
+    return SimpleNamespace(**{name: array.numpy()[0].copy() for name, array in imu.arrays.items()})
+
+
+def read(vehicle: Multirotor, **config) -> SimpleNamespace:
+    return sample(make(ImuConfig(**config), vehicle))
+
+
 # Kinematics
 
 
 def test_hover_reads_one_g_upwards(device):
-    reading = Imu(ImuConfig(), Multirotor(preset("hummingbird"), device=device)).sample()
+    reading = read(Multirotor(preset("hummingbird"), device=device))
     assert reading.specific_force[0] == pytest.approx([0.0, 0.0, 9.81], abs=1e-14)
     assert not reading.angular_rate.any()
 
@@ -42,7 +66,7 @@ def test_free_fall_reads_nothing(device):
     vehicle = isolated(device, gravity_m_s2=9.81)
     vehicle.reset(orientation=(0.1, 0.2, 0.3, 0.9), velocity=(3.0, 2.0, 1.0))
     vehicle.step(np.zeros(4), 50 * MS)
-    assert np.abs(Imu(ImuConfig(), vehicle).sample().specific_force).max() < 1e-14
+    assert np.abs(read(vehicle).specific_force).max() < 1e-14
 
 
 def test_steady_rotation_reads_the_centripetal_acceleration(device):
@@ -50,7 +74,7 @@ def test_steady_rotation_reads_the_centripetal_acceleration(device):
     vehicle = isolated(device)
     vehicle.reset(body_rate=(0.0, 0.0, 5.0))
     vehicle.step(np.zeros(4), 123 * MS)
-    reading = Imu(ImuConfig(mount={"position_m": (0.3, -0.1, 0.2)}), vehicle).sample()
+    reading = read(vehicle, mount={"position_m": (0.3, -0.1, 0.2)})
     assert reading.specific_force[0] == pytest.approx([-7.5, 2.5, 0.0], abs=1e-13)
     assert reading.angular_rate[0] == pytest.approx([0.0, 0.0, 5.0], abs=1e-14)
 
@@ -62,7 +86,7 @@ def test_spin_up_reads_the_tangential_acceleration(device):
     vehicle.reset(rotor_speed=(600.0, 400.0, 600.0, 400.0))
     torque = config.torque_coefficient_n_m_s2 * 2.0 * (600.0**2 - 400.0**2)
     thrust = config.thrust_coefficient_n_s2 * 2.0 * (600.0**2 + 400.0**2)
-    reading = Imu(ImuConfig(mount={"position_m": (0.5, 0.0, 0.0)}), vehicle).sample()
+    reading = read(vehicle, mount={"position_m": (0.5, 0.0, 0.0)})
     expected = [0.0, 0.5 * torque / 7.03e-3, thrust / config.mass_kg]
     assert reading.specific_force[0] == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
@@ -72,7 +96,7 @@ def test_both_sensors_turn_with_the_mount(device):
     vehicle = isolated(device)
     vehicle.reset(body_rate=(2.0, 0.0, 0.0))
     mount = {"position_m": (0.0, 0.5, 0.0), "rpy_rad": (0.0, 0.0, np.pi / 2)}
-    reading = Imu(ImuConfig(mount=mount), vehicle).sample()
+    reading = read(vehicle, mount=mount)
     assert reading.angular_rate[0] == pytest.approx([0.0, -2.0, 0.0], abs=1e-15)
     assert reading.specific_force[0] == pytest.approx([-2.0, 0.0, 0.0], abs=1e-15)
 
@@ -83,7 +107,7 @@ def test_readings_are_the_derivatives_of_the_path_of_the_mount(device):
     config = preset("hummingbird", wind_m_s=(3.0, -2.0, 1.0), motor_time_constant_s=0.05)
     vehicle = Multirotor(config, device=device, max_step_ns=MS // 2)
     vehicle.reset(velocity=(5.0, 1.0, -2.0), body_rate=(6.0, -4.0, 3.0))
-    imu = Imu(ImuConfig(mount=mount), vehicle)
+    imu = make(ImuConfig(mount=mount), vehicle)
     R_BS = Rotation.from_euler("xyz", mount["rpy_rad"])
     step_s = 1e-3
     places, attitudes, readings = [], [], []
@@ -92,7 +116,7 @@ def test_readings_are_the_derivatives_of_the_path_of_the_mount(device):
         R_WB = Rotation.from_quat(state.orientation[0])
         places.append(state.position[0] + R_WB.apply(mount["position_m"]))
         attitudes.append(R_WB * R_BS)
-        readings.append(imu.sample())
+        readings.append(sample(imu))
         vehicle.step((500.0, 520.0, 470.0, 505.0), MS)
     for k in range(2, 39):
         p = places[k - 2 : k + 3]
@@ -111,10 +135,10 @@ def test_readings_are_the_derivatives_of_the_path_of_the_mount(device):
 def record(config: ImuConfig, *, samples: int, count: int, device: str, seed: int = 0, name: str = "imu"):
     """Readings of a body at rest without gravity: force and rate, each [samples, count, 3]."""
     vehicle = Multirotor(preset("hummingbird", **AT_REST), count=count, device=device)
-    imu = Imu(config, vehicle, seed=seed, name=name, slot_count=samples)
+    imu = make(config, vehicle, seed=seed, name=name, slot_count=samples)
     for slot in range(samples):
         imu.measure(slot)
-    return imu.specific_force.numpy(), imu.angular_rate.numpy()
+    return imu.arrays["specific_force"].numpy(), imu.arrays["angular_rate"].numpy()
 
 
 def allan_statistic(readings, variance: float) -> float:
@@ -218,32 +242,50 @@ def test_noise_is_addressed_by_seed_and_name_and_axis(device):
 
 def test_reset_starts_the_noise_again(device):
     vehicle = Multirotor(preset("hummingbird"), count=2, device=device)
-    imu = Imu(NOISY, vehicle, seed=3, slot_count=4)
+    imu = make(NOISY, vehicle, seed=3, slot_count=4)
+    everywhere = wp.ones(2, dtype=wp.int32, device=device)
     runs = []
     for _ in range(2):
-        imu.reset()
+        imu.reset(everywhere)
         for slot in range(4):
             imu.measure(slot)
-        runs.append(np.concatenate([imu.specific_force.numpy(), imu.angular_rate.numpy()], axis=2))
+        runs.append(np.concatenate([array.numpy() for array in imu.arrays.values()], axis=2))
     assert np.array_equal(*runs)
     assert len(np.unique(runs[0])) == runs[0].size
 
 
-def test_terms_with_zero_coefficients_change_nothing(device):
+ERRORS = {
+    "noise_density": 1e-2,
+    "random_walk": 1e-2,
+    "bias_instability_{}": 1e-2,
+    "range_{}": 50.0,
+    "resolution_{}": 1e-3,
+}
+UNITS = {"accelerometer": "m_s2", "gyroscope": "rad_s"}
+
+
+@pytest.mark.parametrize("sensor", UNITS)
+def test_errors_of_one_sensor_leave_the_other_exact(device, sensor):
+    """Both are computed by one kernel: that of the other has all errors, of coefficients that are 0."""
     vehicle = isolated(device)
     vehicle.reset(body_rate=(1.0, 2.0, 5.0))
-    config = ImuConfig(mount={"position_m": (0.3, -0.1, 0.2), "rpy_rad": (0.1, 0.2, 0.3)})
-    reduced, full = (Imu(config, vehicle, terms=terms) for terms in (None, TERMS))
+    mount = {"position_m": (0.3, -0.1, 0.2), "rpy_rad": (0.1, 0.2, 0.3)}
+    named = {f"{sensor}_{name.format(UNITS[sensor])}": value for name, value in ERRORS.items()}
+    exact, noisy = make(ImuConfig(mount=mount), vehicle), make(ImuConfig(mount=mount, **named), vehicle)
+    assert len(noisy.terms) == 5
     for _ in range(20):
         vehicle.step(np.full(4, 500.0), 3 * MS)
-        for one, other in zip(reduced.sample(), full.sample(), strict=True):
-            assert one == pytest.approx(other, abs=1e-12)  # a sum of float64 in another order
+        one, other = sample(exact), sample(noisy)
+        same, erring = ("angular_rate", "specific_force")[:: 1 if sensor == "accelerometer" else -1]
+        # a sum of float64 in another order
+        assert getattr(one, same) == pytest.approx(getattr(other, same), abs=1e-12)
+        assert np.abs(getattr(one, erring) - getattr(other, erring)).min() > 0.0
 
 
 def test_saturation(device):
     vehicle = Multirotor(preset("hummingbird"), device=device)
     vehicle.reset(body_rate=(40.0, -40.0, 3.0))
-    reading = Imu(ImuConfig(accelerometer_range_m_s2=5.0, gyroscope_range_rad_s=35.0), vehicle).sample()
+    reading = read(vehicle, accelerometer_range_m_s2=5.0, gyroscope_range_rad_s=35.0)
     assert reading.specific_force[0, 2] == 5.0
     assert reading.angular_rate[0].tolist() == [35.0, -35.0, 3.0]
 
@@ -256,24 +298,18 @@ def test_quantisation(device):
     vehicle = isolated(device)
     vehicle.reset(body_rate=(0.0, 0.0, 1.3))
     imu, plain = (
-        Imu(c, vehicle) for c in (config, config.model_copy(update={"accelerometer_resolution_m_s2": 0.0}))
+        make(c, vehicle) for c in (config, config.model_copy(update={"accelerometer_resolution_m_s2": 0.0}))
     )
     for _ in range(20):
-        reading, smooth = imu.sample(), plain.sample()
+        reading, smooth = sample(imu), sample(plain)
         assert np.array_equal(reading.specific_force, 0.25 * np.round(smooth.specific_force / 0.25))
         assert reading.angular_rate[0].tolist() == [0.0, 0.0, 1.5]
 
 
 def test_errors_that_are_0_are_left_out(device):
     vehicle = Multirotor(preset("hummingbird"), device=device)
-    assert Imu(ImuConfig(), vehicle).terms == ()
-    assert Imu(NOISY, vehicle).terms == ("white", "walk", "instability")
-
-
-def test_errors_of_one_sensor_leave_the_other_exact(device):
-    force, rate = record(ImuConfig(accelerometer_noise_density=1e-2), samples=3, count=2, device=device)
-    assert force.all()
-    assert not rate.any()
+    assert make(ImuConfig(), vehicle).terms == ()
+    assert make(NOISY, vehicle).terms == ("white", "walk", "instability")
 
 
 @pytest.mark.parametrize(
@@ -289,8 +325,3 @@ def test_errors_of_one_sensor_leave_the_other_exact(device):
 def test_parameters_are_checked(wrong):
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         ImuConfig(**wrong)
-
-
-def test_slot_count_is_checked(device):
-    with pytest.raises(ValueError, match="slot_count must be >= 1, got 0"):
-        Imu(ImuConfig(), Multirotor(preset("hummingbird"), device=device), slot_count=0)
