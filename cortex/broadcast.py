@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import zmq
 
 from cortex.compiled import native
-from cortex.outlet import Outlet
 from cortex.patience import Patience
+from cortex.pub_socket import PubSocket
 from cortex.wire import AttachKey
 
 logger = logging.getLogger(__name__)
@@ -53,9 +53,9 @@ class Reader:
 
     key: bytes
     request: AttachKey
-    outlet: Outlet
+    pub_socket: PubSocket
     member: int | None = None
-    """Its number in the publisher's ring, through which its frames go; None: through the outlet."""
+    """Its number in the publisher's ring, through which its frames go; None: through the socket."""
     confirmed: int = 0
     """It has accounted for all messages below this."""
 
@@ -79,7 +79,7 @@ class Hello(NamedTuple):
 
 
 class Listener:
-    """Where a node's local readers ask for rings. The caller holds the outlets' lock.
+    """Where a node's local readers ask for rings. The caller holds the sockets' lock.
 
     Args:
         path: Of its socket.
@@ -139,7 +139,7 @@ def make_listener(path: Path) -> Listener | None:
 
 
 class Broadcast:
-    """The ring of one publisher and who reads it. The caller holds the outlets' lock.
+    """The ring of one publisher and who reads it. The caller holds the sockets' lock.
 
     Args:
         source: The publisher's number.
@@ -176,7 +176,7 @@ class Broadcast:
 
     def admit(self, reader: Reader, sequence: int) -> None:
         """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
-        listener = reader.outlet.listener
+        listener = reader.pub_socket.listener
         hello = None if listener is None else listener.take(self._source, reader.request.reader)
         if hello is None:
             return

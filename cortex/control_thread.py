@@ -13,8 +13,8 @@ import zmq
 
 from cortex.answers import Answers
 from cortex.discovery import Directory
-from cortex.outlet import Outlets
 from cortex.places import Places, clock_offset_ns
+from cortex.pub_socket import PubSockets
 from cortex.publisher import Publisher
 from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
@@ -34,7 +34,7 @@ class ControlThread:
     _places: Places
     _directory: Directory
     _answers: Answers
-    _outlets: Outlets
+    _pub_sockets: PubSockets
     _publishers: Callable[[], list[Publisher[Any]]]
     _subscribers: Callable[[], list[Subscriber[Any]]]
 
@@ -52,13 +52,18 @@ class ControlThread:
         places: Places,
         directory: Directory,
         answers: Answers,
-        outlets: Outlets,
+        pub_sockets: PubSockets,
         *,
         publishers: Callable[[], list[Publisher[Any]]],
         subscribers: Callable[[], list[Subscriber[Any]]],
     ) -> None:
         """Begin. Places and directory are closed at the end, by this thread."""
-        self._places, self._directory, self._answers, self._outlets = places, directory, answers, outlets
+        self._places, self._directory, self._answers, self._pub_sockets = (
+            places,
+            directory,
+            answers,
+            pub_sockets,
+        )
         self._publishers, self._subscribers = publishers, subscribers
         self._thread.start()
 
@@ -118,8 +123,8 @@ class ControlThread:
     def _tick(self) -> None:
         now_ns = time.monotonic_ns()
         self._directory.tick(now_ns)
-        self._outlets.tick()
-        self._outlets.emit_notes()
+        self._pub_sockets.tick()
+        self._pub_sockets.emit_notes()
         offset_ns = clock_offset_ns()
         if abs(offset_ns - self.clock_offset_ns) > CLOCK_STEP_NS:
             self.clock_offset_ns = offset_ns  # somebody has set the clock: tell the others

@@ -12,8 +12,8 @@ import zmq
 from cortex.codec import Codec, MalformedMessage
 from cortex.inlet import make_inlet
 from cortex.link import Item, Link, make
-from cortex.outlet import DONTWAIT
 from cortex.policy import Policy
+from cortex.pub_socket import DONTWAIT
 from cortex.stats import SubscriberCounters, note_latency
 from cortex.turn import Turn
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST

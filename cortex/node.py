@@ -27,7 +27,6 @@ from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
 from cortex.liveliness import Liveliness, Watch
 from cortex.matching import Matcher
-from cortex.outlet import Outlets
 from cortex.overview import (
     TopicInfo,
     describe_publisher,
@@ -39,6 +38,7 @@ from cortex.overview import (
 )
 from cortex.places import Places
 from cortex.policy import Policy, keep_last
+from cortex.pub_socket import PubSockets
 from cortex.publisher import COMMAND_MAX_WAIT_S, INLINE_MAX, MAX_WAIT_S, Publisher, close_publishers
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import NodeRecord, StatsReply, StatsRequest
@@ -94,7 +94,7 @@ class Node:
         self.id = secrets.randbits(64) or 1
         self._pid = os.getpid()
         self._lock = threading.RLock()
-        self._outlets = Outlets()
+        self._pub_sockets = PubSockets()
         self._publishers: list[Publisher[Any]] = []
         self._subscribers: list[Subscriber[Any]] = []
         self._watches: list[Watch] = []
@@ -103,7 +103,7 @@ class Node:
         self._server = Server(self._callbacks.submit)
         self._control = ControlThread(name)
         self._closed = False
-        self._places = Places(self.domain, self.id, self._outlets, listen, keys=keys, insecure=insecure)
+        self._places = Places(self.domain, self.id, self._pub_sockets, listen, keys=keys, insecure=insecure)
         self._host = host_id()  # once the runtime directory exists: it counts
         self._matcher = Matcher(self._host, keys, insecure=insecure)
         try:
@@ -118,7 +118,7 @@ class Node:
                 on_change=self._on_change,
             )
         except BaseException:
-            self._outlets.close()
+            self._pub_sockets.close()
             self._places.close()
             raise
         self._answers = Answers(
@@ -128,7 +128,7 @@ class Node:
             self._places,
             self._directory,
             self._answers,
-            self._outlets,
+            self._pub_sockets,
             publishers=lambda: list(self._publishers),
             subscribers=lambda: list(self._subscribers),
         )
@@ -170,7 +170,7 @@ class Node:
             Publisher(
                 check_topic(topic),
                 codec_of(message_type),
-                self._outlets,
+                self._pub_sockets,
                 latch=latch,
                 inline_max=inline_max,
                 expected_bytes=expected_bytes,
@@ -186,7 +186,7 @@ class Node:
             Publisher(
                 check_topic(topic),
                 cast(Any, RawCodec(schema)),
-                self._outlets,
+                self._pub_sockets,
                 latch=latch,
                 on_close=self._drop_publisher,
             )
@@ -366,8 +366,8 @@ class Node:
             client.close()
         self._callbacks.close()
         self._control.stop()
-        self._outlets.emit_notes()
-        self._outlets.close()
+        self._pub_sockets.emit_notes()
+        self._pub_sockets.close()
 
     def disown(self) -> None:
         """Give up in a forked child: threads and sockets are the parent's."""

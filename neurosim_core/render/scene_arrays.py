@@ -88,8 +88,6 @@ def upload_scene(
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
         building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
-        if device != "cpu":
-            building.result()  # Warp's list of meshes on CUDA is not guarded against threads
         if baked or config.exposure == "auto":
             light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
         packed = packing.result()

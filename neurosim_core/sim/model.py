@@ -138,11 +138,9 @@ def make_fleet(
         light = functools.partial(
             upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
         )
-        lit = aside.submit(light) if seeing and device == "cpu" else None
+        lit = aside.submit(light) if seeing else None
         with phase("free space"):
             free_space = make_free_space(scene, config.free_space, device=device)
-        if seeing and lit is None:  # Warp's list of meshes on CUDA is not guarded against threads
-            lit = aside.submit(light)
         with phase("path"):
             paths = {name: _plan(member, free_space) for name, member in members.items()}
 

@@ -337,7 +337,7 @@ def test_choice_without_ros(dds_domain: int, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "cyclonedds" else real(name, *rest)
     )
-    with pytest.raises(BackendError, match=r"pip install rosbags 'cyclonedds"):
+    with pytest.raises(BackendError, match=r"pip install 'cyclonedds.*3\.14 and ARM"):
         open_backend("auto")
 
 
