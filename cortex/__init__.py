@@ -14,6 +14,7 @@ from cortex.message import message
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage
     from cortex.context import Closed
+    from cortex.link import Info
     from cortex.liveliness import Liveliness
     from cortex.loan import Loan
     from cortex.message import (
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from cortex.publisher import Publisher
     from cortex.schema import TypeMismatch
     from cortex.service import ServiceFailed, ServiceTimeout, ServiceUnavailable
-    from cortex.subscriber import Info, Subscriber
+    from cortex.subscriber import Subscriber
     from cortex.synchronise import synchronised
 
 _HOME = {
@@ -43,7 +44,7 @@ _HOME = {
     "Closed": "context",
     "Float32": "message",
     "Float64": "message",
-    "Info": "subscriber",
+    "Info": "link",
     "Int8": "message",
     "Int16": "message",
     "Int32": "message",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ from typing import Any, NamedTuple
 import zmq
 
 from cortex.compiled import native
-from cortex.outlet import Outlet
 from cortex.patience import Patience
+from cortex.pub_socket import PubSocket
 from cortex.wire import AttachKey
 
 logger = logging.getLogger(__name__)
@@ -52,9 +53,9 @@ class Reader:
 
     key: bytes
     request: AttachKey
-    outlet: Outlet
+    pub_socket: PubSocket
     member: int | None = None
-    """Its number in the publisher's ring, through which its frames go; None: through the outlet."""
+    """Its number in the publisher's ring, through which its frames go; None: through the socket."""
     confirmed: int = 0
     """It has accounted for all messages below this."""
 
@@ -78,7 +79,7 @@ class Hello(NamedTuple):
 
 
 class Listener:
-    """Where a node's local readers ask for rings. The caller holds the outlets' lock.
+    """Where a node's local readers ask for rings. The caller holds the sockets' lock.
 
     Args:
         path: Of its socket.
@@ -107,6 +108,15 @@ class Listener:
             self._heard.pop(next(iter(self._heard))).close()
         return self._heard.pop((source, reader), None)
 
+    def forget(self) -> None:
+        """Let go of what readers handed over that have left before they attached."""
+        poll = select.poll()
+        for hello in self._heard.values():
+            poll.register(hello.socket, 0)
+        gone = {fd for fd, _ in poll.poll(0)} if self._heard else set()
+        for key in [key for key, hello in self._heard.items() if hello.socket in gone]:
+            self._heard.pop(key).close()
+
     def close(self) -> None:
         """Listen no more."""
         for fd in (self._fd, *self._unheard):
@@ -129,7 +139,7 @@ def make_listener(path: Path) -> Listener | None:
 
 
 class Broadcast:
-    """The ring of one publisher and who reads it. The caller holds the outlets' lock.
+    """The ring of one publisher and who reads it. The caller holds the sockets' lock.
 
     Args:
         source: The publisher's number.
@@ -166,7 +176,7 @@ class Broadcast:
 
     def admit(self, reader: Reader, sequence: int) -> None:
         """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
-        listener = reader.outlet.listener
+        listener = reader.pub_socket.listener
         hello = None if listener is None else listener.take(self._source, reader.request.reader)
         if hello is None:
             return

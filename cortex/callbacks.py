@@ -14,7 +14,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from cortex.subscriber import WAIT_MAX_S, Subscriber
+from cortex.loop_reader import WAIT_MAX_S
+from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)

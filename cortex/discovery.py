@@ -7,7 +7,6 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import zmq
@@ -23,6 +22,7 @@ from cortex.control import (
     make_control_socket,
     try_send,
 )
+from cortex.directory_link import DirectoryLink
 from cortex.host import REGISTRY_SOCKET, runtime_dir
 from cortex.records import (
     Alive,
@@ -46,7 +46,6 @@ __all__ = ["Directory", "Registry", "ensure_registry", "main"]
 logger = logging.getLogger(__name__)
 
 _FRAMES_PER_CALL = 256
-_CONNECT_FIRST_NS = 2_000_000
 _CONNECT_LAST_NS = 50_000_000
 _ANSWER_NS = 300_000_000
 """A `Hello` that was not answered for this long is sent again, then after twice as long, up to a second."""
@@ -56,34 +55,6 @@ _SILENCE_NS = 3_000_000_000
 _REVIVE_FIRST_NS = 1_000_000_000
 _REVIVE_LAST_NS = 10_000_000_000
 _INBOUND = "inbound"
-
-
-@dataclass(eq=False)
-class _Link:
-    """A connection to the registry or to a static peer."""
-
-    address: str
-    socket: zmq.Socket[Any]
-    is_registry: bool
-    next_ns: int
-    """When to send the next heartbeat or `Hello`."""
-    heard_ns: int
-    """When the other side, or the start of our waiting for it, was last heard."""
-    wait_ns: int = _CONNECT_FIRST_NS
-    asked: bool = False
-    """Whether a `Hello` has been sent and not answered yet."""
-    quiet_ns: int = 0
-    """Until when an `Alive` is no reason for a further `Hello`."""
-    welcomed: bool = False
-    epoch: int = 0
-    version: int = 0
-    nodes: set[int] = field(default_factory=set)
-    """Nodes that are known through this link."""
-    missing: dict[int, int] = field(default_factory=dict)
-    """Revisions that `Welcome` named and that have not arrived yet, by node."""
-    doubted: dict[int, int] = field(default_factory=dict)
-    """When to drop a node that the registry did not name in its last `Welcome` [ns]."""
-    warned: bool = False
 
 
 class Directory:
@@ -144,7 +115,7 @@ class Directory:
         self._tick_ns = time.monotonic_ns()
         self._link_types = control_types(Alive, Changed, Gone, Refused, Welcome)
         self._answer_types = control_types(Describe, Heartbeat, Hello, Leave)
-        self._links: list[_Link] = []
+        self._links: list[DirectoryLink] = []
         try:
             if registry == "auto":
                 self._connect(f"ipc://{runtime_dir(domain) / REGISTRY_SOCKET}", is_registry=True)
@@ -173,7 +144,7 @@ class Directory:
             socket.close(linger=0)
             raise
         now_ns = time.monotonic_ns()
-        self._links.append(_Link(address, socket, is_registry, next_ns=now_ns, heard_ns=now_ns))
+        self._links.append(DirectoryLink(address, socket, is_registry, next_ns=now_ns, heard_ns=now_ns))
 
     # What the owner drives
 
@@ -313,7 +284,7 @@ class Directory:
         self._revision += 1
         return dataclasses.replace(self._record(), revision=self._revision)
 
-    def _beat(self, link: _Link, now_ns: int) -> None:
+    def _beat(self, link: DirectoryLink, now_ns: int) -> None:
         if not link.welcomed:
             self._say_hello(link, now_ns, snapshot=True)
             return
@@ -324,10 +295,10 @@ class Directory:
             link.next_ns = now_ns + HEARTBEAT_NS
             self._warn_of_silence(link, now_ns)
         else:
-            self._lose(link)
+            link.lose()
             self._retry(link, now_ns)
 
-    def _say_hello(self, link: _Link, now_ns: int, *, snapshot: bool) -> None:
+    def _say_hello(self, link: DirectoryLink, now_ns: int, *, snapshot: bool) -> None:
         try:
             frame = control_frame(Hello(snapshot, self._own))
         except ValueError as error:  # larger than any control frame may be
@@ -335,20 +306,14 @@ class Directory:
             link.next_ns = now_ns + LEASE_NS
             return
         if not try_send(link.socket, frame):
-            self._lose(link)
+            link.lose()
             self._retry(link, now_ns)
             return
         link.wait_ns = min(2 * link.wait_ns, LEASE_NS) if link.asked else _ANSWER_NS
         link.asked, link.quiet_ns = True, now_ns + _ANSWER_NS
         link.next_ns = now_ns + (HEARTBEAT_NS if link.welcomed else link.wait_ns)
 
-    def _lose(self, link: _Link) -> None:
-        """The connection is gone. What was known through it stays, until its lease says otherwise."""
-        if link.welcomed or link.asked:
-            link.wait_ns = _CONNECT_FIRST_NS
-        link.welcomed = link.asked = False
-
-    def _retry(self, link: _Link, now_ns: int) -> None:
+    def _retry(self, link: DirectoryLink, now_ns: int) -> None:
         link.next_ns = now_ns + link.wait_ns
         link.wait_ns = min(2 * link.wait_ns, _CONNECT_LAST_NS)
         self._warn_of_silence(link, now_ns)
@@ -365,7 +330,7 @@ class Directory:
         self._revive_ns = now_ns + self._revive_wait_ns
         self._revive_wait_ns = min(2 * self._revive_wait_ns, _REVIVE_LAST_NS)
 
-    def _warn_of_silence(self, link: _Link, now_ns: int) -> None:
+    def _warn_of_silence(self, link: DirectoryLink, now_ns: int) -> None:
         if now_ns - link.heard_ns > _SILENCE_NS and not link.warned:
             link.warned = True
             what = "registry" if link.is_registry else "peer"
@@ -374,7 +339,7 @@ class Directory:
 
     # Receiving
 
-    def _on_message(self, link: _Link, message: Any, now_ns: int) -> None:
+    def _on_message(self, link: DirectoryLink, message: Any, now_ns: int) -> None:
         link.heard_ns, link.warned = now_ns, False
         if isinstance(message, Refused):
             self._log_once(f"{link.address} refuses this node", message.reason)
@@ -386,17 +351,17 @@ class Directory:
         elif isinstance(message, Alive):
             self._on_alive(link, message, now_ns)
         elif isinstance(message, Gone):
-            self._count(link, message.version)
+            link.count(message.version)
             link.missing.pop(message.node, None)
             link.doubted.pop(message.node, None)
             self._drop(link, message.node)
         else:
             self._on_changed(link, message, now_ns)
 
-    def _on_welcome(self, link: _Link, welcome: Welcome, now_ns: int) -> None:
+    def _on_welcome(self, link: DirectoryLink, welcome: Welcome, now_ns: int) -> None:
         if not link.is_registry or len(welcome.nodes) != len(welcome.revisions):
             raise MalformedMessage("a welcome with lists of different lengths, or of a peer")
-        self._greet(link, now_ns)
+        link.greet(now_ns)
         self._revive_ns, self._revive_wait_ns = 0, _REVIVE_FIRST_NS
         link.epoch, link.version = welcome.epoch, welcome.version
         named = dict(zip(welcome.nodes, welcome.revisions, strict=True))
@@ -410,12 +375,7 @@ class Directory:
         since = {node: link.doubted.get(node, now_ns + LEASE_NS) for node in link.nodes if node not in named}
         link.doubted = since
 
-    def _greet(self, link: _Link, now_ns: int) -> None:
-        if not link.welcomed:
-            link.next_ns = now_ns + HEARTBEAT_NS
-        link.welcomed, link.asked, link.quiet_ns = True, False, 0
-
-    def _on_alive(self, link: _Link, alive: Alive, now_ns: int) -> None:
+    def _on_alive(self, link: DirectoryLink, alive: Alive, now_ns: int) -> None:
         if not link.welcomed or now_ns < link.quiet_ns:
             return  # the answer to our last `Hello` is on its way and says more
         if link.is_registry:
@@ -428,23 +388,18 @@ class Directory:
         if alive.held != self._own.revision:
             self._say_hello(link, now_ns, snapshot=False)
 
-    def _on_changed(self, link: _Link, changed: Changed, now_ns: int) -> None:
+    def _on_changed(self, link: DirectoryLink, changed: Changed, now_ns: int) -> None:
         record = changed.record
         check_record(record)
         if link.is_registry:
-            self._count(link, changed.version)
+            link.count(changed.version)
             link.missing.pop(record.node, None)
             link.doubted.pop(record.node, None)
         else:
-            self._greet(link, now_ns)
+            link.greet(now_ns)
             for node in link.nodes - {record.node}:  # another node has taken over this address
                 self._drop(link, node)
         self._put(link, record)
-
-    def _count(self, link: _Link, version: int) -> None:
-        # Records of a snapshot are older than the `Welcome` before them; a gap shows at the next `Alive`.
-        if link.welcomed and version == link.version + 1:
-            link.version = version
 
     # What is known
 
@@ -457,7 +412,7 @@ class Directory:
             link.doubted = {node: at_ns + stall_ns for node, at_ns in link.doubted.items()}
         self._inbound = {node: seen_ns + stall_ns for node, seen_ns in self._inbound.items()}
 
-    def _expire(self, link: _Link, now_ns: int) -> None:
+    def _expire(self, link: DirectoryLink, now_ns: int) -> None:
         if link.is_registry:
             if not link.welcomed:
                 return  # without a registry nobody is removed
@@ -472,7 +427,7 @@ class Directory:
         # One holder's records come in order, so its last one counts; of several holders' the newest.
         if record.node != self._own.node:
             self._known.setdefault(record.node, {})[holder] = record
-            if isinstance(holder, _Link):
+            if isinstance(holder, DirectoryLink):
                 holder.nodes.add(record.node)
             self._choose(record.node)
 
@@ -482,7 +437,7 @@ class Directory:
         self._drop(_INBOUND, node)
 
     def _drop(self, holder: Hashable, node: int) -> None:
-        if isinstance(holder, _Link):
+        if isinstance(holder, DirectoryLink):
             holder.nodes.discard(node)
         known = self._known.get(node)
         if known is not None and known.pop(holder, None) is not None:

@@ -69,7 +69,7 @@ class EvolvedCodec:
             + type_from_schema(theirs).__cortex_bindings__[len(self._common) :]  # type: ignore[attr-defined]
         )
         names = [field.name for field in theirs.fields]
-        mixed = make_class(ours.__name__, names, [object] * len(names))
+        mixed = make_class(ours.__name__, names)
         attach_schema(mixed, theirs, bindings)
         self._codec = Codec(mixed)
         self.stamp_of = self._codec.stamp_of

@@ -80,7 +80,6 @@ class Evt3Encoder:
         width: int,
         height: int,
         end_us: int,
-        allocate: Allocate | None = None,
     ) -> Bytes:
         """Return a packet, in which time is written before the first event.
 
@@ -89,7 +88,6 @@ class Evt3Encoder:
             width: Of the sensor [px].
             height: Of the sensor [px].
             end_us: Time of a packet without events [us].
-            allocate: Makes room for the packet; None: a new array.
 
         Raises:
             EventCodecError: The sensor has more than 2048 columns or rows, an event is outside of it or has
@@ -98,7 +96,6 @@ class Evt3Encoder:
         if width > EVT3_SIZE_MAX or height > EVT3_SIZE_MAX:
             raise EventCodecError(f"evt3 holds at most 2048 x 2048 pixels, not {width} x {height}; use mono")
         check_events(events, width, height)
-        allocate = new_bytes if allocate is None else allocate
         times = events.t if len(events.t) else np.array([end_us], np.int64)
         first, last = int(times[0]) >> _EPOCH_BITS, int(times[-1]) >> _EPOCH_BITS
         since = self._wraps(first - (first if self._epoch is None else self._epoch))
@@ -113,8 +110,7 @@ class Evt3Encoder:
             epochs = np.diff(times >> _EPOCH_BITS, prepend=first)
             which = np.flatnonzero(epochs)
             wraps = np.repeat(which, [self._wraps(int(each)) for each in epochs[which]])
-        size = 2 * (count + 1 + 2 * (since + len(wraps)))
-        out = allocate(size)[:size].view("<u2")
+        out = np.empty(count + 1 + 2 * (since + len(wraps)), "<u2")
         if since:
             out[: 2 * since] = np.tile(_WRAP, since)
         out[2 * since] = _TIME_HIGH << 12 | int(times[0]) >> 12 & 0xFFF
@@ -385,11 +381,6 @@ def _changes(values: NDArray[Any], out: NDArray[np.bool_]) -> NDArray[np.bool_]:
     out[0] = True
     np.not_equal(values[1:], values[:-1], out=out[1:])
     return out
-
-
-def new_bytes(size: int) -> Bytes:
-    """Return memory for so many bytes."""
-    return np.empty(size, np.uint8)
 
 
 def read_words(data: Any, dtype: str, encoding: str) -> NDArray[Any]:

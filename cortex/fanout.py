@@ -11,8 +11,8 @@ import zmq
 from cortex.broadcast import Broadcast, Reader
 from cortex.gate import Gate
 from cortex.large import LargeSender
-from cortex.outlet import DONTWAIT, SNDMORE, Outlet, Outlets
 from cortex.patience import Patience
+from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket, PubSockets
 from cortex.wire import (
     LARGE,
     MESSAGE,
@@ -34,7 +34,7 @@ TELL_AGAIN_S = 0.02
 
 
 class Fanout:
-    """Sends frames to all readers, through the ring and sockets. The caller holds the outlets' lock.
+    """Sends frames to all readers, through the ring and sockets. The caller holds the sockets' lock.
 
     Args:
         topic: For what is logged.
@@ -42,7 +42,7 @@ class Fanout:
         fingerprint: Of its type.
         stamped: Whether that has a stamp.
         gate: Sends where this says, if nothing special is to be done.
-        outlets: Tell who has come and gone.
+        sockets: Tell who has come and gone.
         patience: Waits for reliable readers.
         latching: Whether who comes gets the last message.
         max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
@@ -57,7 +57,7 @@ class Fanout:
         *,
         stamped: bool,
         gate: Gate,
-        outlets: Outlets,
+        pub_sockets: PubSockets,
         patience: Patience,
         latching: bool,
         max_wait_s: float,
@@ -69,7 +69,7 @@ class Fanout:
         )
         self._gate = gate
         self._large = LargeSender()
-        self._outlets = outlets
+        self._pub_sockets = pub_sockets
         self._patience = patience
         self.latching = latching
         self._max_wait_ms = round(max_wait_s * 1000.0)
@@ -79,11 +79,11 @@ class Fanout:
             patience,
             self._await_room,
             self.route,
-            lambda text: outlets.note(f"{topic}: {text}"),
+            lambda text: pub_sockets.note(f"{topic}: {text}"),
             expected_bytes,
         )
-        self.late: dict[Outlet, int] = {}
-        """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
+        self.late: dict[PubSocket, int] = {}
+        """Strict sockets on which a reader was too late, and the sequence from which on it may get messages.
 
         libzmq sends it nothing until it has caught up."""
         self.latched = b""
@@ -94,75 +94,79 @@ class Fanout:
         """Messages that some reader did not get, because too much waited to be sent to it."""
         self.closed = False
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
-        self._strict_outlets: tuple[Outlet, ...] = ()
+        self._strict_sockets: tuple[PubSocket, ...] = ()
         self._retries: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
         """What to call where one of the gate's `sends` refuses."""
         self._crowded = False
         self._told = 0
         self._tell_after_ns = SILENCE_NS
-        self._untold: list[Outlet] = []
+        self._untold: list[PubSocket] = []
         self._tell_again_s = 0.0
 
-    # Who comes and goes; called by the outlets
+    # Who comes and goes; called by the sockets
 
-    def attach(self, outlet: Outlet, key: bytes, request: AttachKey) -> None:
+    def attach(self, pub_socket: PubSocket, key: bytes, request: AttachKey) -> None:
         """Take a reader in."""
         if key in self.readers or self.closed:
             return
         if len(self.readers) >= READERS_MAX:
             if not self._crowded:
-                self._outlets.note(f"{self._topic}: has {READERS_MAX} subscribers, further ones are refused")
+                self._pub_sockets.note(
+                    f"{self._topic}: has {READERS_MAX} subscribers, further ones are refused"
+                )
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
         sequence = self._gate.sequence
-        reader = self.readers[key] = Reader(key, request, outlet)
-        if request.shared_memory and outlet.local:
+        reader = self.readers[key] = Reader(key, request, pub_socket)
+        if request.shared_memory and pub_socket.local:
             self.ring.admit(reader, sequence)
         self.route()
         answer = answer_frame(key, AttachAnswer(sequence, self.latched))
-        if outlet.strict:
-            if not outlet.try_send(answer):
-                outlet.send_anyway(answer)
+        if pub_socket.strict:
+            if not pub_socket.try_send(answer):
+                pub_socket.send_anyway(answer)
         else:
-            outlet.send(answer, DONTWAIT)
+            pub_socket.send(answer, DONTWAIT)
 
-    def detach(self, outlet: Outlet, request: AttachKey) -> None:
+    def detach(self, pub_socket: PubSocket, request: AttachKey) -> None:
         """Let a reader go."""
         for key, reader in self.readers.items():
-            if reader.request.reader == request.reader and reader.outlet is outlet:
+            if reader.request.reader == request.reader and reader.pub_socket is pub_socket:
                 del self.readers[key]
                 self.ring.dismiss(reader)
-                self.late.pop(outlet, None)
+                self.late.pop(pub_socket, None)
                 self.route()
                 return
 
-    def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
+    def resume(self, pub_socket: PubSocket, reader: int, sequence: int) -> None:
         """A reader has accounted for all below a sequence."""
         for each in self.readers.values():
             if each.request.reader == reader:
                 each.confirmed = max(each.confirmed, sequence)
-        if sequence >= self.late.get(outlet, 0):  # else it was too late once more since
-            self.late.pop(outlet, None)
+        if sequence >= self.late.get(pub_socket, 0):  # else it was too late once more since
+            self.late.pop(pub_socket, None)
             self.route()
 
     def route(self) -> None:
         """Work out where messages go, when readers or what is sent have changed."""
         readers = self.readers.values()
-        outlets = {reader.outlet for reader in readers if reader.member is None}
-        sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
+        pub_sockets = {reader.pub_socket for reader in readers if reader.member is None}
+        sends: list[Callable[..., Any]] = [
+            pub_socket.send for pub_socket in pub_sockets if not pub_socket.strict
+        ]
         self._lossy_sends = tuple(sends)
-        self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
+        self._strict_sockets = tuple(pub_socket for pub_socket in pub_sockets if pub_socket.strict)
         usual = not (self.latching or self.late or self.ring.has_lost)
-        retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
+        retries = {pub_socket.send: self._retry_strict(pub_socket) for pub_socket in self._strict_sockets}
         self._retries = retries | self.ring.sends
         self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
-        self._gate.ring = self.ring.short_cut if usual and not outlets else None
+        self._gate.ring = self.ring.short_cut if usual and not pub_sockets else None
 
     @property
     def has_sockets(self) -> bool:
         """Whether somebody reads through a socket."""
-        return bool(self._lossy_sends or self._strict_outlets)
+        return bool(self._lossy_sends or self._strict_sockets)
 
     def tick(self, now_ns: int) -> None:
         """Let go of what was sent, and tell readers how many messages there were; called now and then."""
@@ -184,11 +188,11 @@ class Fanout:
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
         on_time = not (self.late or self.ring.has_lost)
-        for outlet in self._strict_outlets:
+        for pub_socket in self._strict_sockets:
             try:
-                outlet.send(frame, DONTWAIT)
+                pub_socket.send(frame, DONTWAIT)
             except zmq.Again:
-                on_time &= self.send_strict(outlet, frame, 0)
+                on_time &= self.send_strict(pub_socket, frame, 0)
         on_time &= self.ring.send(frame)
         if not on_time:
             self.timeouts += 1
@@ -211,8 +215,8 @@ class Fanout:
         if self.latching:
             self.latched = self._large_head + rest + body
         on_time = not (self.late or self.ring.has_lost)
-        for outlet in {r.outlet for r in self.readers.values() if r.member is None}:
-            on_time &= self._send_body(outlet, self._large_head + rest, body)
+        for pub_socket in {r.pub_socket for r in self.readers.values() if r.member is None}:
+            on_time &= self._send_body(pub_socket, self._large_head + rest, body)
         if slot is None:
             on_time &= self.ring.send(self._message_head + rest + body)
         else:
@@ -223,26 +227,28 @@ class Fanout:
         self.timeouts += not on_time
         return on_time
 
-    def _send_body(self, outlet: Outlet, head: bytes, body: memoryview) -> bool:
+    def _send_body(self, pub_socket: PubSocket, head: bytes, body: memoryview) -> bool:
         """Send header and body through a socket; False if a reliable reader lost the message."""
 
         def has_room() -> bool:
-            return self._large.has_room(outlet, body.nbytes)
+            return self._large.has_room(pub_socket, body.nbytes)
 
-        if not has_room() and not (outlet.strict and self._await_room(has_room, self._timeout_s(outlet))):
+        if not has_room() and not (
+            pub_socket.strict and self._await_room(has_room, self._timeout_s(pub_socket))
+        ):
             self.skipped += 1
-            return not outlet.strict
+            return not pub_socket.strict
         on_time = True
-        if outlet.strict:
-            on_time = self.send_strict(outlet, head, SNDMORE)
+        if pub_socket.strict:
+            on_time = self.send_strict(pub_socket, head, SNDMORE)
         else:
-            outlet.send(head, DONTWAIT | SNDMORE)
-        self._large.send(outlet, body)
+            pub_socket.send(head, DONTWAIT | SNDMORE)
+        self._large.send(pub_socket, body)
         return on_time
 
-    def _timeout_s(self, outlet: Outlet) -> float:
+    def _timeout_s(self, pub_socket: PubSocket) -> float:
         """How long the readers of a socket may hold us up [s]."""
-        readers = (r for r in self.readers.values() if r.outlet is outlet and r.member is None)
+        readers = (r for r in self.readers.values() if r.pub_socket is pub_socket and r.member is None)
         return max((reader.timeout_s for reader in readers), default=0.0)
 
     def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
@@ -253,20 +259,20 @@ class Fanout:
             self.timeouts += 1
         return on_time
 
-    def _retry_strict(self, outlet: Outlet) -> Callable[[bytes], bool]:
-        return lambda frame: self.send_strict(outlet, frame, 0)
+    def _retry_strict(self, pub_socket: PubSocket) -> Callable[[bytes], bool]:
+        return lambda frame: self.send_strict(pub_socket, frame, 0)
 
-    def send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
-        """Send through a strict outlet, waiting for its slowest reader; False if that one lost the frame."""
+    def send_strict(self, pub_socket: PubSocket, frame: bytes, flags: int) -> bool:
+        """Send through a strict socket, waiting for its slowest reader; False if that one lost the frame."""
 
         def send() -> bool:
-            return outlet.try_send(frame, flags)
+            return pub_socket.try_send(frame, flags)
 
-        if send() or self._await_room(send, self._timeout_s(outlet)):
+        if send() or self._await_room(send, self._timeout_s(pub_socket)):
             return True
-        self.late[outlet] = self._gate.sequence
+        self.late[pub_socket] = self._gate.sequence
         self.route()
-        outlet.send_anyway(frame, flags)
+        pub_socket.send_anyway(frame, flags)
         return False
 
     def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
@@ -274,7 +280,7 @@ class Fanout:
         if self._patience.wait_for(send, timeout_s):
             return True
         if not self.timeouts:
-            self._outlets.note(f"{self._topic}: a reliable subscriber was too late and lost a message")
+            self._pub_sockets.note(f"{self._topic}: a reliable subscriber was too late and lost a message")
         return False
 
     # Telling readers how many messages there have been
@@ -288,15 +294,15 @@ class Fanout:
         frame = self._news(self._gate.sequence)
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        for outlet in self._strict_outlets:
-            outlet.try_send(frame)
+        for pub_socket in self._strict_sockets:
+            pub_socket.try_send(frame)
         self.ring.offer(frame)
 
     def stop(self) -> None:
         """Take in no reader any more, and end the ring; `finish` follows."""
         self.closed = True
         self.ring.end(self._news(self._gate.sequence))
-        self._untold = list(self._strict_outlets)
+        self._untold = list(self._strict_sockets)
 
     def finish(self, waited_s: float, linger_s: float) -> bool:
         """Tell each reader of a socket which sequence would come next; called again and again.
@@ -314,11 +320,11 @@ class Fanout:
             self._tell_again_s = waited_s + TELL_AGAIN_S
             self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
             # A lossy socket drops it where a queue is full, and does not say so.
-            for outlet in {r.outlet for r in self.readers.values() if self._owes(r)} - {
-                *self._strict_outlets
+            for pub_socket in {r.pub_socket for r in self.readers.values() if self._owes(r)} - {
+                *self._strict_sockets
             }:
-                outlet.send(last, DONTWAIT)
-        behind = [r for r in self.readers.values() if r.outlet in self._untold or self._owes(r)]
+                pub_socket.send(last, DONTWAIT)
+        behind = [r for r in self.readers.values() if r.pub_socket in self._untold or self._owes(r)]
         return not (self._untold or behind) or waited_s >= max([linger_s, *(r.timeout_s for r in behind)])
 
     def _owes(self, reader: Reader) -> bool:
@@ -329,11 +335,11 @@ class Fanout:
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""
         sequence = self._gate.sequence
-        for outlet in self._untold:
-            outlet.send_anyway(self._news(sequence))
-        count = sum(reader.outlet.strict and self._owes(reader) for reader in self.readers.values())
+        for pub_socket in self._untold:
+            pub_socket.send_anyway(self._news(sequence))
+        count = sum(reader.pub_socket.strict and self._owes(reader) for reader in self.readers.values())
         if count:
-            self._outlets.note(
+            self._pub_sockets.note(
                 f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"
             )
 

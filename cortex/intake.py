@@ -12,8 +12,8 @@ import zmq
 from cortex.codec import Codec, MalformedMessage
 from cortex.inlet import make_inlet
 from cortex.link import Item, Link, make
-from cortex.outlet import DONTWAIT
 from cortex.policy import Policy
+from cortex.pub_socket import DONTWAIT
 from cortex.stats import SubscriberCounters, note_latency
 from cortex.turn import Turn
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST
@@ -39,6 +39,8 @@ class Intake:
         """The short way past all this."""
         self.drained_ns = 0
         """When the sockets were last read as a whole."""
+        self.leaving: dict[Link, int] = {}
+        """Links of publishers that have left, and when they are closed, on the monotonic clock."""
         self._policy = policy
         self._counters = counters
         self._turn = turn
@@ -164,6 +166,59 @@ class Intake:
             except MalformedMessage as error:
                 link.reject(str(error))
 
+    def take_all(self, messages: deque[Any], items: deque[Item], *, block: bool) -> int:
+        """Take what has arrived: decoded into `messages` where that is quicker, the rest into `items`.
+
+        Args:
+            messages: Where decoded messages are appended.
+            items: Where the others are.
+            block: Wait up to `BLOCK_S` for the first if there is one socket only.
+
+        Returns:
+            How many there were.
+        """
+        if self._policy.reliable or self._policy.depth >= DRAIN_MAX:
+            if not self.queue:
+                self.drain_decoded(messages, may_wait=block)
+        else:
+            if block and not self.queue:
+                self.receive_one(block=True)
+            self.drain()
+        items.extend(self.queue)
+        self.queue.clear()
+        received = len(messages) + len(items)
+        self._counters.received += received
+        return received
+
+    def leave(self, source: int, until_ns: int) -> bool:
+        """A publisher has left: read what is still on its way until then; False if it is not here."""
+        left = [link for link in self.links if link.source == source and link not in self.leaving]
+        for link in left:
+            self.leaving[link] = until_ns
+            link.leave()
+            self.inlet.exhausted = False
+        return bool(left)
+
+    def revive(self, source: int) -> bool:
+        """A publisher that had left is back; False if its connection is gone."""
+        found = [link for link in self.leaving if link.source == source]
+        for link in found:
+            del self.leaving[link]
+        return bool(found)
+
+    def end_overdue(self, now_ns: int) -> bool:
+        """Close the links whose time is over, a reliable subscriber's once all is read; whether any was."""
+        overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns]
+        if overdue and self._policy.reliable:  # what is on its way stays there until there is room for it
+            unread = self.drain()
+            overdue = [link for link in overdue if link not in unread]
+        for link in overdue:
+            link.end()
+            link.close()
+            self.links.remove(link)
+            del self.leaving[link]
+        return bool(overdue)
+
     def gather(self, codec: Codec) -> np.ndarray | None:
         """The plain messages of a type that wait in the sockets, as one array; None if there are none."""
         for link in self._rotated():
@@ -186,6 +241,19 @@ class Intake:
             if frame is not None:
                 return None
         return None
+
+    def join(self, codec: Codec, item: Item) -> np.ndarray:
+        """All messages that wait, this one first, as one array. The lock is not held."""
+        bodies = [_record(codec, item)]
+        with self._turn:
+            if self._policy.reliable:  # else that was done for the first
+                self.drain()
+            while self.queue:
+                bodies.append(_record(codec, self.queue.popleft()))
+                self._counters.received += 1
+        if any(len(body) != codec.fixed_size for body in bodies):
+            raise MalformedMessage(f"a body that has not the {codec.fixed_size} bytes of its type")
+        return np.frombuffer(b"".join(bodies), codec.record_dtype)
 
     def accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
         """Put the message of a frame into the queue."""
@@ -228,3 +296,11 @@ class Intake:
         if not self._policy.reliable and len(queue) > depth:
             queue.popleft()
             self._counters.overtaken += 1
+
+
+def _record(codec: Codec, item: Item) -> Any:
+    """The body of a message, as one of this type."""
+    if item.link.codec is codec:
+        return item.buffer[item.offset : item.offset + item.size]
+    message = item.link.codec.decode(item.buffer, item.offset, item.size)
+    return codec.encode(message, codec.fixed_size or 0)

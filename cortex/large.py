@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import zmq
 
-from cortex.outlet import Outlet
+from cortex.pub_socket import PubSocket
 
 PRIVATE_BYTES = 64 << 20
 """Most bytes of bodies that wait to be sent through lossy sockets, and through strict ones."""
@@ -20,30 +20,30 @@ class _Body(NamedTuple):
 
 
 class LargeSender:
-    """Bodies of one publisher that its sockets still read. The caller holds the outlets' lock."""
+    """Bodies of one publisher that its sockets still read. The caller holds the sockets' lock."""
 
     def __init__(self) -> None:
         self._waiting: deque[_Body] = deque()
         self.waiting_bytes = {False: 0, True: 0}
         """Bytes that wait, of lossy and of strict sockets."""
 
-    def has_room(self, outlet: Outlet, size: int) -> bool:
+    def has_room(self, pub_socket: PubSocket, size: int) -> bool:
         """Whether so many bytes more may wait."""
         if self._waiting:
             self.prune()
-        return self.waiting_bytes[outlet.strict] + size <= max(PRIVATE_BYTES, 4 * size)
+        return self.waiting_bytes[pub_socket.strict] + size <= max(PRIVATE_BYTES, 4 * size)
 
-    def send(self, outlet: Outlet, body: memoryview) -> None:
+    def send(self, pub_socket: PubSocket, body: memoryview) -> None:
         """Send the body that follows a header; nobody writes there any more. Who took the header gets it."""
-        if outlet.strict:
-            outlet.socket.setsockopt(zmq.XPUB_NODROP, 0)
+        if pub_socket.strict:
+            pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 0)
         try:
-            tracker = outlet.lend(body)
+            tracker = pub_socket.send_uncopied(body)
         finally:
-            if outlet.strict:
-                outlet.socket.setsockopt(zmq.XPUB_NODROP, 1)
-        self._waiting.append(_Body(tracker, body.nbytes, outlet.strict))
-        self.waiting_bytes[outlet.strict] += body.nbytes
+            if pub_socket.strict:
+                pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 1)
+        self._waiting.append(_Body(tracker, body.nbytes, pub_socket.strict))
+        self.waiting_bytes[pub_socket.strict] += body.nbytes
 
     def prune(self) -> None:
         """Let go of what has been sent."""

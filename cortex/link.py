@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import secrets
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -60,6 +61,23 @@ class Item(NamedTuple):
     sequence: int
     stamp_ns: int
     publish_ns: int
+
+
+class Info(NamedTuple):
+    """What is known of a message besides its content."""
+
+    topic: str
+    source: int
+    """The publisher's number."""
+    sequence: int
+    stamp_ns: int | None
+    """The message's own time, if its type has one [ns]."""
+    publish_ns: int
+    """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
+    latency_ns: int
+    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
+    size: int
+    """Bytes of the body."""
 
 
 class Link:
@@ -376,6 +394,19 @@ class Link:
     def _close_end(self) -> None:
         if self._end is not None:
             self._end.close()
+
+    def info(self, item: Item) -> Info:
+        """What is known of a message of this publisher."""
+        publish_ns = item.publish_ns + self.clock_offset_ns
+        return Info(
+            self.record.topic,
+            self.source,
+            item.sequence,
+            item.stamp_ns if self._stamped else None,
+            publish_ns,
+            time.monotonic_ns() - publish_ns,
+            item.size,
+        )
 
     def schema(self) -> Schema:
         """The structure of this publisher's messages."""

@@ -7,7 +7,19 @@ costs less than 1 us.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any, TypeVar
+
+from cortex.context import Closed
+from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS
+from cortex.intake import Intake
+from cortex.wakeup import Wakeup
+
+T = TypeVar("T")
+monotonic_ns = time.monotonic_ns
+
+WAIT_MAX_S = 0.1
 
 
 class LoopReader:
@@ -101,3 +113,93 @@ class LoopReader:
 def _resolve(waiter: asyncio.Future[None]) -> None:
     if not waiter.done():
         waiter.set_result(None)
+
+
+class AsyncReceiver(AsyncIterator[T]):
+    """Takes the messages of one subscriber on a running loop, until it is closed.
+
+    Args:
+        intake: Reads its sockets.
+        wakeup: Wakes those that wait for it.
+        take: Takes the next message if it is there, else `NOTHING`.
+        watched: As of `LoopReader`.
+        generation: As of `LoopReader`.
+    """
+
+    def __init__(
+        self,
+        intake: Intake,
+        wakeup: Wakeup,
+        take: Callable[[], Any],
+        watched: Callable[[], tuple[int, list[int]]],
+        generation: Callable[[], int],
+    ) -> None:
+        self._inlet, self._queue = intake.inlet, intake.queue
+        self._wakeup = wakeup
+        self._take = take
+        self._watched = watched
+        self._generation = generation
+        self._reader: LoopReader | None = None
+
+    async def __anext__(self) -> T:
+        message: T = self._inlet.soon()
+        if message is not NOTHING:
+            return message
+        try:
+            found_nothing = self._inlet.is_open and self._inlet.exhausted and not self._queue
+            return await self._wait(None, look=not found_nothing)
+        except Closed:
+            raise StopAsyncIteration from None
+
+    async def receive(self, timeout_s: float | None) -> T:
+        """Take the next message.
+
+        Raises:
+            TimeoutError: None came in time.
+        """
+        self._inlet.left -= 1
+        if self._inlet.left >= 0 and monotonic_ns() < self._inlet.until_ns:
+            message: T = self._take()
+            if message is not NOTHING:
+                return message
+        return await self._wait(timeout_s, look=True)
+
+    async def _wait(self, timeout_s: float | None, *, look: bool) -> T:
+        """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
+        inlet = self._inlet
+        reader: LoopReader | None = None
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            if look and (inlet.left <= 0 or monotonic_ns() >= inlet.until_ns):  # others want to run, too
+                await asyncio.sleep(0)
+                inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+            message: T = self._take() if look else NOTHING
+            if message is not NOTHING:
+                return message
+            look = True
+            left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError
+            if self._queue or not inlet.exhausted:  # what came could not be read
+                await asyncio.sleep(0)
+                continue
+            if reader is None:  # not before: other tasks of the loop may have made it meanwhile
+                reader = self._reader_of_loop()
+            await reader.wait(min(left_s, WAIT_MAX_S))
+            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+
+    def _reader_of_loop(self) -> LoopReader:
+        reader = self._reader
+        if reader is None or reader.loop is not asyncio.get_running_loop():
+            self.stop()
+            reader = self._reader = LoopReader(self._watched, self._generation, self._on_wake)
+        return reader
+
+    def _on_wake(self, fd: int) -> None:
+        if fd == self._wakeup.fd:
+            self._wakeup.clear()
+
+    def stop(self) -> None:
+        """Leave the loop."""
+        if self._reader is not None:
+            self._reader.stop()

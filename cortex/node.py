@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import secrets
-import select
 import threading
 import time
 import weakref
@@ -23,11 +22,11 @@ from cortex.callbacks import CallbackThread
 from cortex.codec import MalformedMessage, codec_of
 from cortex.context import LINGER_MS, Closed, context
 from cortex.control import control_types
+from cortex.control_thread import ControlThread
 from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
 from cortex.liveliness import Liveliness, Watch
 from cortex.matching import Matcher
-from cortex.outlet import Outlets
 from cortex.overview import (
     TopicInfo,
     describe_publisher,
@@ -37,8 +36,9 @@ from cortex.overview import (
     subscriber_stats,
     topics_of,
 )
-from cortex.places import Places, clock_offset_ns
+from cortex.places import Places
 from cortex.policy import Policy, keep_last
+from cortex.pub_socket import PubSockets
 from cortex.publisher import COMMAND_MAX_WAIT_S, INLINE_MAX, MAX_WAIT_S, Publisher, close_publishers
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import NodeRecord, StatsReply, StatsRequest
@@ -47,7 +47,6 @@ from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number
 from cortex.subscriber import Subscriber
 from cortex.topic import check_pattern, check_topic, matches
-from cortex.wakeup import Wakeup
 from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
@@ -55,12 +54,6 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 Request = TypeVar("Request")
 Reply = TypeVar("Reply")
-
-TICK_MS = 20
-TICK_BUSY_MS = 2
-BUSY_NS = 300_000_000
-"""For so long after a change ticks are short, so that new peers meet quickly."""
-CLOCK_STEP_NS = 5_000_000
 
 _nodes: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -101,18 +94,16 @@ class Node:
         self.id = secrets.randbits(64) or 1
         self._pid = os.getpid()
         self._lock = threading.RLock()
-        self._outlets = Outlets()
+        self._pub_sockets = PubSockets()
         self._publishers: list[Publisher[Any]] = []
         self._subscribers: list[Subscriber[Any]] = []
         self._watches: list[Watch] = []
         self._clients: weakref.WeakSet[Client[Any, Any]] = weakref.WeakSet()
         self._callbacks = CallbackThread(name)
         self._server = Server(self._callbacks.submit)
-        self._wakeup = Wakeup()
-        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
-        self._clock_offset_ns = clock_offset_ns()
+        self._control = ControlThread(name)
         self._closed = False
-        self._places = Places(self.domain, self.id, self._outlets, listen, keys=keys, insecure=insecure)
+        self._places = Places(self.domain, self.id, self._pub_sockets, listen, keys=keys, insecure=insecure)
         self._host = host_id()  # once the runtime directory exists: it counts
         self._matcher = Matcher(self._host, keys, insecure=insecure)
         try:
@@ -127,17 +118,21 @@ class Node:
                 on_change=self._on_change,
             )
         except BaseException:
-            self._outlets.close()
+            self._pub_sockets.close()
             self._places.close()
             raise
         self._answers = Answers(
-            name, self._server, registry=self._directory.answer, stats=self._stats, wake=self._wake
+            name, self._server, registry=self._directory.answer, stats=self._stats, wake=self._control.wake
         )
-        self._thread = threading.Thread(target=self._run, name=f"{name} control", daemon=True)
-        self._thread.start()
+        self._control.start(
+            self._places,
+            self._directory,
+            self._answers,
+            self._pub_sockets,
+            publishers=lambda: list(self._publishers),
+            subscribers=lambda: list(self._subscribers),
+        )
         _nodes.add(self)
-
-    # What users call
 
     def publisher(
         self,
@@ -165,6 +160,7 @@ class Node:
         Raises:
             ValueError: The topic is not one, or `max_wait_s` is not 0 to 86400.
         """
+        self._check_open()
         if max_wait_s is None:
             is_command = message_type.__module__ == "cortex.messages.commands"
             max_wait_s = COMMAND_MAX_WAIT_S if is_command else MAX_WAIT_S
@@ -174,7 +170,7 @@ class Node:
             Publisher(
                 check_topic(topic),
                 codec_of(message_type),
-                self._open_outlets(),
+                self._pub_sockets,
                 latch=latch,
                 inline_max=inline_max,
                 expected_bytes=expected_bytes,
@@ -185,11 +181,12 @@ class Node:
 
     def raw_publisher(self, topic: str, schema: Schema, *, latch: bool = False) -> Publisher[RawMessage]:
         """Publish bodies that are encoded already; their type is known by its schema only."""
+        self._check_open()
         return self._add_publisher(
             Publisher(
                 check_topic(topic),
                 cast(Any, RawCodec(schema)),
-                self._open_outlets(),
+                self._pub_sockets,
                 latch=latch,
                 on_close=self._drop_publisher,
             )
@@ -368,11 +365,9 @@ class Node:
         for client in list(self._clients):
             client.close()
         self._callbacks.close()
-        self._wakeup.set()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
-        self._outlets.emit_notes()
-        self._outlets.close()
+        self._control.stop()
+        self._pub_sockets.emit_notes()
+        self._pub_sockets.close()
 
     def disown(self) -> None:
         """Give up in a forked child: threads and sockets are the parent's."""
@@ -389,17 +384,11 @@ class Node:
     ) -> None:
         self.close()
 
-    # Keeping track
-
     def _check_open(self) -> None:
         if self._pid != os.getpid():
             raise RuntimeError(f"node {self.name!r} belongs to the process that this one was forked from")
         if self._closed:
             raise Closed(f"node {self.name!r} is closed")
-
-    def _open_outlets(self) -> Outlets:
-        self._check_open()
-        return self._outlets
 
     def _add_publisher(self, publisher: Publisher[T]) -> Publisher[T]:
         with self._lock:
@@ -429,7 +418,7 @@ class Node:
     def _announce(self) -> None:
         if not self._closed:
             self._directory.announce()
-            self._hurry()
+            self._control.hurry()
             self._tell_watches()
 
     def _tell_watches(self) -> None:
@@ -439,15 +428,6 @@ class Node:
                 for watch in self._watches:
                     for change in watch.changes(records):
                         self._callbacks.submit(partial(watch.tell, change))
-
-    def _wake(self) -> None:
-        """Have the control thread look at once, unless it is that which calls."""
-        if threading.current_thread() is not self._thread:
-            self._wakeup.set()
-
-    def _hurry(self) -> None:
-        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
-        self._wakeup.set()
 
     def _record(self) -> NodeRecord:
         with self._lock:
@@ -460,7 +440,7 @@ class Node:
             self._host,
             self._pid,
             0,
-            self._clock_offset_ns,
+            self._control.clock_offset_ns,
             self._places.endpoints,
             publishers,
             subscribers,
@@ -478,13 +458,11 @@ class Node:
                 except Exception:  # one that cannot be connected must not take the others along
                     logger.exception("%s: cannot connect the subscriber of %s", self.name, subscriber.topic)
         self._tell_watches()
-        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
+        self._control.hurry()
 
     def _match(self, subscriber: Subscriber[Any]) -> None:
         """Connect a subscriber to the publishers of its topic, and let go of those that have left."""
-        directory = getattr(self, "_directory", None)
-        peers = list(directory.nodes.values()) if directory is not None else []
-        self._matcher.match(subscriber, self._record(), peers)
+        self._matcher.match(subscriber, self._record(), self._directory.nodes.values())
 
     def _find_service(self, name: str, number: int, expected: Schema) -> Place | None:
         place = self._matcher.find_service(name, number, expected, self._known().values())
@@ -504,71 +482,6 @@ class Node:
             [subscriber_stats(subscriber) for subscriber in subscribers],
             self.rejected + self._directory.rejected + self._server.rejected,
         )
-
-    # The control thread
-
-    def _run(self) -> None:
-        failures = 0
-        while not self._closed:
-            try:
-                self._step()
-            except Exception:  # heartbeats must go on whatever one of our many duties ran into
-                failures += 1
-                if failures & (failures - 1) == 0:
-                    logger.exception("%s: a step of the control thread failed (%d)", self.name, failures)
-                time.sleep(TICK_MS * 1e-3)
-        for end in (self._answers.send, self._directory.close, self._places.close):
-            try:
-                end()
-            except Exception:
-                logger.exception("%s: could not close in order", self.name)
-
-    def _step(self) -> None:
-        poller = zmq.Poller()
-        poller.register(self._wakeup.fd, zmq.POLLIN)
-        routers = self._places.routers
-        sockets = self._directory.sockets()
-        for socket in (*routers, *sockets):
-            poller.register(socket, zmq.POLLIN)
-        busy = time.monotonic_ns() < self._busy_until_ns
-        ready = dict(poller.poll(TICK_BUSY_MS if busy else TICK_MS))
-        if self._wakeup.fd in ready:
-            self._wakeup.clear()
-        for socket in routers:
-            if socket in ready:
-                self._answers.handle(socket)
-        for socket in sockets:
-            if socket in ready:
-                self._directory.handle(socket)
-        self._answers.send()
-        self._tick()
-
-    def _tick(self) -> None:
-        now_ns = time.monotonic_ns()
-        self._directory.tick(now_ns)
-        self._outlets.tick()
-        self._outlets.emit_notes()
-        offset_ns = clock_offset_ns()
-        if abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
-            self._clock_offset_ns = offset_ns  # somebody has set the clock: tell the others
-            self._directory.announce()
-        with self._lock:
-            publishers, subscribers = list(self._publishers), list(self._subscribers)
-        for publisher in publishers:
-            publisher.tick(now_ns)
-        self._top_up(subscribers, now_ns)
-
-    def _top_up(self, subscribers: list[Subscriber[Any]], now_ns: int) -> None:
-        poll, owners = select.poll(), {}
-        for subscriber in subscribers:
-            subscriber.dismiss(now_ns)
-            if subscriber.must_read:
-                subscriber.top_up(now_ns)
-            for fd in subscriber.fds():
-                owners[fd] = subscriber
-                poll.register(fd, select.POLLIN)
-        for subscriber in {owners[fd] for fd, _ in poll.poll(0)} if owners else ():
-            subscriber.top_up(now_ns)
 
 
 def _after_fork_in_child() -> None:

@@ -8,20 +8,20 @@ from collections.abc import Callable
 from types import TracebackType
 
 from cortex.gate import Gate
-from cortex.outlet import Backoff, Outlets
+from cortex.pub_socket import Backoff, PubSockets
 
 
 class Patience:
     """The waiting of one publisher. A block of it is the time of one message; the caller holds the lock.
 
     Args:
-        outlets: Whose lock it is; who has come and gone meanwhile is looked at after each sleep.
+        sockets: Whose lock it is; who has come and gone meanwhile is looked at after each sleep.
         gate: Lets no other message pass meanwhile.
         check_open: Raises once the publisher is closed.
     """
 
-    def __init__(self, outlets: Outlets, gate: Gate, check_open: Callable[[], None]) -> None:
-        self._outlets = outlets
+    def __init__(self, pub_sockets: PubSockets, gate: Gate, check_open: Callable[[], None]) -> None:
+        self._pub_sockets = pub_sockets
         self._gate = gate
         self._check_open = check_open
         self.until_s = math.inf
@@ -48,13 +48,13 @@ class Patience:
         Raises:
             Closed: The publisher was closed meanwhile.
         """
-        self._outlets.lock.release()
+        self._pub_sockets.lock.release()
         try:
             more = backoff.wait()
         finally:
-            self._outlets.lock.acquire()
+            self._pub_sockets.lock.acquire()
         self._check_open()
-        self._outlets.refresh()
+        self._pub_sockets.refresh()
         return more and not self.is_over()
 
     def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:

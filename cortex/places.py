@@ -13,7 +13,7 @@ import zmq
 from cortex.broadcast import Listener, make_listener
 from cortex.context import context, new_socket
 from cortex.host import NodeFiles
-from cortex.outlet import Outlets, open_outlet
+from cortex.pub_socket import PubSockets, open_pub_socket
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
 
@@ -31,7 +31,7 @@ class Places:
     Args:
         domain: The node's domain.
         node: The node's number.
-        outlets: Gets the XPUB sockets, and closes them.
+        sockets: Gets the XPUB sockets, and closes them.
         listen: Address of an interface; None: this host only.
         keys: For CURVE on tcp.
         insecure: Allow plain tcp beyond this host.
@@ -41,7 +41,7 @@ class Places:
         self,
         domain: int,
         node: int,
-        outlets: Outlets,
+        pub_sockets: PubSockets,
         listen: str | None,
         *,
         keys: Keys | None,
@@ -55,33 +55,33 @@ class Places:
             check_address(f"tcp://{_bracket(listen)}:0", keys=keys, insecure=insecure)
         self._files = NodeFiles(domain, node)
         try:
-            self._open_local(node, outlets)
+            self._open_local(node, pub_sockets)
             if listen is not None:
-                self._open_tcp(outlets, listen, keys)
+                self._open_tcp(pub_sockets, listen, keys)
         except BaseException:
-            outlets.close()
+            pub_sockets.close()
             self.close()
             raise
 
-    def _open_local(self, node: int, outlets: Outlets) -> None:
+    def _open_local(self, node: int, pub_sockets: PubSockets) -> None:
         path = self._files.endpoint
         listener = self._listener = make_listener(self._files.path("ring"))
         for role, strict in (("lossy", False), ("strict", True)):
-            outlets.add(open_outlet([path(role)], strict=strict, local=True, listener=listener))
+            pub_sockets.add(open_pub_socket([path(role)], strict=strict, local=True, listener=listener))
         router = self._router(tcp=False)
         router.bind(path("control"))
         self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
 
-    def _open_tcp(self, outlets: Outlets, listen: str, keys: Keys | None) -> None:
+    def _open_tcp(self, pub_sockets: PubSockets, listen: str, keys: Keys | None) -> None:
         secure: Secure | None = None
         if keys is not None:
             self._authenticator = Authenticator.acquire(context())
             secure = partial(apply_server, keys=keys)
         any_port = [f"tcp://{_bracket(listen)}:*"]
-        lossy = open_outlet(any_port, strict=False, local=False, secure=secure)
-        outlets.add(lossy)
-        strict = open_outlet(any_port, strict=True, local=False, secure=secure)
-        outlets.add(strict)
+        lossy = open_pub_socket(any_port, strict=False, local=False, secure=secure)
+        pub_sockets.add(lossy)
+        strict = open_pub_socket(any_port, strict=True, local=False, secure=secure)
+        pub_sockets.add(strict)
         router = self._router(tcp=True)
         if secure is not None:
             secure(router)

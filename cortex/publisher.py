@@ -18,8 +18,8 @@ from cortex.context import Closed
 from cortex.fanout import Fanout
 from cortex.gate import Gate, make_gate
 from cortex.loan import Loan
-from cortex.outlet import Backoff, Outlets
 from cortex.patience import Patience
+from cortex.pub_socket import Backoff, PubSockets
 from cortex.stats import PublisherCounters
 from cortex.wire import MESSAGE, REST, message_head
 
@@ -45,7 +45,7 @@ class Publisher(Generic[T]):
         self,
         topic: str,
         codec: Codec,
-        outlets: Outlets,
+        pub_sockets: PubSockets,
         *,
         latch: bool = False,
         inline_max: int = INLINE_MAX,
@@ -62,11 +62,11 @@ class Publisher(Generic[T]):
         self._stamp_of = codec.stamp_of
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
-        self._outlets = outlets
-        self._lock = outlets.lock
+        self._pub_sockets = pub_sockets
+        self._lock = pub_sockets.lock
         self._gate: Gate = make_gate(
             coder_of(codec, self._head),
-            outlets.lock,
+            pub_sockets.lock,
             slowly=self._publish_slowly,
             retry=lambda frame, send: self._fanout.retry(frame, send),
             limit=inline_max,
@@ -76,14 +76,14 @@ class Publisher(Generic[T]):
         self._large_lock = threading.Lock()
         self._gate.large_acquire = self._large_lock.acquire
         self._gate.large_release = self._large_lock.release
-        self._patience = Patience(outlets, self._gate, self._check_open)
+        self._patience = Patience(pub_sockets, self._gate, self._check_open)
         self._fanout = Fanout(
             topic,
             self.source,
             codec.fingerprint,
             stamped=stamped,
             gate=self._gate,
-            outlets=outlets,
+            pub_sockets=pub_sockets,
             patience=self._patience,
             latching=latch,
             max_wait_s=max_wait_s,
@@ -92,7 +92,7 @@ class Publisher(Generic[T]):
         self._on_close = on_close
         self._closing = False
         self._closed = False
-        outlets.register(self.source, self._fanout)
+        pub_sockets.register(self.source, self._fanout)
 
     def publish(self, message: T) -> bool:
         """Send a message; what it refers to may be changed or freed afterwards.
@@ -165,7 +165,7 @@ class Publisher(Generic[T]):
             RuntimeError: All slots are out on loan. Reliable readers that have not come to them are waited
                 for as by `publish`.
         """
-        loan = self._lend(dtypes, dims, may_wait=True)
+        loan = self._acquire_loan(dtypes, dims, may_wait=True)
         if loan is None:
             with self._lock:
                 self._skip()
@@ -187,9 +187,9 @@ class Publisher(Generic[T]):
         Returns:
             The message; None if there is no slot for it now.
         """
-        return self._lend(dtypes, dims, may_wait=False)
+        return self._acquire_loan(dtypes, dims, may_wait=False)
 
-    def _lend(
+    def _acquire_loan(
         self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
     ) -> Loan | None:
         size = self.codec.draft_size(dims, dtypes)
@@ -216,7 +216,7 @@ class Publisher(Generic[T]):
     def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
         """Send a message that was written on loan; returns and raises as `Loan.publish`."""
         if message is not None and slot is not None and self.codec.drafts_by_tail:
-            sent = self._send_lent(message, slot)
+            sent = self._send_loaned(message, slot)
             if sent is not None:
                 self.codec.seal(draft)
                 return sent
@@ -232,7 +232,7 @@ class Publisher(Generic[T]):
                 buffer[:size] = written[:size]
             return self._send_written(buffer, slot, size, stamp_ns, now_ns)
 
-    def _send_lent(self, message: Any, slot: Any) -> bool | None:
+    def _send_loaned(self, message: Any, slot: Any) -> bool | None:
         """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
         with self._lock:
             now_ns = monotonic_ns()
@@ -287,7 +287,7 @@ class Publisher(Generic[T]):
             self._sleep_unlocked()
         self._check_open()
         self._gate.refresh_ns = now_ns + REFRESH_NS
-        self._outlets.refresh_if_older(now_ns - REFRESH_NS)
+        self._pub_sockets.refresh_if_older(now_ns - REFRESH_NS)
 
     def _sleep_unlocked(self) -> None:
         self._lock.release()
@@ -324,8 +324,8 @@ class Publisher(Generic[T]):
     def subscriber_count(self) -> int:
         """Subscribers that are attached now."""
         with self._lock:
-            if not (self._closed or self._outlets.closed):
-                self._outlets.refresh()
+            if not (self._closed or self._pub_sockets.closed):
+                self._pub_sockets.refresh()
             return len(self._fanout.readers)
 
     def wait_for_subscribers(self, count: int = 1, timeout_s: float = 5.0) -> bool:
@@ -375,7 +375,7 @@ class Publisher(Generic[T]):
         with self._lock:
             self._patience.until_s = min(self._patience.until_s, by_s)
             try:
-                if not self._outlets.closed and not self._patience.is_waiting:
+                if not self._pub_sockets.closed and not self._patience.is_waiting:
                     self._fanout.tell()
             finally:
                 self._closed = True
@@ -385,18 +385,18 @@ class Publisher(Generic[T]):
     def _is_finished(self, waited_s: float, linger_s: float) -> bool:
         """Whether nobody is worth waiting for any more; writes what there is room for."""
         with self._lock:
-            if self._outlets.closed:
+            if self._pub_sockets.closed:
                 return True
-            self._outlets.refresh()
+            self._pub_sockets.refresh()
             return self._fanout.finish(waited_s, linger_s)
 
     def _end(self) -> None:
         """Let go of everything."""
         with self._lock:
-            if not self._outlets.closed:
+            if not self._pub_sockets.closed:
                 self._fanout.give_up()
             self._fanout.close()
-        self._outlets.unregister(self.source)
+        self._pub_sockets.unregister(self.source)
         if self._on_close is not None:
             self._on_close(self)
 

@@ -200,7 +200,9 @@ class Schema:
                 f"{self.name} has {_count_nodes(self)} fields, enum values and dimensions with those of "
                 f"nested types, allowed are {MAX_NODES}"
             )
-        _check_fixed_size(self.name, _block_size(self))
+        from cortex.layout import block_size  # it needs the records of this module
+
+        _check_fixed_size(self.name, block_size(self))
         if len(self._text.encode()) > MAX_TEXT_BYTES:
             raise SchemaError(f"{self.name}: the schema is longer than {MAX_TEXT_BYTES} bytes")
 
@@ -340,12 +342,6 @@ def _check_fixed_size(what: str, size: int) -> None:
         raise SchemaError(f"{what}: a fixed part of {size} bytes, allowed are {MAX_FIXED_BYTES}")
 
 
-def _block_size(schema: Schema) -> int:
-    from cortex.layout import block_size  # it needs the records of this module
-
-    return block_size(schema)
-
-
 def _count_nodes(kind: FieldType) -> int:
     if isinstance(kind, (OptionalType, ListType)):
         return _count_nodes(kind.item)
@@ -462,9 +458,8 @@ def type_from_schema(schema: Schema) -> type:
             _classes.move_to_end(key)
             return _classes[key]
     bindings = tuple(_binding(field.type) for field in schema.fields)
-    hints = [_python_type(field.type, bound) for field, bound in zip(schema.fields, bindings, strict=True)]
     short_name = re.split(r"[./]", schema.name)[-1] or "Message"
-    created = make_class(short_name, [field.name for field in schema.fields], hints)
+    created = make_class(short_name, [field.name for field in schema.fields])
     attach_schema(created, schema, bindings)
     with _classes_lock:
         created = _classes.setdefault(key, created)
@@ -501,17 +496,3 @@ def _binding(kind: FieldType) -> Any:
     if isinstance(kind, (OptionalType, ListType)):
         return _binding(kind.item)
     return None
-
-
-def _python_type(kind: FieldType, bound: Any) -> Any:
-    if isinstance(kind, str):
-        if kind in ("str", "bytes", "bool"):
-            return {"str": str, "bytes": bytes, "bool": bool}[kind]
-        return float if kind.startswith("float") else int
-    if isinstance(kind, ArrayType):
-        return np.ndarray
-    if isinstance(kind, OptionalType):
-        return _python_type(kind.item, bound) | None
-    if isinstance(kind, ListType):
-        return list[_python_type(kind.item, bound)]  # type: ignore[misc]  # a class made at run time
-    return bound

@@ -15,13 +15,12 @@ _MAX_SHOWN_ITEMS = 8
 _MAX_SHOWN_TEXT = 64
 
 
-def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> type[Any]:
+def make_class(name: str, field_names: Sequence[str]) -> type[Any]:
     """Build a frozen class with slots for field names that came over the wire, without generating code.
 
     Args:
         name: Name of the class.
         field_names: Valid identifiers; keywords are fine.
-        hints: The annotation of each field.
     """
     names = tuple(field_names)
 
@@ -35,7 +34,7 @@ def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> t
 
     namespace: dict[str, Any] = {
         "__slots__": names,
-        "__annotations__": dict(zip(names, hints, strict=True)),
+        "__annotations__": dict.fromkeys(names, object),
         "__module__": __name__,
         "__doc__": f"The message type {name}, made from a schema.",
         "__init__": init,

@@ -1,30 +1,29 @@
 """Subscribing: a bounded queue per subscriber, read by a callback, a blocking iterator or asyncio.
 
 The three share one path, which reads the socket where the message is wanted; there is no thread between
-socket and user. `cortex bench receive` prints what each costs: at 40 B 0.60 to 0.65 us of CPU a message and
-1.4 to 1.5 M messages a second for all three, so choose by taste. A callback runs on the node's callback
-thread, `async for` on the running loop, whose other tasks get a turn after a millisecond.
+socket and user. A callback runs on the node's callback thread, `async for` on the running loop, whose other
+tasks get a turn after a millisecond. `cortex bench receive` prints what each costs.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import select
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import AsyncIterator, Callable, Iterator
+from functools import partial
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
-from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, Inlet
+from cortex.inlet import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
-from cortex.link import BLOCK_MS, Item, Link
-from cortex.loop_reader import LoopReader
+from cortex.link import BLOCK_MS, Info, Item, Link
+from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver
 from cortex.policy import Policy
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
@@ -42,27 +41,9 @@ TOP_UP_NS = 20_000_000
 """A subscriber that nobody has read for so long is read by the node's control thread."""
 LOOK_EVERY = 64
 """After a look in vain, every so many calls of `look_out` one looks again."""
-WAIT_MAX_S = 0.1
 BLOCK_S = BLOCK_MS * 1e-3
 LEAVING_NS = 2_000_000_000
 """How long the connection to a publisher that has left is kept, for what is still on its way."""
-
-
-class Info(NamedTuple):
-    """What is known of a message besides its content."""
-
-    topic: str
-    source: int
-    """The publisher's number."""
-    sequence: int
-    stamp_ns: int | None
-    """The message's own time, if its type has one [ns]."""
-    publish_ns: int
-    """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
-    latency_ns: int
-    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
-    size: int
-    """Bytes of the body."""
 
 
 class Subscriber(Generic[T]):
@@ -85,13 +66,13 @@ class Subscriber(Generic[T]):
         self._turn = Turn()
         self._lock = self._turn.lock
         self.wakeup = Wakeup()
-        self._leaving: dict[Link, int] = {}
         self._problems: deque[Exception] = deque()
         self._intake = Intake(policy, self.counters, self._turn)
         self._links, self._queue, self._inlet = self._intake.links, self._intake.queue, self._intake.inlet
+        self._leaving = self._intake.leaving
         self._on_close = on_close
         self._closed = False
-        self._reader: LoopReader | None = None
+        self._async_receiver: AsyncReceiver[T] | None = None
         self._generation = 0
         self._raised = 0
         self.refused: set[int] = set()
@@ -154,7 +135,9 @@ class Subscriber(Generic[T]):
 
     def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
         """Take the next message, and what is known of it; see `recv`."""
-        pair: tuple[T, Info] = self._receive(timeout_s, lambda item: (self._decode(item), self._info(item)))
+        pair: tuple[T, Info] = self._receive(
+            timeout_s, lambda item: (self._decode(item), item.link.info(item))
+        )
         return pair
 
     def recv_raw(self, timeout_s: float | None = None) -> tuple[Info, bytes | np.ndarray, Schema]:
@@ -162,7 +145,7 @@ class Subscriber(Generic[T]):
 
         def raw(item: Item) -> tuple[Info, bytes | np.ndarray, Schema]:
             body = item.buffer[item.offset : item.offset + item.size]
-            return self._info(item), body, item.link.schema()
+            return item.link.info(item), body, item.link.schema()
 
         found: tuple[Info, bytes | np.ndarray, Schema] = self._receive(timeout_s, raw)
         return found
@@ -183,7 +166,7 @@ class Subscriber(Generic[T]):
             simple = not (self._queue or self._closed or self._problems) and self.policy.reliable
             records = self._intake.gather(self.codec) if simple else None
         if records is None:
-            records = self._receive(timeout_s, self._join)
+            records = self._receive(timeout_s, partial(self._intake.join, self.codec))
         return records
 
     def __iter__(self) -> Iterator[T]:
@@ -192,7 +175,7 @@ class Subscriber(Generic[T]):
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
-        return _Arrivals(self._inlet, self._recv_until_closed)
+        return self._receiver_of_loops()
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
@@ -200,49 +183,19 @@ class Subscriber(Generic[T]):
         A message that is there is returned without a switch of tasks, for up to a millisecond or 1024
         messages; then other tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
-        message: T
-        if self._may_go_on() and (message := self._take_now()) is not NOTHING:
-            return message
-        return await self._wait_async(timeout_s, look=True)
+        try:
+            return await self._receiver_of_loops().receive(timeout_s)
+        except TimeoutError:
+            error = self._nothing_came(timeout_s)
+        raise error
 
-    async def _wait_async(self, timeout_s: float | None, *, look: bool) -> T:
-        """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
-        inlet = self._inlet
-        reader: LoopReader | None = None
-        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            if look and (inlet.left <= 0 or monotonic_ns() >= inlet.until_ns):  # others want to run, too
-                await asyncio.sleep(0)
-                inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
-            message: T = self._take_now() if look else NOTHING
-            if message is not NOTHING:
-                return message
-            look = True
-            left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
-            if left_s <= 0.0:
-                raise self._nothing_came(timeout_s)
-            if self._queue or not inlet.exhausted:  # what came could not be read
-                await asyncio.sleep(0)
-                continue
-            if (
-                reader is None
-            ):  # not before: other tasks of the loop, which share it, may have made it meanwhile
-                reader = self._reader_of_loop()
-            await reader.wait(min(left_s, WAIT_MAX_S))
-            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
-
-    def _reader_of_loop(self) -> LoopReader:
-        reader = self._reader
-        if reader is None or reader.loop is not asyncio.get_running_loop():
-            if reader is not None:
-                reader.stop()
-            reader = self._reader = LoopReader(self._watched, lambda: self._generation, self._on_wake)
-        return reader
-
-    def _may_go_on(self) -> bool:
-        """Whether an asyncio task may take one more message before other tasks get a turn."""
-        self._inlet.left -= 1
-        return self._inlet.left >= 0 and monotonic_ns() < self._inlet.until_ns
+    def _receiver_of_loops(self) -> AsyncReceiver[T]:
+        """What serves asyncio, made when wanted: it refers back to us, which delays our end."""
+        if self._async_receiver is None:
+            self._async_receiver = AsyncReceiver(
+                self._intake, self.wakeup, self._take_now, self._watched, lambda: self._generation
+            )
+        return self._async_receiver
 
     def _take_now(self) -> Any:
         """Take the next message if it is there; `NOTHING` if not, or if it could not be read."""
@@ -253,12 +206,9 @@ class Subscriber(Generic[T]):
                 message = self._open(item, self._decode)
         return message
 
-    async def _recv_until_closed(self) -> T:
-        try:
-            found_nothing = self._inlet.is_open and self._inlet.exhausted and not self._queue
-            return await self._wait_async(None, look=not found_nothing)
-        except Closed:
-            raise StopAsyncIteration from None
+    def _watched(self) -> tuple[int, list[int]]:
+        with self._turn:
+            return self._generation, [self.wakeup.fd, *(fd for link in self._links for fd in link.fds)]
 
     def _nothing_came(self, timeout_s: float | None) -> TimeoutError:
         """What to raise when no message came in time: if all publishers have another type, that is why."""
@@ -270,14 +220,6 @@ class Subscriber(Generic[T]):
             return error
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
         return TimeoutError(f"{self.topic}: no message within {timeout_s} s{others}")
-
-    def _watched(self) -> tuple[int, list[int]]:
-        with self._turn:
-            return self._generation, [self.wakeup.fd, *(fd for link in self._links for fd in link.fds)]
-
-    def _on_wake(self, fd: int) -> None:
-        if fd == self.wakeup.fd:
-            self.wakeup.clear()
 
     def _receive(self, timeout_s: float | None, use: Callable[[Item], Any]) -> Any:
         if self.callback is not None:
@@ -339,44 +281,6 @@ class Subscriber(Generic[T]):
         message: T = item.link.codec.decode(item.buffer, item.offset, item.size)
         return message
 
-    def _info(self, item: Item) -> Info:
-        publish_ns = item.publish_ns + item.link.clock_offset_ns
-        return Info(
-            item.link.record.topic,
-            item.link.source,
-            item.sequence,
-            item.stamp_ns if item.link.codec.stamp_of is not None else None,
-            publish_ns,
-            monotonic_ns() - publish_ns,
-            item.size,
-        )
-
-    def _join(self, item: Item) -> np.ndarray:
-        """All messages that wait, this one first, as one array."""
-        assert self.codec is not None
-        fixed, dtype = self.codec.fixed_size, self.codec.record_dtype
-        assert fixed is not None
-        assert dtype is not None
-        bodies: list[Any] = [self._record(item, item.buffer)]
-        with self._turn:
-            if self.policy.reliable:  # else that was done for the first
-                self._intake.drain()
-            while self._queue:
-                more = self._queue.popleft()
-                bodies.append(self._record(more, more.buffer))
-                self.counters.received += 1
-        if any(len(body) != fixed for body in bodies):
-            raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
-        return np.frombuffer(b"".join(bodies), dtype)
-
-    def _record(self, item: Item, buffer: bytes | np.ndarray) -> Any:
-        """The body of a message, in our type."""
-        if item.link.codec is self.codec or self.codec is None:
-            return buffer[item.offset : item.offset + item.size]
-        return self.codec.encode(
-            item.link.codec.decode(buffer, item.offset, item.size), self.codec.fixed_size or 0
-        )
-
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
         with self._turn:
@@ -417,18 +321,7 @@ class Subscriber(Generic[T]):
             problems: deque[Exception] = deque()
             if self._problems:
                 problems, self._problems = self._problems, problems
-            if self.policy.reliable or self.policy.depth >= DRAIN_MAX:
-                if not self._queue:
-                    self._intake.drain_decoded(messages, may_wait=block)
-            else:
-                if block and not self._queue:
-                    self._intake.receive_one(block=True)
-                self._intake.drain()
-            if self._queue:
-                items.extend(self._queue)
-                self._queue.clear()
-            received = len(messages) + len(items)
-            self.counters.received += received
+            received = self._intake.take_all(messages, items, block=block)
             more = not self._inlet.exhausted or (block and received > 0)
         for problem in problems:
             logger.error("%s", problem)
@@ -534,11 +427,7 @@ class Subscriber(Generic[T]):
     def revive(self, source: int) -> bool:
         """A publisher that had left is back: keep its connection; False if there is none. For the node."""
         with self._turn:
-            for link in list(self._leaving):
-                if link.source == source:
-                    del self._leaving[link]
-                    return True
-        return False
+            return self._intake.revive(source)
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node.
@@ -546,12 +435,8 @@ class Subscriber(Generic[T]):
         A reliable subscriber disconnects once it has read all of it, however long its user takes.
         """
         with self._turn:
-            for link in self._links:
-                if link.source == source and link not in self._leaving:
-                    self._leaving[link] = monotonic_ns() + LEAVING_NS
-                    link.leave()
-                    self._inlet.exhausted = False
-                    self.wakeup.set()
+            if self._intake.leave(source, monotonic_ns() + LEAVING_NS):
+                self.wakeup.set()
 
     def complain(self, problem: TypeMismatch) -> None:
         """A publisher cannot be connected; the user hears of it at the next `recv`."""
@@ -580,26 +465,12 @@ class Subscriber(Generic[T]):
         """Close the connections to publishers that have left long enough ago; for the node."""
         if self._leaving and self._lock.acquire(blocking=False):
             try:
-                if not self._closed:
-                    self._dismiss(now_ns)
+                if not self._closed and self._intake.end_overdue(now_ns):
+                    self._links_changed()
+                if self._queue:
+                    self.wakeup.set()
             finally:
                 self._lock.release()
-
-    def _dismiss(self, now_ns: int) -> None:
-        """Close connections whose time is over; the lock is held."""
-        for link, deadline_ns in list(self._leaving.items()):
-            if now_ns >= deadline_ns:
-                if self.policy.reliable:  # what is on its way stays there until there is room for it
-                    unread = self._intake.drain()
-                    if self._queue:
-                        self.wakeup.set()
-                    if link in unread:
-                        continue
-                link.end()
-                link.close()
-                self._links.remove(link)
-                del self._leaving[link]
-                self._links_changed()
 
     def disown(self) -> None:
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
@@ -619,8 +490,8 @@ class Subscriber(Generic[T]):
             links = list(self._links)
             self._links.clear()
             self._leaving.clear()
-        if self._reader is not None:
-            self._reader.stop()
+        if self._async_receiver is not None:
+            self._async_receiver.stop()
         for link in links:
             link.close()
         self.wakeup.set()
@@ -648,13 +519,3 @@ class _Messages(Generic[T]):
             return self._subscriber.recv()
         except Closed:
             raise StopIteration from None
-
-
-class _Arrivals(AsyncIterator[T]):
-    def __init__(self, inlet: Inlet, wait: Callable[[], Coroutine[Any, Any, T]]) -> None:
-        self._inlet = inlet
-        self._wait = wait
-
-    async def __anext__(self) -> T:
-        message: T = self._inlet.soon()
-        return await self._wait() if message is NOTHING else message

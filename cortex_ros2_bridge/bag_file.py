@@ -14,7 +14,7 @@ import shutil
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rosbags import rosbag1, rosbag2
@@ -43,12 +43,8 @@ class BagError(ValueError):
     """A bag is damaged, or a message of it cannot be used."""
 
 
-class _Way(NamedTuple):
-    """From a topic of Cortex to one of the bag."""
-
-    convert: Any
-    context: Context
-    publisher: BagPublisher
+_Way = tuple[Any, Context, BagPublisher]
+"""From a topic of Cortex to one of the bag: a conversion, its context, and what takes its messages."""
 
 
 class BagWriter:
@@ -83,11 +79,11 @@ class BagWriter:
         """
         if topic not in self._ways:
             self._ways[topic] = self._ways_of(topic, message, frame_id)
-        for way in self._ways[topic]:
-            data = way.convert(message, way.context)
+        for convert, context, publisher in self._ways[topic]:
+            data = convert(message, context)
             if data is not None:
-                way.publisher.publish(data, at_ns=message.stamp_ns)
-            way.context.sequence += 1
+                publisher.publish(data, at_ns=message.stamp_ns)
+            context.sequence += 1
 
     def close(self) -> None:
         """Complete the bag. Closing twice is allowed."""
@@ -116,7 +112,7 @@ class BagWriter:
             }
             context = Context(vehicle=vehicle_of(topic), frame_id=frame_id, options=options)
             publisher = self._bag.publisher(route.ros_topic, route.ros_type, route.qos)
-            ways.append(_Way(rule.convert, context, publisher))
+            ways.append((rule.convert, context, publisher))
         return ways
 
 

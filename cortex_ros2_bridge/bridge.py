@@ -14,10 +14,10 @@ import time
 from collections.abc import Iterable
 
 from cortex import Node
-from cortex_ros2_bridge import diagnostics
+from cortex_ros2_bridge import cdr, diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError
 from cortex_ros2_bridge.config import QOS, BridgeConfig
-from cortex_ros2_bridge.convert.records import status_record
+from cortex_ros2_bridge.convert.records import record, status_record, time_of
 from cortex_ros2_bridge.lifecycle import ACTIVE, FINALIZED, INACTIVE, STATES, UNCONFIGURED
 from cortex_ros2_bridge.links import Connections, Link
 from cortex_ros2_bridge.neighbours import Neighbours
@@ -49,11 +49,6 @@ class Bridge:
     def __init__(self, config: BridgeConfig, backend: Backend, node: Node) -> None:
         """Prepare; nothing but /diagnostics is connected before `update` or `run`.
 
-        Args:
-            config: What to do.
-            backend: The ROS side; it stays open.
-            node: The Cortex side; it stays open.
-
         Raises:
             BackendError: The backend cannot publish.
         """
@@ -67,7 +62,6 @@ class Bridge:
         self._seen: Seen | None = None
         self._retry_s: float | None = None
         self._said: set[str] = set()
-        self._noted: set[str] = set()
         self._links: dict[Key, Link] = {}
         self._connections = Connections(config, backend, node, lambda: self.state == ACTIVE)
         self._neighbours = Neighbours(backend, node)
@@ -90,8 +84,10 @@ class Bridge:
             BackendError: The backend is dead for good.
         """
         while not stop.is_set():
-            if self._backend.failure:
-                raise BackendError(self._backend.failure)
+            if reason := self._backend.failure:
+                self._failure = reason
+                self._diagnose(DIAGNOSTICS_INTERVAL_S)
+                raise BackendError(reason)
             try:
                 self.update()
             except Exception as error:  # streams and commands of others must not end with one mistake
@@ -117,7 +113,8 @@ class Bridge:
             except BackendError as error:
                 logger.warning("%s: %s", self.config.ros_topic("/tf_static"), error)
             if now_s - self._diagnosed_s >= DIAGNOSTICS_INTERVAL_S:
-                self._look_at_others(seen, now_s)
+                self._notes = self._neighbours.notes(self.routes(), seen, self.config, now_s)
+                self._say(self._notes)
                 self._diagnose(now_s - self._diagnosed_s)
                 self._diagnosed_s = now_s
 
@@ -202,10 +199,7 @@ class Bridge:
                 self._node, self._backend, self.config, lambda: self.state == ACTIVE
             )
         self.problems = problems
-        for problem in problems:
-            if problem not in self._said:
-                logger.warning("%s", problem)
-        self._said = set(problems)
+        self._say(problems)
 
     def _cortex_gone(self, count: int) -> None:
         """Say once that all of the Cortex side has gone."""
@@ -242,13 +236,12 @@ class Bridge:
         if not self._closed:
             logger.debug("%s: closed", link.route)
 
-    def _look_at_others(self, seen: Seen, now_s: float) -> None:
-        """Say once what others do that does not work."""
-        self._notes = self._neighbours.notes(self.routes(), seen, self.config, now_s)
-        for note in self._notes:
-            if note not in self._noted:
-                logger.warning("%s", note)
-        self._noted |= set(self._notes)
+    def _say(self, sentences: Iterable[str]) -> None:
+        """Say each sentence once."""
+        for sentence in sentences:
+            if sentence not in self._said:
+                logger.warning("%s", sentence)
+                self._said.add(sentence)
 
     def _tell_failure(self, error: Exception) -> None:
         """Say a mistake once a second at most, and on /diagnostics."""
@@ -262,7 +255,7 @@ class Bridge:
         """Publish how everything is doing."""
         failure, self._failure = self._failure, ""
         feeds = self._connections.feeds.values()
-        wrong = self.problems + self._notes + ([self._backend.trouble] if self._backend.trouble else [])
+        wrong = self.problems + self._notes
         missing = "" if self._was_routed else "no Cortex topics: no simulator runs"
         if missing and self._had_routes:
             missing = "the Cortex side has gone"
@@ -285,8 +278,8 @@ class Bridge:
         ]
         if self._diagnostics.subscriber_count:
             newest = max((feed.newest for feed in feeds), default=(0.0, 0))
-            array = diagnostics.diagnostic_array(statuses, newest[1])
+            head = record("std_msgs/msg/Header")(time_of(newest[1]), "")
             try:
-                self._diagnostics.publish(array)
+                self._diagnostics.publish(cdr.encode(record(diagnostics.TYPE)(head, statuses)))
             except BackendError as error:
                 logger.warning("%s: %s", diagnostics.TOPIC, error)

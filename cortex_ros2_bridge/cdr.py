@@ -18,11 +18,10 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from cortex_ros2_bridge.backend.base import Buffer
-from cortex_ros2_bridge.msgs import TYPE_CODES, Message, message_class
+from cortex_ros2_bridge.msgs import EMPTY, TYPE_CODES, Message, as_it_is, message_class
 from cortex_ros2_bridge.typestore import check_type, typestore
 
 _LITTLE, _BIG = b"\x00\x01", b"\x00\x00"
-_EMPTY = "structure_needs_at_least_one_member"
 _WRONG = (
     SerdeError,
     struct.error,
@@ -41,33 +40,35 @@ class CdrError(ValueError):
 
 
 def encode(message: Any) -> memoryview:
-    """Return a message as CDR.
-
-    Args:
-        message: A stand-in, a message of rclpy, or one of the plain records that `record_class` makes.
+    """Return a stand-in, a message of rclpy, or a plain record of a `record_class`, as CDR.
 
     Raises:
         CdrError: A field has a value that its type cannot hold.
         UnknownTypeError: It is a message of a type that we have no definition of.
     """
     type_name = getattr(message, "__msgtype__", None)
-    convert: Callable[[Any], Any] = _as_it_is
+    convert: Callable[[Any], Any] = as_it_is
     if type_name is None:
         type_name = type_name_of(message)
         convert = _to_record(type_name)
     check_type(type_name)
+    store = typestore()
+    definition = store.get_msgdef(type_name)
     try:
-        return _serialise(convert(message), type_name)
+        record = convert(message)
+        size = definition.getsize_cdr(0, record, store)
+        buffer = bytearray(4 + (size + 3 & -4))
+        buffer[:2] = _LITTLE
+        definition.serialize_cdr_le(memoryview(buffer)[4:], 0, record, store)
     except _WRONG as error:
         raise CdrError(f"cannot encode a {type_name}: {error}") from error
+    return memoryview(buffer).toreadonly()
 
 
 def decode(data: Buffer, type_name: str | type[Any]) -> Any:
     """Return the message in a buffer, as an object of `msgs.message_class(type_name)`; its arrays are copies.
 
-    Args:
-        data: The message.
-        type_name: Such as "sensor_msgs/msg/Imu", or the class that `msgs` has for it.
+    The type is given by its name, or by the class that `msgs` has for it.
 
     Raises:
         CdrError: The data are cut off or too long, hold a length beyond their end, or are no plain CDR.
@@ -104,17 +105,6 @@ def type_name_of(message: Any) -> str:
     return f"{package}/{folder}/{kind.__name__}"
 
 
-def _serialise(record: Any, type_name: str) -> memoryview:
-    store = typestore()
-    definition = store.get_msgdef(type_name)
-    size = definition.getsize_cdr(0, record, store)
-    buffer = bytearray(4 + (size + 3 & -4))
-    buffer[:2] = _LITTLE
-    view = memoryview(buffer)
-    definition.serialize_cdr_le(view[4:], 0, record, store)
-    return view.toreadonly()
-
-
 def _deserialise(data: Buffer, type_name: str, store: Typestore) -> Any:
     check_type(type_name)
     view = memoryview(data).cast("B")
@@ -139,14 +129,14 @@ def _deserialise(data: Buffer, type_name: str, store: Typestore) -> Any:
 
 @functools.cache
 def _to_record(type_name: str) -> Callable[[Any], Any]:
-    """Return what makes a plain record of a message; `_as_it_is` where its attributes serve as they are."""
+    """Return what makes a plain record of a message; `as_it_is` where its attributes serve as they are."""
     check_type(type_name)
     entries = [(name, _to_record_field(desc)) for name, desc in typestore().fielddefs[type_name][1]]
     make = record_class(type_name)
-    if [name for name, _ in entries] == [_EMPTY]:
+    if [name for name, _ in entries] == [EMPTY]:
         return lambda _message: make(0)
     if all(convert is None for _, convert in entries):
-        return _as_it_is
+        return as_it_is
 
     def convert_all(message: Any) -> Any:
         values = []
@@ -163,7 +153,7 @@ def _to_record_field(desc: Any) -> Callable[[Any], Any] | None:
     kind, what = desc
     if kind == Nodetype.NAME:
         convert = _to_record(what)
-        return None if convert is _as_it_is else convert
+        return None if convert is as_it_is else convert
     if kind == Nodetype.BASE:
         return _byte_value if what[0] == "byte" else None
     element, _ = what
@@ -175,10 +165,6 @@ def _to_record_field(desc: Any) -> Callable[[Any], Any] | None:
         return functools.partial(np.ascontiguousarray, dtype=dtype)
     one = _to_record_field(element)
     return None if one is None else lambda values: [one(value) for value in values]
-
-
-def _as_it_is(value: Any) -> Any:
-    return value
 
 
 def _byte_value(value: bytes) -> int:
@@ -205,7 +191,7 @@ class _Makers(dict[str, Any]):
 def _maker(type_name: str) -> Callable[..., Any]:
     kind = message_class(type_name)
     entries = [(name, _from_record_field(desc)) for name, desc in typestore().fielddefs[type_name][1]]
-    if [name for name, _ in entries] == [_EMPTY]:
+    if [name for name, _ in entries] == [EMPTY]:
         return lambda _placeholder: kind()
 
     def make(*values: Any) -> Any:

@@ -20,16 +20,7 @@ from typing import Any
 import yaml
 
 from cortex import Node
-from cortex_ros2_bridge.config import (
-    ROOTED,
-    SETTINGS,
-    BridgeConfig,
-    check_backend,
-    check_cortex_domain,
-    check_distro,
-    check_namespace,
-    load,
-)
+from cortex_ros2_bridge.config import ROOTED, SETTINGS, BridgeConfig, load
 from cortex_ros2_bridge.options import OPTIONS
 from cortex_ros2_bridge.ros_args import RosArguments, split
 from cortex_ros2_bridge.routes import Route, Seen, known_options, look, make_routes, unfit
@@ -132,22 +123,14 @@ def _settings(
 
 def _config(options: argparse.Namespace, ros: RosArguments, parameters: Mapping[str, Any]) -> BridgeConfig:
     """Return settings: those of the file, over them parameters, over them options, over them remappings."""
-    config = load(options.config, parameters)
-    checks: dict[str, Callable[[str, object], Any]] = {
-        "backend": check_backend,
-        "distro": check_distro,
-        "cortex_domain": check_cortex_domain,
-        "namespace": check_namespace,
-    }
-    changes = {
-        name: check(f"--{name.replace('_', '-')}", value)
-        for name, check in checks.items()
-        if (value := getattr(options, name)) is not None
-    }
-    changes["converters"] = (*config.converters, *(options.converter or ()))
-    config = dataclasses.replace(config, **changes)
+    given = {name: getattr(options, name) for name in ("backend", "distro", "cortex_domain", "namespace")}
+    config = load(
+        options.config,
+        {**parameters, **{name: value for name, value in given.items() if value is not None}},
+    )
     node, namespace = ros.names(config.node, config.namespace)
-    return dataclasses.replace(config, node=node, namespace=namespace, ros=ros)
+    converters = (*config.converters, *(options.converter or ()))
+    return dataclasses.replace(config, node=node, namespace=namespace, converters=converters, ros=ros)
 
 
 def _version() -> str:
@@ -160,13 +143,7 @@ def _version() -> str:
 def _bridge(
     make: Callable[[Mapping[str, Any]], BridgeConfig], given: Mapping[str, Any], *, beside: bool
 ) -> int:
-    """Bridge until interrupted.
-
-    Args:
-        make: Makes settings of ROS parameters.
-        given: The parameters.
-        beside: Run although another bridge publishes the same topics.
-    """
+    """Bridge until interrupted, with what makes settings of ROS parameters, and the parameters."""
     config = make(given)
     _load_converters(config)
     stop = _stop_at_signals(forced=not config.is_bag)

@@ -148,7 +148,7 @@ def load(
         raise ConfigError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from None
 
 
-def check_namespace(key: str, value: object) -> str:
+def _namespace(key: str, value: object) -> str:
     """Return a namespace with a slash in front and none behind; "" for none."""
     if not isinstance(value, str):
         raise ConfigError(f"{key} must be a text, got {value!r:.80}")
@@ -220,42 +220,40 @@ def _merged(raw: object, parameters: Mapping[str, Any]) -> object:
 
 def _bridge_config(raw: object) -> BridgeConfig:
     given = dict(_mapping("the settings", raw))
-    if "domain" in given and "cortex_domain" not in given:
-        given["cortex_domain"] = given.pop("domain")  # its old name, which is easily taken for that of ROS
+    if "domain" in given:  # its old name, which is easily taken for that of ROS
+        given.setdefault("cortex_domain", given.pop("domain"))
     _refuse_unknown("", given, SETTINGS)
     return BridgeConfig(
         **{key: SETTINGS[key](key, value) for key, value in given.items() if value is not None}
     )
 
 
-def check_backend(key: str, value: object) -> str:
-    """Return the name of a backend, or of a bag."""
+def _checked(key: str, check: Callable[..., Any], *values: Any) -> Any:
     try:
-        return check_kind(_text(key, value))
+        return check(*values)
     except ValueError as error:
         raise ConfigError(f"{key}: {error}") from None
 
 
-def check_distro(key: str, value: object) -> str:
-    """Return the name of a distribution."""
+def _backend(key: str, value: object) -> Any:
+    return _checked(key, check_kind, _text(key, value))
+
+
+def _distro(key: str, value: object) -> str:
     text = _text(key, value)
     if text not in DISTROS:
         raise ConfigError(f"{key} must be one of {', '.join(DISTROS)}, got {text!r}")
     return text
 
 
-def check_cortex_domain(key: str, value: object) -> int:
-    """Return a domain of Cortex."""
+def _cortex_domain(key: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ConfigError(f"{key} must be an integer >= 0, got {value!r}")
     return value
 
 
-def _node_name(key: str, value: object) -> str:
-    try:
-        return check_node_name(_text(key, value), "")[0]
-    except ValueError as error:
-        raise ConfigError(f"{key}: {error}") from None
+def _node_name(key: str, value: object) -> Any:
+    return _checked(key, check_node_name, _text(key, value), "")[0]
 
 
 def _frame_names(key: str, value: object) -> FrameNames:
@@ -280,10 +278,7 @@ def _options(key: str, value: object) -> dict[str, Any]:
     given = _mapping(key, value)
     _refuse_unknown(key, given, OPTIONS)
     for name, option in given.items():
-        try:
-            check_option(name, option)
-        except ValueError as error:
-            raise ConfigError(f"{key}: {error}") from None
+        _checked(key, check_option, name, option)
     return dict(given)
 
 
@@ -368,11 +363,11 @@ def _ros_name(key: str, value: object) -> str:
 
 
 SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
-    "backend": check_backend,
-    "distro": check_distro,
-    "cortex_domain": check_cortex_domain,
+    "backend": _backend,
+    "distro": _distro,
+    "cortex_domain": _cortex_domain,
     "node": _node_name,
-    "namespace": check_namespace,
+    "namespace": _namespace,
     "frames": _frame_names,
     "isolate": _flag,
     "autostart": _flag,

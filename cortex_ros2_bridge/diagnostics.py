@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
-from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.backend.base import Buffer
-from cortex_ros2_bridge.convert.records import record, status_record, time_of
+from cortex_ros2_bridge.convert.records import status_record
 from cortex_ros2_bridge.links import Link
 
 TOPIC = "/diagnostics"
@@ -38,9 +35,3 @@ def route_status(link: Link, node: str, elapsed_s: float) -> Any:
     values = {**counts, "rate_hz": f"{rate_hz:.1f}", "listeners": link.listeners(), "types": types}
     level = WARN if any(gone.values()) else OK
     return status_record(level, name, message, HARDWARE, ((key, str(each)) for key, each in values.items()))
-
-
-def diagnostic_array(statuses: Iterable[Any], stamp_ns: int) -> Buffer:
-    """Return the message for /diagnostics at a time [ns]."""
-    head = record("std_msgs/msg/Header")(time_of(stamp_ns), "")
-    return cdr.encode(record(TYPE)(head, list(statuses)))

@@ -16,6 +16,7 @@ import yaml
 
 from cortex import messages as msg
 from cortex_ros2_bridge import frames
+from cortex_ros2_bridge.convert.commands import xyz
 from cortex_ros2_bridge.frames import FrameNames, Vector
 from cortex_ros2_bridge.msgs import message_class
 
@@ -88,7 +89,7 @@ class Entities:
         if not is_body and self._news("/status", msg.SimulatorStatus).stamp_ns:
             refuse(INCORRECT_STATE, "the simulation runs: stop it first (SetSimulationState)")
         position, q = self._pose(state.pose, state.header.frame_id, _STATE_POSE)
-        velocity, rate = _xyz(state.twist.linear), frames.rotate_back(q, _xyz(state.twist.angular))
+        velocity, rate = xyz(state.twist.linear), frames.rotate_back(q, xyz(state.twist.angular))
         if not is_body:
             self._call("/reset", msg.Reset(None, name, position, q, velocity, rate))
         elif velocity.any() or rate.any():
@@ -138,7 +139,7 @@ class Entities:
         q = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
         if not abs(math.hypot(*q.tolist()) - 1.0) < 1e-3:  # also refuses nan
             refuse(code, f"the quaternion has not length 1: {q.tolist()}")
-        return _xyz(pose.position), q
+        return xyz(pose.position), q
 
     def _fitting(self, filters: Any) -> list[str]:
         """Return the names that filters leave."""
@@ -193,7 +194,3 @@ class Entities:
             for axis, value in zip("xyzw", np.asarray(numbers).tolist(), strict=False):
                 setattr(part, axis, float(value))
         return state
-
-
-def _xyz(vector: Any) -> Vector:
-    return np.array([vector.x, vector.y, vector.z])

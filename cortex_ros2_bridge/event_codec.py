@@ -1,4 +1,4 @@
-"""Events as bytes: mono of event_camera_msgs/EventPacket, the records of dvs_msgs/EventArray, and pictures.
+"""Events as bytes: mono of event_camera_msgs/EventPacket, and the records of dvs_msgs/EventArray.
 
 mono is one word of 64 bits for each event, with a time of its own in nanoseconds; `cortex.evt3` is the other
 encoding of EventPacket. Nothing here loops over events in Python.
@@ -15,31 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex.evt3 import (
-    Allocate,
     Buffer,
     Bytes,
     EventCodecError,
     EventColumns,
     check_events,
-    check_pixels,
-    new_bytes,
     read_words,
 )
 
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
 
 
-def encode_mono(
-    events: EventColumns, *, width: int, height: int, base_us: int, allocate: Allocate | None = None
-) -> Bytes:
+def encode_mono(events: EventColumns, *, width: int, height: int, base_us: int) -> Bytes:
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
-
-    Args:
-        events: What to write, with times in microseconds.
-        width: Of the sensor [px].
-        height: Of the sensor [px].
-        base_us: Time not after that of the first event [us].
-        allocate: Makes room for the events; None: a new array.
 
     Raises:
         EventCodecError: The sensor has too many rows, an event is outside of it or has another polarity, or
@@ -54,9 +42,9 @@ def encode_mono(
         raise EventCodecError(
             f"mono holds times from its base to 4.29 s later, got {t_us[0]} to {t_us[-1]} us for {base_us} us"
         )
-    out = (new_bytes if allocate is None else allocate)(8 * count)
+    out = np.empty(8 * count, np.uint8)
     quarters = out.view("<u2").reshape(count, 4)
-    after_ns = _after(t_us, base_us)
+    after_ns = (t_us - base_us).astype(np.uint32)
     after_ns *= np.uint32(1000)
     out.view("<u4").reshape(count, 2)[:, 0] = after_ns
     quarters[:, 2] = x
@@ -68,11 +56,7 @@ def encode_mono(
 
 
 def decode_mono(data: Buffer | Bytes, *, base_ns: int) -> EventColumns:
-    """Return the events of a packet, with times in nanoseconds.
-
-    Args:
-        data: Words of 64 bits, little endian.
-        base_ns: The packet's `time_base` [ns].
+    """Return the events of a packet with a `time_base`, with times in nanoseconds.
 
     Raises:
         EventCodecError: It does not consist of words of 8 bytes.
@@ -116,15 +100,12 @@ def read_dvs(data: Buffer, *, ros1: bool = False) -> tuple[tuple[int, int], Even
         (length,) = struct.unpack_from("<I", view, 12)  # of the frame's name; CDR ends and pads it
         begin = 16 + (length if ros1 else length + 3 & -4)
         height, width, count = struct.unpack_from("<III", view, begin)
-        records = _ros1_records(view[begin + 12 :], count) if ros1 else _records(view[begin + 12 :], count)
+        rows = view[begin + 12 :]
+        records = np.frombuffer(rows, DVS_RECORD_ROS1, count=count) if ros1 else _records(rows, count)
     except (struct.error, ValueError) as error:
         raise EventCodecError(f"{len(view)} bytes are no dvs_msgs/EventArray: {error}") from error
     t = records["sec"].astype(np.int64) * 1_000_000 + records["nanosec"] // 1000
     return (width, height), EventColumns(t, *(records[name].copy() for name in ("x", "y", "polarity")))
-
-
-def _ros1_records(view: memoryview, count: int) -> NDArray[Any]:
-    return np.frombuffer(view, DVS_RECORD_ROS1, count=count)
 
 
 def _records(view: memoryview, count: int) -> NDArray[Any]:
@@ -137,40 +118,3 @@ def _records(view: memoryview, count: int) -> NDArray[Any]:
         padded = bytes(view[14:size]) + bytes(3)
         records[1:] = np.frombuffer(padded, DVS_RECORD, count=count - 1)
     return records
-
-
-class EventPicture:
-    """Draws the events of some time on white: a pixel's last one decides; brighter: blue, darker: red."""
-
-    COLORS = np.array([[255, 255, 255], [220, 30, 30], [30, 60, 220]], np.uint8)
-    """Red, green, blue of a pixel without events, that became darker, that became brighter."""
-
-    def __init__(self, *, width: int, height: int) -> None:
-        self.width = width
-        self.height = height
-        self._last = np.zeros((height, width), np.uint8)
-
-    def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]) -> None:
-        """Draw events, in the order of their times.
-
-        Raises:
-            EventCodecError: An event is outside of the picture, or has another polarity than 0 and 1.
-        """
-        check_pixels(x, y, polarity, self.width, self.height)
-        pixel = y.astype(np.intp)
-        pixel *= self.width
-        pixel += x
-        self._last.reshape(-1)[pixel] = polarity + np.uint8(1)
-
-    def take(self) -> NDArray[np.uint8]:
-        """Return the picture, shape [height, width, 3], and begin a new one."""
-        picture: NDArray[np.uint8] = self.COLORS.take(self._last, axis=0)
-        self._last[:] = 0
-        return picture
-
-
-def _after(t_us: NDArray[np.int64], begin_us: int) -> NDArray[np.uint32]:
-    """Return times after another one, none by 71 minutes or more [us]: in half the memory of int64."""
-    after = t_us.astype(np.uint32)
-    after -= np.uint32(begin_us & 0xFFFFFFFF)
-    return after

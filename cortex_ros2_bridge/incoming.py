@@ -73,11 +73,6 @@ class Incoming:
         self._pending: tuple[Target, Any, float] | None = None
         self._told = 0
 
-    @property
-    def heard(self) -> bool:
-        """Whether anybody in ROS publishes; as of the last look."""
-        return self.publisher_count > 0
-
     def add(self, target: Target) -> None:
         """Add a target; there is more than one where the message says which (AttitudeTarget)."""
         with self._lock:
@@ -100,8 +95,8 @@ class Incoming:
         self._told += lost
         with self._lock:
             if lost and self._targets:
-                self._targets[0].tally.receive(lost)
-                self._targets[0].tally.lose("on the way through ROS", lost)
+                self._targets[0].tally.count("received", count=lost)
+                self._targets[0].tally.count("lost", "on the way through ROS", lost)
             self._send_pending()
         return self.publisher_count > before
 
@@ -110,22 +105,22 @@ class Incoming:
         with self._lock:
             if not self._is_active():
                 for target in self._targets[:1]:
-                    target.tally.receive()
-                    target.tally.refuse(NOT_ACTIVE)
+                    target.tally.count("received")
+                    target.tally.count("refused", NOT_ACTIVE)
                 return
             for target in self._targets:
                 try:
                     command = self._convert(target, data)
                 except (ConvertError, cdr.CdrError) as error:
-                    target.tally.receive()
-                    target.tally.refuse(str(error))
+                    target.tally.count("received")
+                    target.tally.count("refused", str(error))
                     return
                 if command is not None:
                     self._deliver(target, command)
                     return
             for target in self._targets[:1]:
-                target.tally.receive()
-                target.tally.refuse("it commands nothing that Cortex has a topic for")
+                target.tally.count("received")
+                target.tally.count("refused", "it commands nothing that Cortex has a topic for")
 
     def close(self) -> None:
         """Withdraw the subscription."""
@@ -144,14 +139,14 @@ class Incoming:
     def _deliver(self, target: Target, command: Any) -> None:
         """Send a command to where it belongs, or refuse it."""
         context = target.context
-        target.tally.receive()
+        target.tally.count("received")
         if context.excess:
-            target.tally.clamp(context.excess)
+            target.tally.count("clamped", context.excess)
         if target.restamp:
             command = dataclasses.replace(command, stamp_ns=context.now_ns)
         reason = _staleness(getattr(command, "stamp_ns", 0), self.whereabouts.now_ns, target.stale_ns)
         if reason:
-            target.tally.refuse(reason)
+            target.tally.count("refused", reason)
             return
         context.sequence += 1
         if target.publisher.subscriber_count:
@@ -164,9 +159,9 @@ class Incoming:
     def _publish(self, target: Target, command: Any) -> None:
         with contextlib.suppress(Closed):  # the bridge is about to end
             if target.publisher.publish(command):
-                target.tally.send()
+                target.tally.count("sent")
             else:
-                target.tally.lose("a reliable subscriber in Cortex did not take it in in time")
+                target.tally.count("lost", "a reliable subscriber in Cortex did not take it in in time")
 
     def _send_pending(self) -> None:
         """Send the command that waits for a subscriber; the lock is held."""
@@ -182,7 +177,7 @@ class Incoming:
     def _drop_pending(self, reason: str) -> None:
         if self._pending is not None:
             target, self._pending = self._pending[0], None
-            target.tally.lose(reason)
+            target.tally.count("lost", reason)
 
 
 class Caller:
@@ -209,24 +204,24 @@ class Caller:
 
     def take(self, data: bytes) -> None:
         """Take in a message of ROS; its request waits for those before it."""
-        self.tally.receive()
+        self.tally.count("received")
         try:
             self._requests.put_nowait(self._convert(data, self._context))
         except queue.Full:
-            self.tally.refuse("there are requests that have not been answered yet")
+            self.tally.count("refused", "there are requests that have not been answered yet")
         except (ConvertError, cdr.CdrError) as error:
-            self.tally.refuse(str(error))
+            self.tally.count("refused", str(error))
 
     def serve(self, request: Any, response: Any) -> Any:
         """Call the service for a request of ROS, of one of `SERVICES`; waits for the answer."""
-        self.tally.receive()
+        self.tally.count("received")
         try:
             begin = getattr(request, "begin", None)
             asked = self._default if begin is None else self._convert(bytes(cdr.encode(begin)), self._context)
             response.message = self._call(asked)
         except ConvertError as error:
             response.message = str(error)
-            self.tally.refuse(response.message)
+            self.tally.count("refused", response.message)
         response.success = not response.message
         return response
 
@@ -246,11 +241,11 @@ class Caller:
         """Call the service; returns why it did not do what was asked, empty if it did."""
         reason, was_answered = ask(self._client, request) if self._is_active() else (NOT_ACTIVE, True)
         if not reason:
-            self.tally.send()
+            self.tally.count("sent")
         elif was_answered:
-            self.tally.refuse(reason)
+            self.tally.count("refused", reason)
         elif reason != ENDS:
-            self.tally.lose(reason)
+            self.tally.count("lost", reason)
         return reason
 
 

@@ -12,15 +12,19 @@ Reference: design.ros2.org, "Managed nodes"; numbers and names are those of life
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Backend, BackendError, Qos
 from cortex_ros2_bridge.msgs import message_class
+
+if TYPE_CHECKING:
+    from cortex_ros2_bridge.bridge import Bridge
 
 logger = logging.getLogger(__name__)
 
@@ -78,30 +82,38 @@ TRANSITIONS = _CALLS + tuple(
 """All of them, also those that follow by themselves."""
 
 
-class Managed(Protocol):
-    """What has a lifecycle."""
-
-    state: int
-
-    def change_state(self, state: int) -> None:
-        """Go on in another primary state."""
-
-
 class Lifecycle:
     """Answers the services of a managed node of a full name, until it is closed."""
 
-    def __init__(self, managed: Managed, backend: Backend, node: str) -> None:
+    def __init__(self, managed: Bridge, backend: Backend, node: str) -> None:
         self._managed = managed
         self._lock = threading.Lock()
         self._resources = contextlib.ExitStack()
-        answers: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
-            "change_state": ("ChangeState", self._change),
-            "get_state": ("GetState", self._get),
-            "get_available_states": ("GetAvailableStates", self._states),
-            "get_available_transitions": ("GetAvailableTransitions", self._available),
-            "get_transition_graph": ("GetAvailableTransitions", self._graph),
+        answers: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
+            "change_state": (
+                "ChangeState",
+                "success",
+                lambda request: self.change(request.transition.id, request.transition.label),
+            ),
+            "get_state": ("GetState", "current_state", lambda _: _state(managed.state)),
+            "get_available_states": (
+                "GetAvailableStates",
+                "available_states",
+                lambda _: [_state(number) for number in STATES],
+            ),
+            "get_available_transitions": (
+                "GetAvailableTransitions",
+                "available_transitions",
+                lambda _: [_described(each) for each in TRANSITIONS if each.start == managed.state],
+            ),
+            "get_transition_graph": (
+                "GetAvailableTransitions",
+                "available_transitions",
+                lambda _: [_described(each) for each in TRANSITIONS],
+            ),
         }
-        for name, (kind, answer) in answers.items():
+        for name, (kind, field, value) in answers.items():
+            answer = functools.partial(_answer, field, value)
             service = backend.service(f"{node}/{name}", f"lifecycle_msgs/srv/{kind}", answer)
             self._resources.callback(service.close)
         self._events = backend.publisher(
@@ -143,31 +155,13 @@ class Lifecycle:
         with contextlib.suppress(BackendError):  # the backend ends
             self._events.publish(cdr.encode(event))
 
-    # Services
-
-    def _change(self, request: Any, response: Any) -> Any:
-        response.success = self.change(request.transition.id, request.transition.label)
-        return response
-
-    def _get(self, request: Any, response: Any) -> Any:
-        response.current_state = _state(self._managed.state)
-        return response
-
-    def _states(self, request: Any, response: Any) -> Any:
-        response.available_states = [_state(number) for number in STATES]
-        return response
-
-    def _available(self, request: Any, response: Any) -> Any:
-        here = [each for each in TRANSITIONS if each.start == self._managed.state]
-        response.available_transitions = [_described(each) for each in here]
-        return response
-
-    def _graph(self, request: Any, response: Any) -> Any:
-        response.available_transitions = [_described(each) for each in TRANSITIONS]
-        return response
-
 
 TRANSITIONS_BY_NUMBER = {each.number: each for each in TRANSITIONS}
+
+
+def _answer(field: str, value: Callable[[Any], Any], request: Any, response: Any) -> Any:
+    setattr(response, field, value(request))
+    return response
 
 
 def _state(number: int) -> Any:

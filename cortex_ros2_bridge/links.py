@@ -141,23 +141,20 @@ class Connections:
         if status is not None and not self._is_logged:
             self._is_logged = True
             feed = self._feed(status, "cortex/SimulatorStatus", self._resources)
-            self._tap(feed, self._run_log.take, lambda: True, self._resources)
+            feed.tap(self._run_log.take, lambda: True, self._resources)
         for vehicle, whereabouts in self._vehicles.items():
             topics = odometry_of(vehicle, seen), clock, simulation
             if whereabouts.sources == topics:
                 continue
             whereabouts.forget(topics)
             wants = self._commands_come_for(vehicle)
-            taps: tuple[tuple[str, Callable[[Any], None], Callable[[], bool]], ...] = (
-                ("cortex/Odometry", whereabouts.take_odometry, wants),
-                ("cortex/Clock", whereabouts.take_clock, wants),
-                # It says once what the first command already needs.
-                ("cortex/Simulation", whereabouts.take_simulation, lambda: True),
-            )
-            for topic, (kind, take, is_wanted) in zip(topics, taps, strict=True):
+            # The simulation is said once, and the first command needs it already.
+            wanted = {"Odometry": wants, "Clock": wants, "Simulation": lambda: True}
+            for topic, (kind, is_wanted) in zip(topics, wanted.items(), strict=True):
                 if topic is not None:
                     stack = whereabouts.resources
-                    self._tap(self._feed(topic, kind, stack), take, is_wanted, stack)
+                    take = functools.partial(setattr, whereabouts, kind.lower())
+                    self._feed(topic, f"cortex/{kind}", stack).tap(take, is_wanted, stack)
 
     def close(self) -> None:
         """Forget vehicles and transforms; the routes are closed by their links."""
@@ -175,7 +172,7 @@ class Connections:
         if route.ros_topic == self._tf_static:
             tally = Tally(str(route))
             source = route.cortex_topic
-            self._tap(feed, lambda message: self._take_transform(source, message, tally), lambda: True, stack)
+            feed.tap(lambda message: self._take_transform(source, message, tally), lambda: True, stack)
             return tally, lambda: publisher.subscriber_count
         output = Outgoing(
             route,
@@ -188,7 +185,8 @@ class Connections:
             output.whereabouts = self._whereabouts_of(route)
         if route.ros_type == "sensor_msgs/msg/CameraInfo" and route.cortex_type != "cortex/CameraInfo":
             info = self._feed(route.cortex_topic + INFO, "cortex/CameraInfo", stack)
-            self._tap(info, output.take_camera_info, lambda: True, stack)
+            take = functools.partial(setattr, output.context, "camera_info")
+            info.tap(take, lambda: True, stack)
         feed.add(output)
         stack.callback(feed.remove, output)
         return output.tally, lambda: output.subscriber_count
@@ -249,24 +247,18 @@ class Connections:
     def _is_latched(self, topic: str) -> bool:
         return any(t.topic == topic and t.latched for t in self._seen.topics)
 
-    def _tap(
-        self, feed: Feed, tap: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
-    ) -> None:
-        feed.tap(tap, wants)
-        stack.callback(feed.untap, tap)
-
     def _commands_come_for(self, vehicle: str) -> Callable[[], bool]:
         whereabouts = self._vehicles[vehicle]
-        return lambda: any(i.heard for i in self.incoming.values() if i.whereabouts is whereabouts)
+        return lambda: any(i.publisher_count for i in self.incoming.values() if i.whereabouts is whereabouts)
 
     def _take_transform(self, source: str, transform: Any, tally: Tally) -> None:
-        tally.receive()
+        tally.count("received")
         try:
             self._static.add(source, transform)
         except convert.ConvertError as error:
-            tally.refuse(str(error))
+            tally.count("refused", str(error))
         else:
-            tally.send()
+            tally.count("sent")
 
 
 def _topic_of(type_name: str, seen: Seen) -> str | None:

@@ -5,8 +5,8 @@
     imu.orientation_covariance[0] = -1.0
 
 A stand-in has the constructor, attributes, defaults, constants and array types of the class that rclpy uses.
-As those of Humble do always, and those of Jazzy with ROS_PYTHON_CHECK_FIELDS=1, it refuses values that do not
-fit: with an `AssertionError`, or the error of the array that is made of them.
+As those of Jazzy do without ROS_PYTHON_CHECK_FIELDS=1, it takes any value but for numbers in a row; what does
+not fit a field is refused by `cdr.encode`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,8 @@ import array
 import difflib
 import functools
 import importlib
-import math
 import operator
-from collections import UserList
-from collections.abc import Callable, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,8 +46,8 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
     "simulation_interfaces/srv/StepSimulation_Request": {"steps": 1},
 }
-_FLOAT32_MAX = 3.402823466e38
-_EMPTY = "structure_needs_at_least_one_member"  # a byte that stands for an empty message on the wire
+EMPTY = "structure_needs_at_least_one_member"
+"""A byte that stands for an empty message on the wire."""
 _HIDDEN = {"actionlib_msgs", "type_description_interfaces"}
 """Packages whose messages have the names of others that are used more; `message_class` finds them."""
 
@@ -113,10 +110,7 @@ class Message:
 
 @functools.cache
 def message_class(type_name: str) -> Any:
-    """Return the class of a message type: that of ROS if it can be imported, else a stand-in.
-
-    Args:
-        type_name: Such as "sensor_msgs/msg/Imu".
+    """Return the class of a type such as "sensor_msgs/msg/Imu": that of ROS if it imports, else a stand-in.
 
     Raises:
         UnknownTypeError: There is no such type.
@@ -148,11 +142,11 @@ def _make_class(type_name: str) -> Any:
     attributes: dict[str, Any] = {
         name: bytes([int(value)]) if kind == "byte" else value for name, kind, value in constants
     }
-    fields = [_field(name, desc) for name, desc in entries if name != _EMPTY]
+    fields = [_field(name, desc) for name, desc in entries if name != EMPTY]
     for name, value in _DEFAULTS.get(type_name, {}).items():
         attributes[f"{name.upper()}__DEFAULT"] = value
         fields = [
-            f._replace(default=functools.partial(_as_it_is, value)) if f.name == name else f for f in fields
+            f._replace(default=functools.partial(as_it_is, value)) if f.name == name else f for f in fields
         ]
     attributes |= {field.name: _accessor(field) for field in fields}
     attributes |= {
@@ -160,7 +154,6 @@ def _make_class(type_name: str) -> Any:
         "__doc__": f"Message class '{base}'.",
         "__module__": __name__,
         "__qualname__": base,
-        "__reduce__": _reduce,
         "__ros_type__": type_name,
         "_fields_and_field_types": {field.name: _idl_type(field.description) for field in fields},
         "__ros_fields__": tuple(fields),
@@ -168,23 +161,20 @@ def _make_class(type_name: str) -> Any:
     return type(base, (Message,), attributes)
 
 
-def _reduce(self: Message) -> tuple[Any, ...]:
-    """Pickle and copy by the name of the type: its class has no place in a module."""
-    return _restore, (self.__ros_type__, [getattr(self, slot) for slot in self.__slots__])
-
-
-def _restore(type_name: str, values: list[Any]) -> Any:
-    kind = message_class(type_name)
-    return kind(**dict(zip(kind.get_fields_and_field_types(), values, strict=True)))
-
-
-def _as_it_is(value: Any) -> Any:
+def as_it_is(value: Any) -> Any:
+    """Return a value."""
     return value
 
 
 def _accessor(field: Field) -> Any:
+    kind, what = field.description
+    is_row = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and what[0][0] == Nodetype.BASE
+    code = TYPE_CODES.get(what[0][1][0]) if is_row else None
+
     def put(self: Message, value: Any) -> None:
-        setattr(self, field.slot, _stored(field.name, field.description, value))
+        if code is not None:
+            value = _numbers(code, value, fixed=kind == Nodetype.ARRAY)
+        setattr(self, field.slot, value)
 
     return property(operator.attrgetter(field.slot), put, doc=f"Message field '{field.name}'.")
 
@@ -235,50 +225,8 @@ _PYTHON: dict[str, type[Any]] = {
 """What Python has for a base type; int for all others."""
 
 
-def _stored(name: str, description: Any, value: Any) -> Any:
-    """Return what a field stores for a value: of numbers in a row, the array that rclpy has.
-
-    Raises:
-        AssertionError: The field cannot hold it.
-        TypeError, OverflowError: An array of such numbers cannot hold it.
-    """
-    kind, what = description
-    if kind == Nodetype.NAME:
-        fits = isinstance(value, message_class(what))
-    elif kind == Nodetype.BASE:
-        base, limit = what
-        fits = _fits(base, limit, value)
-    else:
-        element, size = what
-        fits = isinstance(value, Sequence | AbstractSet | UserList | np.ndarray | array.array)
-        fits = fits and not isinstance(value, str)
-        if fits and element[0] == Nodetype.BASE and element[1][0] in TYPE_CODES:
-            value = _numbers(element[1][0], value, fixed=kind == Nodetype.ARRAY)
-        elif fits:
-            for each in value:
-                _stored(name, element, each)
-        count = len(value) if fits else 0
-        fits = fits and (count == size if kind == Nodetype.ARRAY else not size or count <= size)
-    assert fits, f"The '{name}' field must be of type '{_idl_type(description)}', got {value!r:.80}"
-    return value
-
-
-def _fits(base: str, limit: int, value: Any) -> bool:
-    """Return whether a value is one of a base type; `limit` is the longest text, 0: any."""
-    kind = _PYTHON.get(base, int)
-    if not isinstance(value, kind):
-        return False
-    if kind is int:
-        info = np.iinfo(TYPE_CODES[base])
-        return bool(info.min <= value <= info.max)
-    if base == "float32":
-        return not math.isfinite(value) or abs(value) <= _FLOAT32_MAX
-    return len(value) == 1 if kind is bytes else kind is not str or not limit or len(value) <= limit
-
-
-def _numbers(base: str, value: Any, *, fixed: bool) -> Any:
+def _numbers(code: str, value: Any, *, fixed: bool) -> Any:
     """Return numbers in a row as rclpy has them; without a Python loop where they are an array already."""
-    code = TYPE_CODES[base]
     if isinstance(value, np.ndarray):
         if value.ndim != 1 or (fixed and value.dtype != np.dtype(code)):
             raise TypeError(

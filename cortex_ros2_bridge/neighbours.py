@@ -26,14 +26,7 @@ class Neighbours:
         self._twice_s: float | None = None
 
     def notes(self, routes: Iterable[Route], seen: Seen, config: BridgeConfig, now_s: float) -> list[str]:
-        """Return what is wrong now, a sentence each.
-
-        Args:
-            routes: Those that are open.
-            seen: What Cortex shows.
-            config: Settings.
-            now_s: The time [s].
-        """
+        """Return what is wrong at a time [s], a sentence each."""
         ours = {route.ros_topic: route for route in routes}
         others = self._backend.topics()
         return (

@@ -12,7 +12,6 @@ from typing import Any
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
 from cortex.messages import (
-    CameraInfo,
     Clock,
     CommandRanges,
     Events,
@@ -24,7 +23,7 @@ from cortex.messages import (
 )
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
-from cortex_ros2_bridge.convert import Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.convert import Context, ConvertError, static_transforms, transform_of
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.routes import Route
 from cortex_ros2_bridge.tally import Tally
@@ -59,6 +58,7 @@ class Outgoing:
     Attributes:
         route: The route.
         tally: What it has done.
+        context: Of its conversion.
         wanted: Whether anybody in ROS listens, or may later; as of the last look.
         subscriber_count: How many listen; as of the last look.
         whereabouts: Of the vehicle whose commands these are; None: they are none.
@@ -74,17 +74,13 @@ class Outgoing:
         self.whereabouts: Whereabouts | None = None
         self._publisher = publisher
         self._convert = convert
-        self._context = context
+        self.context = context
         self._lasting = route.qos.durability == "transient_local"
         self._latched = latched and not self._lasting
         self._lock = threading.Lock()
         self._last: bytes | None = None
         self._last_s = 0.0
         self._remind_s: list[float] = []
-
-    def take_camera_info(self, info: CameraInfo) -> None:
-        """Take in the calibration that goes with each image."""
-        self._context.camera_info = info
 
     def look(self, is_active: bool) -> bool:
         """See who listens; returns whether anybody does, or may later, and messages may pass."""
@@ -98,29 +94,29 @@ class Outgoing:
     def send(self, message: Any) -> None:
         """Convert a message and publish it."""
         tally = self.tally
-        tally.receive()
+        tally.count("received")
         if isinstance(message, Events) and message.dropped_count:
-            tally.drop(message.dropped_count)
+            tally.count("dropped", "events that did not fit into the sensor's buffer", message.dropped_count)
         if self.whereabouts is not None:
-            self._context.max_thrust_n = self.whereabouts.max_thrust_n
+            self.context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
-            data = self._convert(message, self._context)
+            data = self._convert(message, self.context)
         except (ConvertError, cdr.CdrError) as error:
-            tally.refuse(str(error))
+            tally.count("refused", str(error))
             return
         except Exception as error:  # whatever is wrong with a message, the next one may be right
-            tally.refuse(f"{type(error).__name__}: {error}")
+            tally.count("refused", f"{type(error).__name__}: {error}")
             return
         if data is None:
             return
-        self._context.sequence += 1
+        self.context.sequence += 1
         with self._lock:
             try:
                 self._publisher.publish(data)
             except BackendError as error:
-                self.tally.lose(str(error))
+                self.tally.count("lost", str(error))
                 return
-            self.tally.send()
+            self.tally.count("sent")
             if self._latched:
                 self._last, self._last_s = bytes(data), time.monotonic()
 
@@ -148,7 +144,7 @@ class Outgoing:
                     try:
                         self._publisher.publish(self._last)
                     except BackendError as error:
-                        self.tally.lose(str(error))
+                        self.tally.count("lost", str(error))
 
 
 class StaticTransforms:
@@ -156,33 +152,24 @@ class StaticTransforms:
 
     def __init__(self, frames: FrameNames) -> None:
         self._frames = frames
-        self._transforms: dict[str, tuple[str, Transform]] = {}
+        self._transforms: dict[str, tuple[str, Any]] = {}
         self._vehicles: tuple[str, ...] = ()
         self._lock = threading.Lock()
         self.changed = False
 
     def add(self, source: str, transform: Transform) -> None:
-        """Take in a transform, or a newer one of the same child.
-
-        Args:
-            source: Cortex topic that it came on.
-            transform: The transform.
+        """Take in a transform from a Cortex topic, or a newer one of the same child.
 
         Raises:
             ConvertError: It is none: the one before stays.
         """
-        check_transform(transform, self._frames)
+        made = transform_of(transform, self._frames)
         with self._lock:
-            self._transforms[transform.child] = source, transform
+            self._transforms[transform.child] = source, made
             self.changed = True
 
     def keep(self, sources: Iterable[str], vehicles: Iterable[str]) -> None:
-        """Say what there is; transforms that came from elsewhere are forgotten.
-
-        Args:
-            sources: Cortex topics of transforms.
-            vehicles: Vehicles that move.
-        """
+        """Say which topics of transforms there are, and which vehicles move; forget what came from others."""
         there = set(sources)
         with self._lock:
             kept = {child: held for child, held in self._transforms.items() if held[0] in there}
@@ -226,20 +213,17 @@ class Feed:
         self._told = (0, 0)
         self.newest = (0.0, 0)
 
-    def tap(self, function: Callable[[Any], None], wants: Callable[[], bool]) -> None:
-        """Give each message to a function of the bridge, before the routes get it.
-
-        Args:
-            function: Gets the messages, on the callback thread.
-            wants: Says whether it wants any now.
-        """
+    def tap(
+        self, function: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
+    ) -> None:
+        """Give messages to a function while it wants any, before routes get them, until a stack closes."""
         with self._lock:
             self._taps[function] = wants
             if self._last is not None:
                 function(self._last)
+        stack.callback(self._untap, function)
 
-    def untap(self, function: Callable[[Any], None]) -> None:
-        """Give it no more of them."""
+    def _untap(self, function: Callable[[Any], None]) -> None:
         with self._lock:
             del self._taps[function]
 
@@ -351,51 +335,48 @@ class Feed:
         self._told = now
         for output in self._outputs:
             if lost and output.wanted:
-                output.tally.receive(lost)
-                output.tally.lose("the bridge, or the machine, is too slow", lost)
+                output.tally.count("received", count=lost)
+                output.tally.count("lost", "the bridge, or the machine, is too slow", lost)
             for _ in range(rejected):
-                output.tally.refuse("a malformed message, or one of another type")
+                output.tally.count("refused", "a malformed message, or one of another type")
 
 
 @dataclass(eq=False)
 class Whereabouts:
-    """What the bridge knows of a vehicle: its newest state, and what time that is."""
+    """What the bridge knows of a vehicle: the newest messages about it, None before the first."""
 
     vehicle: str
     odometry: Odometry | None = None
-    max_thrust_n: float | None = None
-    """Thrust with all rotors at their highest speed [N]; None if the simulator has not said."""
-    ranges: CommandRanges | None = None
-    """What it can be asked for; None if the simulator has not said."""
+    clock: Clock | None = None
+    simulation: Simulation | None = None
+    """What the vehicles can do; the simulator says it once."""
     sources: tuple[str | None, ...] = (None, None, None)
     """Topics of state, of time and of the simulation; None where there is none."""
     resources: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     """What is to be closed when the sources change."""
-    clock_ns: int | None = None
 
     def forget(self, sources: tuple[str | None, ...]) -> None:
         """Forget all that came from other sources."""
         self.resources.close()
         self.sources = sources
-        self.odometry = self.clock_ns = self.max_thrust_n = self.ranges = None
+        self.odometry = self.clock = self.simulation = None
 
-    def take_odometry(self, message: Odometry) -> None:
-        """Take in a state."""
-        self.odometry = message
+    @property
+    def max_thrust_n(self) -> float | None:
+        """Thrust with all rotors at their highest speed [N]."""
+        said = self.simulation
+        known = {} if said is None else dict(zip(said.vehicles, said.thrust_max_n, strict=False))
+        return known.get(self.vehicle)
 
-    def take_clock(self, message: Clock) -> None:
-        """Take in the time of the run."""
-        self.clock_ns = message.stamp_ns
-
-    def take_simulation(self, message: Simulation) -> None:
-        """Take in what a vehicle can do."""
-        known = dict(zip(message.vehicles, message.thrust_max_n, strict=False))
-        self.max_thrust_n = known.get(self.vehicle)
-        ranges = dict(zip(message.vehicles, message.command_ranges, strict=False))
-        self.ranges = ranges.get(self.vehicle)
+    @property
+    def ranges(self) -> CommandRanges | None:
+        """What it can be asked for."""
+        said = self.simulation
+        known = {} if said is None else dict(zip(said.vehicles, said.command_ranges, strict=False))
+        return known.get(self.vehicle)
 
     @property
     def now_ns(self) -> int | None:
-        """Time of the newest state, else that of the run [ns]; None if neither has come."""
-        odometry = self.odometry
-        return self.clock_ns if odometry is None else odometry.stamp_ns
+        """Time of the newest state, else that of the run [ns]."""
+        newest = self.odometry or self.clock
+        return None if newest is None else newest.stamp_ns

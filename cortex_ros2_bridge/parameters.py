@@ -68,10 +68,7 @@ class Parameters:
         ):
             service = backend.service(f"{node}/{service_path(name)}", f"rcl_interfaces/srv/{name}", answer)
             self._resources.callback(service.close)
-
-    def close(self) -> None:
-        """Withdraw the services."""
-        self._resources.close()
+        self.close = self._resources.close  # withdraws the services
 
     def all(self) -> dict[str, Described]:
         """Return all parameters by their names."""
@@ -95,7 +92,7 @@ class Parameters:
         with self._lock:
             known = self.all()
             for name in changes:
-                if name not in known and not _may_be_new(name):
+                if name not in known and not name.startswith(("routes.", "rename.")):  # those may be new
                     return f"unknown parameter {name!r}"
                 if name in known and known[name].fixed:
                     return f"{name} holds from the start to the end of the bridge"
@@ -185,11 +182,6 @@ def _of_route(route: Route | None, entry: RouteChange | None) -> Iterable[tuple[
     for name in sorted(known_options(route)):
         value = route.options.get(name, OPTIONS[name].default)
         yield f"options.{name}", Described(value, f"must be {OPTIONS[name].must}", False)
-
-
-def _may_be_new(name: str) -> bool:
-    """Return whether a parameter may be set that has no value now: an option, or a new entry of `routes`."""
-    return name.startswith(("routes.", "rename."))
 
 
 def _plain(value: Any) -> Any:

@@ -130,14 +130,9 @@ def look(node: Node) -> Seen:
 
 
 def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str]]:
-    """Return the routes that there are now, and what is wrong with others.
+    """Return the routes that there are now, in the order of their topics.
 
-    Args:
-        seen: What Cortex shows.
-        config: Selects and changes routes.
-
-    Returns:
-        Routes in the order of their topics, and a sentence for each topic or setting that has none.
+    And a sentence for each topic or setting that has none.
     """
     problems = _adopt(seen, config)
     routes: list[Route] = []
@@ -288,13 +283,9 @@ def _fits(change: RouteChange, route: Route) -> bool:
 def _changed(
     route: Route, changes: Sequence[RouteChange], config: BridgeConfig, images: dict[str, str]
 ) -> Route:
-    """Apply the settings to a route.
+    """Apply the settings to a route: of its entries those that fit it.
 
-    Args:
-        route: As by default.
-        changes: What fits it.
-        config: All settings.
-        images: ROS topics of the images that have been named so far, by Cortex topic; added to.
+    ROS topics of images that have been named so far, by Cortex topic, are in `images`, and are added to it.
     """
     name, named, label = route.ros_topic, False, ""
     qos: dict[str, Any] = {}

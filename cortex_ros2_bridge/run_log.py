@@ -14,11 +14,7 @@ class RunLog:
     """Says that a run has ended, and which commands the simulator refuses."""
 
     def __init__(self, reset: str) -> None:
-        """Begin with no simulator.
-
-        Args:
-            reset: Name in ROS of the service that begins another run.
-        """
+        """Begin with no simulator; `reset` is the service in ROS that begins another run."""
         self._reset = reset
         self._phase = ""
         self._refused: dict[str, Tally] = {}
@@ -31,5 +27,5 @@ class RunLog:
         for vehicle in status.vehicles:
             tally = self._refused.setdefault(vehicle.name, Tally(f"{vehicle.name}: the simulator"))
             if vehicle.refused_count > tally.refused:
-                tally.refuse(vehicle.refused_reason, vehicle.refused_count - tally.refused)
+                tally.count("refused", vehicle.refused_reason, vehicle.refused_count - tally.refused)
             tally.refused = vehicle.refused_count

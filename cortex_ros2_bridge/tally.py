@@ -6,10 +6,12 @@ import logging
 import threading
 import time
 from dataclasses import dataclass, fields
+from typing import Literal
 
 logger = logging.getLogger(__name__)
 
 SAY_INTERVAL_S = 1.0
+What = Literal["received", "sent", "lost", "refused", "clamped", "dropped"]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -45,35 +47,12 @@ class Tally(Totals):
         self._unsaid = 0
         self._lock = threading.Lock()
 
-    def receive(self, count: int = 1) -> None:
-        """Count messages that came in."""
-        self._count("received", count)
-
-    def send(self) -> None:
-        """Count a message that went out."""
-        self._count("sent", 1)
-
-    def refuse(self, reason: str, count: int = 1) -> None:
-        """Count messages that make no sense."""
-        self._count("refused", count, reason)
-
-    def clamp(self, reason: str) -> None:
-        """Count a command that was out of range."""
-        self._count("clamped", 1, reason)
-
-    def lose(self, reason: str, count: int = 1) -> None:
-        """Count messages that went missing."""
-        self._count("lost", count, reason)
-
-    def drop(self, count: int) -> None:
-        """Count what a sensor had no room for."""
-        self._count("dropped", count, "events that did not fit into the sensor's buffer")
-
     def totals(self) -> Totals:
         """Return the counts as of now."""
         return Totals(**{field.name: getattr(self, field.name) for field in fields(Totals)})
 
-    def _count(self, what: str, count: int, reason: str = "") -> None:
+    def count(self, what: What, reason: str = "", count: int = 1) -> None:
+        """Count messages; the reason is said, once a second at most."""
         with self._lock:
             setattr(self, what, getattr(self, what) + count)
             if not reason:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from importlib.resources import files
+import re
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
@@ -57,11 +58,7 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
 
 
 def define(type_name: str, text: str) -> None:
-    """Make a message type known that no distribution has.
-
-    Args:
-        type_name: Such as "my_robot/msg/Battery".
-        text: As in a .msg file.
+    """Make a type such as "my_robot/msg/Battery" known that no distribution has, by the text of a .msg file.
 
     Raises:
         ValueError: The text is no definition, or the type is known with another one.
@@ -93,31 +90,19 @@ _stores: list[Typestore] = []
 def definitions() -> dict[str, str]:
     """Return the text of each definition that the bridge brings along, by its type's name."""
     found = {}
-    for package in files("cortex_ros2_bridge").joinpath("definitions").iterdir():
-        for folder in package.iterdir():
-            for path in folder.iterdir():
-                name, _, kind = path.name.partition(".")
-                text = path.read_text(encoding="utf-8")
-                if kind == "msg":
-                    found[f"{package.name}/msg/{name}"] = text
-                elif kind == "srv":
-                    for half, part in zip(
-                        service_types(f"{package.name}/srv/{name}"), _halves(text), strict=True
-                    ):
-                        found[half] = part
+    for path in Path(__file__).with_name("definitions").glob("*/*/*"):
+        package, text = path.parts[-3], path.read_text(encoding="utf-8")
+        if path.suffix == ".msg":
+            found[f"{package}/msg/{path.stem}"] = text
+        elif path.suffix == ".srv":
+            halves = service_types(f"{package}/srv/{path.stem}")
+            found |= zip(halves, re.split("^---\n", text, flags=re.MULTILINE), strict=True)
     return dict(sorted(found.items()))
 
 
 def service_types(type_name: str) -> tuple[str, str]:
     """Return the types of a service's request and response; they are messages of their own."""
     return f"{type_name}_Request", f"{type_name}_Response"
-
-
-def _halves(text: str) -> list[str]:
-    """Split the definition of a service at its line of three dashes."""
-    lines = text.splitlines()
-    at = lines.index("---")
-    return ["\n".join(lines[:at]) + "\n", "\n".join(lines[at + 1 :]) + "\n"]
 
 
 def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
+import faulthandler
 import gc
 import logging
 import os
@@ -37,6 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     gc.set_threshold(10_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
+    if not faulthandler.is_enabled():
+        with contextlib.suppress(ValueError, OSError, RuntimeError):  # standard error may be no file
+            faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
     began_s = time.perf_counter()

@@ -29,6 +29,7 @@ from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
+from neurosim_core.scene.hall import HallConfig  # noqa: F401  registers a kind
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.sensors.base import SensorConfig, expand_stereo
 from neurosim_core.sensors.depth import DepthSensorConfig

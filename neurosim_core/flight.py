@@ -7,6 +7,7 @@ import functools
 import importlib
 import importlib.util
 import itertools
+import math
 import shutil
 import sys
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 import yaml
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -41,6 +43,7 @@ from neurosim_core.view.film import SUFFIXES as FILMS
 from neurosim_core.view.film import save_film
 from neurosim_core.view.overview import FlightSummary, Track
 from neurosim_core.view.overview_plot import save_overview
+from neurosim_core.view.rerun_batches import Table
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
 from neurosim_core.view.rerun_shapes import scene_shapes
@@ -51,6 +54,8 @@ _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
 _ROOM_BYTES = 32_000_000
 """When less is left on the disk, flight.rrd gives its place to flight.h5 [bytes]."""
 _CHECK_S = 1.0
+_CLEARANCE_NS = 100_000_000
+"""How much flight is asked for its distances at once."""
 
 
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
@@ -289,7 +294,8 @@ class _Files:
         self._model, self._folder, self._console = model, folder, console
         self._recording: RecordingWriter | None = None
         self._rerun: RerunLogger | None = None
-        self._checked_s = time.monotonic()
+        self._positions = Table("clearance", self._log_clearance, span_ns=_CLEARANCE_NS)
+        self._checked_s = -math.inf  # so before the first packet is in flight.h5
         header = header_of(model)
         if _has("h5py", console, "flight.h5"):
             self._recording = RecordingWriter(folder / "flight.h5", header)
@@ -315,8 +321,7 @@ class _Files:
         if self._rerun is not None:
             self._rerun.log(packet)
             if isinstance(packet, Odometry):
-                clearance_m = float(self._model.free_space.clearance(packet.position)[0])
-                self._rerun.log_scalar("clearance", packet.stamp_ns, clearance_m)
+                self._positions.append(packet.stamp_ns, position=packet.position)
             if time.monotonic() - self._checked_s >= _CHECK_S:
                 self._check_disk()
         if self._recording is not None:
@@ -330,6 +335,8 @@ class _Files:
         """
         if self._rerun is not None:
             self._check_disk()
+        if self._rerun is not None:
+            self._positions.send()
         logger, self._rerun = self._rerun, None
         if logger is not None:
             logger.close()
@@ -342,6 +349,12 @@ class _Files:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(OSError):  # it has been told
             self.close()
+
+    def _log_clearance(self, name: str, stamp_ns: NDArray[np.int64], position: NDArray[np.float64]) -> None:
+        """Plot the distance to what is nearest."""
+        assert self._rerun is not None
+        for stamp, clearance_m in zip(stamp_ns, self._model.free_space.clearance(position), strict=True):
+            self._rerun.log_scalar(name, int(stamp), float(clearance_m))
 
     def _check_disk(self) -> None:
         """Give flight.rrd up if it cannot be written, or takes the last room from flight.h5."""

@@ -11,6 +11,7 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -186,6 +187,26 @@ raise SystemExit(main(["run", "scene.yaml", "--out", "flight", "--device", "cpu"
     assert packets[-1].stamp_ns == round(float(kept[1]) * 1e9) > 0
     if not (tmp_path / "flight" / "flight.rrd").exists():
         assert "flight.rrd is given up" in done.stdout
+
+
+def test_a_nearly_full_disk_is_left_to_the_recording(tmp_path, monkeypatch, capsys):
+    """Before the first packet is written, not when both files have filled it."""
+    sizes = []
+
+    def little(folder):
+        sizes.append((folder / "flight.h5").stat().st_size)
+        return SimpleNamespace(free=1_000_000)
+
+    monkeypatch.setattr("shutil.disk_usage", little)
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(SETTINGS))
+    flight = tmp_path / "flight"
+    assert cli.main(["run", str(tmp_path / "scene.yaml"), "--out", str(flight), "--device", "cpu"]) == 0
+    assert "flight.rrd is given up: less than 32 MB are left" in capsys.readouterr().out
+    assert not (flight / "flight.rrd").exists()
+    with Recording(flight / "flight.h5") as recording:
+        assert len(list(recording.packets("rgb"))) > 1
+    assert len(sizes) == 1
+    assert sizes[0] < 0.5 * (flight / "flight.h5").stat().st_size
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_anything_is_prepared(tmp_path, capsys):

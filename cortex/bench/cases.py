@@ -71,7 +71,7 @@ class Case:
     repeats: int = 0
     """At most so many repetitions; 0: as many as asked for."""
     bound: float = 0.8
-    """What the first metric has to be of that of another checkout (its inverse where smaller is better)."""
+    """What rate or round trip have to be of another checkout's (the inverse where smaller is better)."""
 
     def beside(self, checkout: str) -> Case:
         """Return the case with each contestant of Cortex in Python also as another checkout has it."""
@@ -80,10 +80,13 @@ class Case:
             dataclasses.replace(c, name=f"{c.name}, before", options={**c.options, "checkout": checkout})
             for c in ours
         ]
-        metric = self.metrics[0]
-        wanted: Literal[">=", "<="] = ">=" if METRICS[metric].larger_is_better else "<="
-        bound = self.bound if wanted == ">=" else round(1.0 / self.bound, 2)
-        bars = [Bar(c.name, (f"{c.name}, before",), wanted, bound, metric) for c in ours]
+        bars = []
+        for contestant in ours:
+            metric = "rtt_p50_us" if contestant.kind == "roundtrip" else self.metrics[0]
+            rivals = (f"{contestant.name}, before",)
+            larger = METRICS[metric].larger_is_better
+            bound = self.bound if larger else round(1.0 / self.bound, 2)
+            bars.append(Bar(contestant.name, rivals, ">=" if larger else "<=", bound, metric))
         return dataclasses.replace(self, contestants=(*self.contestants, *theirs), bars=(*self.bars, *bars))
 
 

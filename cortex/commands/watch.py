@@ -16,10 +16,11 @@ import numpy as np
 from cortex.codec import MalformedMessage, codec_of
 from cortex.commands.session import CommandError, Patience, hint, open_node
 from cortex.commands.text import bytes_of, message_lines, number_of, rate, seconds, to_plain
+from cortex.link import Info
 from cortex.node import Node
 from cortex.policy import keep_last
 from cortex.schema import type_from_schema
-from cortex.subscriber import Info, Subscriber
+from cortex.subscriber import Subscriber
 
 _WAIT_S = 0.1
 _PERIOD_NS = 1_000_000_000

@@ -14,9 +14,9 @@ A file explains itself: every channel has the structure of its type. It needs th
 (`pip install mcap`).
 """
 
-from cortex.log.format import LogError
+from cortex.log.format import LogError, LogInfo, LogTopic
 from cortex.log.player import Player
-from cortex.log.reader import Log, LogInfo, LogTopic, open_log
+from cortex.log.reader import Log, open_log
 from cortex.log.recorder import Recorder, RecordStats, TopicStats
 
 __all__ = [

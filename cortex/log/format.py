@@ -11,6 +11,10 @@ record `cortex.start` says where and when, `cortex.end` what was counted, as JSO
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+from cortex.schema import Schema
+
 PROFILE = "cortex"
 MESSAGE_ENCODING = "cortex"
 SCHEMA_ENCODING = "cortex-json"
@@ -34,3 +38,36 @@ def require_mcap() -> None:
         raise ImportError(
             "recordings need the library mcap, which is not installed: pip install mcap"
         ) from error
+
+
+class LogInfo(NamedTuple):
+    """What is known of a recorded message besides its content."""
+
+    topic: str
+    node: str
+    """Name of the node that published it."""
+    source: int
+    """The publisher's number."""
+    sequence: int
+    """The low 32 bits of the publisher's sequence number."""
+    stamp_ns: int | None
+    """The message's own time, if its type has one [ns]."""
+    publish_ns: int
+    """When it was published [ns since 1970]."""
+    log_ns: int
+    """When it was received [ns since 1970]."""
+    size: int
+    """Bytes of the body."""
+
+
+class LogTopic(NamedTuple):
+    """One topic of a recording; one of two entries if it was published with two types."""
+
+    topic: str
+    schema: Schema
+    message_count: int
+    """Messages."""
+    nodes: tuple[str, ...]
+    """Names of the nodes that published it."""
+    latch: bool
+    """Whether one of them gave its last message to late joiners."""

@@ -8,7 +8,8 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 
-from cortex.log.reader import Log, LogInfo
+from cortex.log.format import LogInfo
+from cortex.log.reader import Log
 from cortex.node import Node
 from cortex.publisher import Publisher
 from cortex.raw import RawMessage

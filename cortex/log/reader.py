@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from cortex.codec import codec_of
 from cortex.layout import SCALAR_CODES, measure_fields
-from cortex.log.format import END, MESSAGE_ENCODING, SCHEMA_ENCODING, START, LogError, require_mcap
+from cortex.log.format import (
+    END,
+    MESSAGE_ENCODING,
+    SCHEMA_ENCODING,
+    START,
+    LogError,
+    LogInfo,
+    LogTopic,
+    require_mcap,
+)
 from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
 
 if TYPE_CHECKING:
@@ -29,39 +38,6 @@ _CHUNK_HEAD = struct.Struct("<QQQII")
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES = 16
 _CHUNK_MAX = 4 << 30
-
-
-class LogInfo(NamedTuple):
-    """What is known of a recorded message besides its content."""
-
-    topic: str
-    node: str
-    """Name of the node that published it."""
-    source: int
-    """The publisher's number."""
-    sequence: int
-    """The low 32 bits of the publisher's sequence number."""
-    stamp_ns: int | None
-    """The message's own time, if its type has one [ns]."""
-    publish_ns: int
-    """When it was published [ns since 1970]."""
-    log_ns: int
-    """When it was received [ns since 1970]."""
-    size: int
-    """Bytes of the body."""
-
-
-class LogTopic(NamedTuple):
-    """One topic of a recording; one of two entries if it was published with two types."""
-
-    topic: str
-    schema: Schema
-    message_count: int
-    """Messages."""
-    nodes: tuple[str, ...]
-    """Names of the nodes that published it."""
-    latch: bool
-    """Whether one of them gave its last message to late joiners."""
 
 
 class _Channel(NamedTuple):

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from cortex.context import Closed
+from cortex.link import Info
 from cortex.log.format import (
     END,
     FORMAT_VERSION,
@@ -35,7 +36,7 @@ from cortex.node import Node
 from cortex.policy import Policy, reliable
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
-from cortex.subscriber import Info, Subscriber
+from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)

@@ -47,7 +47,7 @@ class BagBackend:
     """
 
     name = "bag"
-    failure = trouble = ""
+    failure = ""
 
     def __init__(self, path: str | Path, *, distro: str | None = None, storage: str = "mcap") -> None:
         """Begin a bag; see `choose.open_backend`. The storage is "mcap" or "sqlite3".

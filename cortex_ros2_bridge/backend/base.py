@@ -93,7 +93,8 @@ class RosService(Protocol):
 class Backend(Protocol):
     """One participant of a ROS 2 graph: a node.
 
-    All functions may be called from any thread.
+    All functions may be called from any thread. Those that take a type raise `ValueError` where it is
+    unknown, or the name is not valid.
     """
 
     name: str
@@ -105,16 +106,8 @@ class Backend(Protocol):
     def failure(self) -> str:
         """Why nothing is received any more, for good; empty while all is well."""
 
-    @property
-    def trouble(self) -> str:
-        """What went wrong and was mended; empty if nothing was."""
-
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
-        """Publish on a topic.
-
-        Raises:
-            ValueError: The type is unknown, or the topic's name is not valid.
-        """
+        """Publish on a topic."""
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
@@ -122,17 +115,10 @@ class Backend(Protocol):
         """Subscribe to a topic; the callback is called with every message, on a thread of the backend.
 
         At most `qos.depth` messages wait for a callback that is busy; newer ones push out the oldest.
-
-        Raises:
-            ValueError: The type is unknown, or the topic's name is not valid.
         """
 
     def service(self, name: str, type_name: str, callback: Serve) -> RosService:
-        """Answer requests to a service such as of type "std_srvs/srv/Trigger", on a thread of the backend.
-
-        Raises:
-            ValueError: The type is unknown, or the name is not valid.
-        """
+        """Answer requests to a service such as of type "std_srvs/srv/Trigger", on a thread of the backend."""
 
     def topics(self) -> list[TopicInfo]:
         """Return what is seen on the other side now, in order of names; own endpoints do not count."""

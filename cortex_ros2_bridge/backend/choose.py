@@ -12,7 +12,7 @@ from cortex_ros2_bridge.backend.names import check_kind
 
 _log = logging.getLogger(__name__)
 
-INSTALL = "pip install rosbags 'cyclonedds>=11,<12'"
+INSTALL = "pip install 'cyclonedds>=11,<12' (no wheels for Python 3.14 and ARM Linux: source a ROS there)"
 
 
 def open_backend(

@@ -85,7 +85,7 @@ class DdsBackend:
     """A node of ROS 2 that speaks DDS itself."""
 
     name = "dds"
-    failure = trouble = ""
+    failure = ""
 
     def __init__(
         self,
@@ -111,11 +111,6 @@ class DdsBackend:
             self.graph = Graph(self.participant, node_name=node_name, namespace=namespace, distro=known)
         except (DDSException, Refused) as error:
             raise BackendError(f"DDS does not start in domain {number}: {error}") from error
-
-    @property
-    def layout(self) -> str | None:
-        """Distribution as which the node is announced; None as long as it is not, because nobody is there."""
-        return self.graph.layout
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> DdsPublisher:
         """Publish on a topic."""

@@ -45,6 +45,7 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
 Kind = Literal["writer", "reader"]
+_DISCOVERED = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 _CLOSE_S = 5.0
 _BATCH = 64
 _WITHOUT_HASH = next(name for name, distro in DISTROS.items() if not distro.shows_type_hash)
@@ -72,6 +73,9 @@ class Graph:
     """Follows discovery on a thread of its own, and announces a node once it knows how.
 
     Without a distribution, that of the first node of ROS that is seen decides the layout.
+
+    Attributes:
+        layout: Distribution whose layout is announced: "humble" or a later one; None: not known yet.
     """
 
     def __init__(
@@ -86,7 +90,7 @@ class Graph:
         self._endpoints: dict[bytes, Endpoint] = {}
         self._warned: set[bool] = set()
         self._writer: Any = None
-        self._layout: str | None = None
+        self.layout: str | None = None
         if distro is not None:
             self._speak(distro)
         self._open = True
@@ -94,11 +98,6 @@ class Graph:
             self._guard = GuardCondition(participant)
         self._thread = threading.Thread(target=self._follow, name="ros-graph", daemon=True)
         self._thread.start()
-
-    @property
-    def layout(self) -> str | None:
-        """Distribution whose layout is announced: "humble" or a later one; None: not known yet."""
-        return self._layout
 
     def add(self, guid: bytes, endpoint: Endpoint) -> None:
         """Announce an endpoint of ours."""
@@ -136,7 +135,9 @@ class Graph:
 
     def _follow(self) -> None:
         try:
-            waitset, readers = self._watch()
+            with ENTITIES:
+                readers = [BuiltinDataReader(self._participant, kind) for kind in _DISCOVERED]
+                waitset = wait_set(self._participant, self._guard, readers)
             while self._open:
                 self._take_participants(readers[0])
                 self._take_endpoints(readers[1], "writer")
@@ -146,13 +147,6 @@ class Graph:
         except (DDSException, Refused):
             if self._open:
                 _log.exception("the ROS graph is not followed any more")
-
-    def _watch(self) -> tuple[Any, list[Any]]:
-        """Return what wakes the thread up, and readers of participants, writers and readers of others."""
-        kinds = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
-        with ENTITIES:
-            readers = [BuiltinDataReader(self._participant, kind) for kind in kinds]
-            return wait_set(self._participant, self._guard, readers), readers
 
     def _take_participants(self, reader: Any) -> None:
         for sample, alive in _samples(reader):
@@ -193,17 +187,17 @@ class Graph:
                 if endpoint.topic.startswith((TOPIC_PREFIX + "/", DISCOVERY_TOPIC))
                 and self._is_ros(endpoint.participant)
             }
-            if self._layout is None and heard:
+            if self.layout is None and heard:
                 # In company of both, that without hashes: what is wrong there breaks the tools of everybody.
                 self._speak(DEFAULT_DISTRO if min(heard) else _WITHOUT_HASH)
-            spoken = DISTROS[self._layout].shows_type_hash if self._layout else True
+            spoken = DISTROS[self.layout].shows_type_hash if self.layout else True
             for stranger in sorted(heard - {spoken}):
                 if stranger not in self._warned:
                     self._warned.add(stranger)
                     _log.warning(
                         "nodes of ROS %s are here too: they cannot see this node's name, announced as in %s",
                         "Iron or later" if stranger else _WITHOUT_HASH.capitalize(),
-                        self._layout,
+                        self.layout,
                     )
 
     def _is_ros(self, participant: bytes) -> bool:
@@ -224,18 +218,18 @@ class Graph:
         with ENTITIES:
             topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
             self._writer = DataWriter(self._participant, topic, qos)
-        self._layout = distro
+        self.layout = distro
         self._announce()
 
     def _announce(self) -> None:
-        if self._writer is None or self._layout is None:
+        if self._writer is None or self.layout is None:
             return
-        store = typestore(self._layout)
+        store = typestore(self.layout)
         info, node, gid = (
             store.types[f"rmw_dds_common/msg/{name}"]
             for name in ("ParticipantEntitiesInfo", "NodeEntitiesInfo", "Gid")
         )
-        gid_bytes = DISTROS[self._layout].gid_bytes
+        gid_bytes = DISTROS[self.layout].gid_bytes
 
         def as_gid(guid: bytes) -> Any:
             return gid(data=np.frombuffer(guid.ljust(gid_bytes, b"\0"), dtype=np.uint8))

@@ -19,10 +19,7 @@ _structs: dict[tuple[str, str, bool], Any] = {}
 def idl_struct(type_name: str, distro: str, header: Mapping[str, Any] | None = None) -> Any:
     """Return the class of cyclonedds for a message, as a distribution defines it.
 
-    Args:
-        type_name: Such as "sensor_msgs/msg/Imu".
-        distro: The distribution.
-        header: Fields before those of the message, always the same ones for a type.
+    Fields of a `header`, always the same ones for a type, go before its own.
 
     Raises:
         ValueError: The type is unknown, or has a field for which DDS has no type.

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import importlib
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -31,39 +29,31 @@ _CLOSE_S = 3.0
 """Longest wait for an executor that was told to end [s]."""
 _CALL_S = 10.0
 """Longest wait for an executor to make or destroy something [s]."""
-_RESTART_COUNT_MAX = 10
-"""An executor that fails more often than this within `_RESTART_PERIOD_S` is given up."""
-_RESTART_PERIOD_S = 10.0
 _TAKE_COUNT_MAX = 32
 """So many messages of a topic are taken before others have their turn."""
 _SERVICES = "_services"
 """Added to the node's name for the node of its services; `ros2 node list` hides names with a leading "_"."""
 _Result = TypeVar("_Result")
-_Part = TypeVar("_Part", bound="_Endpoint")
 
 
 class _Loop:
     """A node, and the thread that executes its callbacks.
 
     Everything that the executor waits for is made and destroyed on its thread, between two waits: a handle
-    that another thread destroys while the executor builds its wait set ends the executor of Humble. An
-    executor that fails nevertheless is replaced, and what it waited for is made anew.
+    that another thread destroys while the executor builds its wait set ends the executor of Humble. One
+    that fails nevertheless may never look at some of its endpoints again, and is not used any more.
 
     Attributes:
         node: The node of rclpy.
         failure: Why it is dead for good; empty while it lives.
-        restart_count: How often the executor was replaced.
-        restart_reason: Why, the last time.
     """
 
     def __init__(self, context: Any, name: str, namespace: str) -> None:
         import rclpy
+        from rclpy.executors import SingleThreadedExecutor
 
         self.failure = ""
-        self.restart_count = 0
-        self.restart_reason = ""
         self._context = context
-        self._restarts_s: deque[float] = deque(maxlen=_RESTART_COUNT_MAX + 1)
         self._jobs: deque[Callable[[], None]] = deque()
         self._endpoints: dict[_Endpoint, None] = {}
         self._closed = False
@@ -74,7 +64,8 @@ class _Loop:
             use_global_arguments=False,
             start_parameter_services=False,
         )
-        self._executor: Any = self._make_executor()
+        self._executor: Any = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._run, name=f"executor {name}", daemon=True)
         self._thread.start()
 
@@ -107,18 +98,16 @@ class _Loop:
     def defer(self, job: Callable[[], None]) -> None:
         """Have a function called on the executor's thread, after the callback that runs now."""
         self._jobs.append(job)
-        with contextlib.suppress(Exception):  # it is being replaced: the new one begins with the jobs
-            self._executor.create_task(self._work)
+        self._executor.create_task(self._work)
 
-    def add(self, endpoint: _Part) -> _Part:
-        """Make the handle of an endpoint, and keep it over a restart."""
+    def add(self, endpoint: _Endpoint) -> None:
+        """Make the handle of an endpoint."""
 
         def make() -> None:
             endpoint.handle = endpoint.make(self.node)
             self._endpoints[endpoint] = None
 
         self.call(make)
-        return endpoint
 
     def remove(self, endpoint: _Endpoint) -> None:
         """Destroy the handle of an endpoint."""
@@ -127,7 +116,7 @@ class _Loop:
             if endpoint in self._endpoints:
                 del self._endpoints[endpoint]
                 handle, endpoint.handle = endpoint.handle, None
-                endpoint.destroy(self.node, handle)
+                getattr(self.node, endpoint.destroyer)(handle)
 
         if self._closed or self.failure:
             endpoint.handle = None  # it went with the node
@@ -155,50 +144,18 @@ class _Loop:
         self._executor.shutdown(timeout_sec=0.0)
         self.node.destroy_node()
 
-    def _make_executor(self) -> Any:
-        from rclpy.executors import SingleThreadedExecutor
-
-        executor = SingleThreadedExecutor(context=self._context)
-        executor.add_node(self.node)
-        return executor
-
     def _run(self) -> None:
         while not self._closed and not self.failure:
+            reason = ""
             try:
                 self._executor.spin_once()
-                if not self._context.ok() and not self._closed:
-                    self.failure = "the context of rclpy was shut down from outside"
-            except Exception as error:  # whatever rclpy raises: the node must not go deaf
-                self._restart(error)
-        if self.failure:
-            _log.error("%s: nothing is received any more", self.failure)
-
-    def _restart(self, error: Exception) -> None:
-        """Replace the executor, and make anew what it waits for: it may never look at the old ones again."""
-        if self._closed:
-            return
-        reason = f"{type(error).__name__}: {error}"
-        now_s = time.monotonic()
-        self._restarts_s.append(now_s)
-        self.restart_count += 1
-        self.restart_reason = reason
-        if not self._context.ok():
-            self.failure = "the context of rclpy was shut down from outside"
-        elif len(self._restarts_s) > _RESTART_COUNT_MAX and now_s - self._restarts_s[0] < _RESTART_PERIOD_S:
-            self.failure = f"the executor of rclpy fails again and again: {reason}"
-        if self.failure:
-            return
-        _log.warning("the executor of rclpy has failed and is restarted: %s", reason, exc_info=error)
-        try:
-            self._executor.shutdown(timeout_sec=0.0)
-            self._executor = self._make_executor()
-            for endpoint in self._endpoints:
-                if endpoint.is_waited_for:
-                    endpoint.destroy(self.node, endpoint.handle)
-                    endpoint.handle = endpoint.make(self.node)
-            self._executor.create_task(self._work)
-        except Exception as fatal:  # nothing is left that could be tried
-            self.failure = f"the executor of rclpy cannot be restarted: {type(fatal).__name__}: {fatal}"
+            except Exception as error:  # whatever rclpy raises: the node must not go deaf unnoticed
+                reason = f"the executor of rclpy has failed: {type(error).__name__}: {error}"
+            if not self._context.ok():
+                reason = "the context of rclpy was shut down from outside"
+            if reason and not self._closed:
+                self.failure = reason
+                _log.error("%s: nothing is received any more", reason)
 
     def _work(self) -> None:
         while self._jobs:
@@ -240,56 +197,24 @@ class RclpyBackend:
         """Why nothing is received any more, for good; empty while all is well."""
         return next((loop.failure for loop in self._loops() if loop.failure), "")
 
-    @property
-    def trouble(self) -> str:
-        """What went wrong and was mended; empty if nothing was."""
-        return "; ".join(
-            f"the executor of rclpy failed and was restarted, {loop.restart_count} times by now "
-            f"({loop.restart_reason})"
-            for loop in self._loops()
-            if loop.restart_count
-        )
-
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
-        check_name(topic)
-        kind, profile = _interface(type_name), _profile(qos)
-        loop = self._here()
-        quiet = _no_events("PublisherEventCallbacks")
-        made = RclpyPublisher(
-            loop, topic, lambda node: node.create_publisher(kind, topic, profile, event_callbacks=quiet)
-        )
-        made.seen_qos = qos.seen()
-        return loop.add(made)
+        return RclpyPublisher(self._here(), topic, type_name, qos)
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> RclpySubscription:
         """Subscribe to a topic; all subscriptions share a thread."""
-        check_name(topic)
-        kind, profile = _interface(type_name), _profile(qos)
-        loop = self._here()
-        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
-        made = RclpySubscription(
-            loop, topic, lambda node: node.create_subscription(kind, topic, made.take, profile, **arguments)
-        )
-        made.seen_qos = qos.seen()
-        made.deliver = Delivery(callback, topic)
-        return loop.add(made)
+        return RclpySubscription(self._here(), topic, type_name, qos, callback)
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
         """Answer requests to a service; all services share a node and a thread of their own."""
-        check_name(name)
-        kind = _interface(type_name)
         with self._lock:
             self._here()
             if self._service_loop is None:
                 node_name, namespace = self._names
                 self._service_loop = _Loop(self._context, f"_{node_name}{_SERVICES}", namespace)
-        loop = self._service_loop
-        made = RclpyService(loop, name, lambda node: node.create_service(kind, name, made.answer))
-        made.callback = callback
-        return loop.add(made)
+        return RclpyService(self._service_loop, name, type_name, callback)
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
@@ -299,7 +224,7 @@ class RclpyBackend:
         me = node.get_name(), node.get_namespace()
         found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         for topic, _ in node.get_topic_names_and_types():
-            for end, kind in enumerate((RclpyPublisher, RclpySubscription)):
+            for end, kind in enumerate(_ENDS):
                 own = [part.seen_qos for part in parts if isinstance(part, kind) and part.topic == topic]
                 for each in getattr(node, kind.lister)(topic):
                     qos = _qos_of(each)
@@ -319,11 +244,6 @@ class RclpyBackend:
             loop.close()
         self._context.try_shutdown()
 
-    @property
-    def node(self) -> Any:
-        """The node of rclpy."""
-        return self._loop.node
-
     def _loops(self) -> list[_Loop]:
         return [self._loop] if self._service_loop is None else [self._loop, self._service_loop]
 
@@ -338,28 +258,26 @@ class _Endpoint:
 
     Attributes:
         topic: Its topic, or the name of the service.
+        seen_qos: As discovery tells it.
         handle: What rclpy has for it; None once it is closed.
-        make: Makes the handle for a node.
     """
 
-    is_waited_for = True
-    """Whether the executor waits for it."""
-    seen_qos = Qos()
-    """As discovery tells it."""
     lister = ""
     """What the node lists those of a topic with."""
     destroyer = ""
     """What the node destroys a handle with."""
 
-    def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
-        self.topic = topic
+    def __init__(self, loop: _Loop, topic: str, type_name: str, qos: Qos) -> None:
+        self.topic = check_name(topic)
+        self.seen_qos = qos.seen()
         self.handle: Any = None
-        self.make = make
         self._loop = loop
+        self._kind, self._profile = _interface(type_name), _profile(qos)
+        loop.add(self)
 
-    def destroy(self, node: Any, handle: Any) -> None:
-        """Destroy the handle."""
-        getattr(node, self.destroyer)(handle)
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Withdraw it."""
@@ -370,9 +288,13 @@ class _Endpoint:
 class RclpyPublisher(_Endpoint):
     """Publishes on one topic."""
 
-    is_waited_for = False
-    destroyer = "destroy_publisher"
     lister = "get_publishers_info_by_topic"
+    destroyer = "destroy_publisher"
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        quiet = _no_events("PublisherEventCallbacks")
+        return node.create_publisher(self._kind, self.topic, self._profile, event_callbacks=quiet)
 
     @property
     def subscriber_count(self) -> int:
@@ -395,11 +317,21 @@ class RclpyPublisher(_Endpoint):
 class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
-    destroyer = "destroy_subscription"
     lister = "get_subscriptions_info_by_topic"
+    destroyer = "destroy_subscription"
     lost_count = 0
     """rclpy does not tell."""
-    deliver: Delivery
+
+    def __init__(
+        self, loop: _Loop, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
+    ) -> None:
+        self.deliver = Delivery(callback, topic)
+        super().__init__(loop, topic, type_name, qos)
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
+        return node.create_subscription(self._kind, self.topic, self.take, self._profile, **arguments)
 
     def take(self, message: bytes) -> None:
         """Deliver a message, and those that have come meanwhile.
@@ -432,15 +364,25 @@ class RclpyService(_Endpoint):
     """Answers the requests to one service."""
 
     destroyer = "destroy_service"
-    callback: Serve
+
+    def __init__(self, loop: _Loop, name: str, type_name: str, callback: Serve) -> None:
+        self._callback = callback
+        super().__init__(loop, name, type_name, Qos())
+
+    def make(self, node: Any) -> Any:
+        """Return a handle of a node."""
+        return node.create_service(self._kind, self.topic, self.answer)
 
     def answer(self, request: Any, response: Any) -> Any:
         """Answer a request; an empty response where the callback raises."""
         try:
-            return self.callback(request, response)
+            return self._callback(request, response)
         except Exception:  # whatever it raises: the client gets an answer, and the node goes on
             _log.exception("the service %s failed", self.topic)
             return type(response)()
+
+
+_ENDS: tuple[type[_Endpoint], ...] = (RclpyPublisher, RclpySubscription)
 
 
 def _interface(type_name: str) -> Any:

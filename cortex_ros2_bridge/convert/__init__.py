@@ -7,14 +7,13 @@ convention in ROS is said at each function. What cannot be used is refused, with
 from cortex_ros2_bridge.convert import camera, commands, events, robot, simulator, state
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.registry import RULES, from_ros, share, to_ros
-from cortex_ros2_bridge.convert.state import check_transform, static_transforms
+from cortex_ros2_bridge.convert.state import static_transforms, transform_of
 
 __all__ = [
     "RULES",
     "Context",
     "ConvertError",
     "camera",
-    "check_transform",
     "commands",
     "events",
     "from_ros",
@@ -24,4 +23,5 @@ __all__ = [
     "state",
     "static_transforms",
     "to_ros",
+    "transform_of",
 ]

@@ -8,7 +8,6 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortex import messages
 from cortex_ros2_bridge.convert.context import Context, ConvertError
@@ -117,7 +116,10 @@ def point_cloud(message: messages.PointCloud, context: Context) -> Any:
     for axis, name in enumerate("xyz"):
         points[name] = message.points[:, axis]
     for name in names:
-        points[name] = _of_length(name, getattr(message, name), count)
+        values = getattr(message, name)
+        if len(values) != count:
+            raise ConvertError(f"a point cloud with {count} points and {len(values)} values of {name}")
+        points[name] = values
     is_timed = message.t is not None and not message.deskewed
     describe = record("sensor_msgs/msg/PointField")
     fields = [
@@ -205,9 +207,3 @@ def pixel_type(encoding: str) -> tuple[np.dtype[Any], int]:
         known = ", ".join(_NAMED_PIXELS)
         raise ConvertError(f"unknown encoding {encoding!r} of an image, known: {known}, and such as 32FC1")
     return np.dtype(kind), channels
-
-
-def _of_length(name: str, values: NDArray[Any], count: int) -> NDArray[Any]:
-    if len(values) != count:
-        raise ConvertError(f"a point cloud with {count} points and {len(values)} values of {name}")
-    return values

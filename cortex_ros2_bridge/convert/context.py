@@ -93,12 +93,6 @@ class Context:
             return np.asarray(direction * (highest / size))
         return np.asarray(np.clip(value, -highest, highest))
 
-    def remembered(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return what is kept under a name; made when it is first asked for."""
-        if name not in self.memory:
-            self.memory[name] = make()
-        return self.memory[name]
-
 
 _VECTORS = ("velocity", "body rate")
 _LIMITS = {

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from cortex import messages
-from cortex.evt3 import Bytes, EventCodecError, EventColumns, Evt3Encoder
-from cortex_ros2_bridge import cdr
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Encoder, check_pixels
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
-from cortex_ros2_bridge.event_codec import EventPicture, encode_mono
+from cortex_ros2_bridge.event_codec import encode_mono
 
-_NO_BYTES: Bytes = np.empty(0, np.uint8)
+_COLORS = np.array([[255, 255, 255], [220, 30, 30], [30, 60, 220]], np.uint8)
+"""Red, green, blue of a pixel without events, that became darker, that became brighter."""
 
 
 @standard(messages.Events, "event_camera_msgs/EventPacket", "{topic}", PACKETS, "encoding")
@@ -27,37 +27,29 @@ def event_packet(message: messages.Events, context: Context) -> Any:
     window. `time_base` is that time in mono, and 0 in evt3, where it has no meaning.
     """
     encoding = context.option("encoding")
-    stamp_ns = _events_stamp_ns(message)
+    stamp_ns = int(message.t[0]) * 1000 if len(message.t) else message.stamp_ns
     base_us = stamp_ns // 1000
-    if encoding == "mono" and base_us < 0:
-        raise ConvertError(f"mono holds no time before 0, got {base_us} us")
-    prefix = cdr.encode(
-        record("event_camera_msgs/msg/EventPacket")(
-            header(stamp_ns, message.frame_id or context.frame_id, context),
-            message.height,
-            message.width,
-            message.sequence,
-            base_us * 1000 if encoding == "mono" else 0,
-            encoding,
-            False,
-            _NO_BYTES,
-        )
-    )
-    room = _Room(prefix)
-    columns = _columns(message)
+    columns = EventColumns(message.t, message.x, message.y, message.polarity)
+    size = {"width": message.width, "height": message.height}
     try:
         if encoding == "mono":
-            encode_mono(
-                columns, width=message.width, height=message.height, base_us=base_us, allocate=room.make
-            )
+            if base_us < 0:
+                raise ConvertError(f"mono holds no time before 0, got {base_us} us")
+            data = encode_mono(columns, **size, base_us=base_us)
         else:
-            encoder = context.remembered("evt3", Evt3Encoder)
-            encoder.encode(
-                columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
-            )
+            data = context.memory.setdefault("evt3", Evt3Encoder()).encode(columns, **size, end_us=base_us)
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
-    return room.message()
+    return record("event_camera_msgs/msg/EventPacket")(
+        header(stamp_ns, message.frame_id or context.frame_id, context),
+        message.height,
+        message.width,
+        message.sequence,
+        base_us * 1000 if encoding == "mono" else 0,
+        encoding,
+        False,
+        data,
+    )
 
 
 @standard(messages.Events, "sensor_msgs/Image", "{topic}/image", FRAMES, "period_s")
@@ -68,28 +60,28 @@ def event_image(message: messages.Events, context: Context) -> Any:
     of simulated time. A picture ends with the window in which a multiple of the period lies, and has its
     stamp.
     """
-    size = (int(message.width), int(message.height))
-    if context.memory.get("picture_size") != size:
-        context.memory["picture_size"] = size
-        context.memory["picture"] = EventPicture(width=size[0], height=size[1])
-    picture: EventPicture = context.memory["picture"]
+    shape = int(message.height), int(message.width)
+    last = context.memory.get("picture")
+    if last is None or last.shape != shape:
+        last = context.memory["picture"] = np.zeros(shape, np.uint8)
     if message.stamp_ns < context.memory.get("seen_until_ns", message.stamp_ns):  # time was set back
-        picture.take()
+        last[:] = 0
     ends = _ends_picture(message, context)
     try:
-        picture.add(message.x, message.y, message.polarity)
+        check_pixels(message.x, message.y, message.polarity, shape[1], shape[0])
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
+    last[message.y, message.x] = message.polarity + np.uint8(1)
     if not ends:
         return None
-    data = picture.take()
+    data = _COLORS.take(last, axis=0)
+    last[:] = 0
     return record("sensor_msgs/msg/Image")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
-        size[1],
-        size[0],
+        *shape,
         "rgb8",
         0,
-        3 * size[0],
+        3 * shape[1],
         data.reshape(-1),
     )
 
@@ -116,34 +108,3 @@ def _ends_picture(message: messages.Events, context: Context) -> bool:
     context.memory["seen_until_ns"] = message.stamp_ns
     begin_ns = until_ns if until_ns <= message.stamp_ns else message.start_ns
     return bool(message.stamp_ns // period_ns > begin_ns // period_ns)
-
-
-def _columns(message: messages.Events) -> EventColumns:
-    return EventColumns(message.t, message.x, message.y, message.polarity)
-
-
-class _Room:
-    """Makes room behind the beginning of a message for what its last field holds: nothing is copied twice."""
-
-    def __init__(self, prefix: memoryview) -> None:
-        """Begin with a message whose last field is an empty sequence: the last 4 bytes are its length, 0."""
-        self._prefix = prefix
-        self._buffer = _NO_BYTES
-
-    def make(self, size: int) -> Bytes:
-        """Return so many bytes to write to, and up to 3 more."""
-        begin = len(self._prefix)
-        self._buffer = np.empty(begin + (size + 3 & -4), np.uint8)
-        self._buffer[:begin] = self._prefix
-        self._buffer[begin - 4 : begin].view("<u4")[0] = size
-        self._buffer[begin + size :] = 0
-        return self._buffer[begin:]
-
-    def message(self) -> memoryview:
-        """Return the message."""
-        return self._buffer.data.toreadonly()
-
-
-def _events_stamp_ns(message: messages.Events) -> int:
-    """Return the time of the first event, or of the end of a window without any [ns]."""
-    return int(message.t[0]) * 1000 if len(message.t) else message.stamp_ns

@@ -86,31 +86,38 @@ def standard(
     *options: str,
     default: bool = True,
     direction: Direction = "out",
+    robot: bool = False,
 ) -> Callable[[F], F]:
-    """Register a conversion of the bridge's own, which makes a record or CDR; see `Rule`."""
+    """Register a conversion of the bridge's own; see `Rule`.
+
+    One to ROS makes a record or CDR, one from ROS takes a plain record.
+    """
+    to = ros_type.replace("/", "/msg/")
 
     def register(function: F) -> F:
-        _add_rule(kind, ros_type, direction, name, qos, encoded(function), default, options)
+        convert = encoded(function) if direction in ("out", "record") else _decoded(function, to)
+        source = schema_of(kind).name
+        RULES.append(Rule(source, to, direction, name, qos, convert, default, frozenset(options), robot))
         return function
 
     return register
 
 
 def recorded(kind: type[Any], ros_type: str, name: str, *options: str) -> Callable[[F], F]:
-    """Register a conversion of commands for bags, as `standard`; `name` is below {base}."""
+    """Register a conversion of commands for bags; `name` is below {base}."""
     return standard(kind, ros_type, f"{{base}}/{name}", NEWEST, *options, direction="record")
 
 
 def command(
     kind: type[Any], ros_type: str, name: str, *options: str, default: bool = True
 ) -> Callable[[F], F]:
-    """Register a conversion of commands, which takes plain records; `name` is below {base}."""
-    return _incoming(kind, ros_type, "in", f"{{base}}/{name}", default, options)
+    """Register a conversion of commands; `name` is below {base}."""
+    return standard(kind, ros_type, f"{{base}}/{name}", NEWEST, *options, default=default, direction="in")
 
 
 def request(kind: type[Any], ros_type: str, name: str = "{topic}") -> Callable[[F], F]:
-    """Register a conversion of requests, likewise."""
-    return _incoming(kind, ros_type, "call", name, True, ())
+    """Register a conversion of requests."""
+    return standard(kind, ros_type, name, direction="call")
 
 
 def encoded(function: Callable[..., Any]) -> Out:
@@ -124,25 +131,12 @@ def encoded(function: Callable[..., Any]) -> Out:
     return convert
 
 
-def _incoming(kind: type[Any], ros_type: str, direction: Direction, *rest: Any) -> Callable[[F], F]:
-    name, default, options = rest
+def _decoded(function: Callable[..., Any], ros_type: str) -> Callable[[Buffer, Context], Any]:
+    @functools.wraps(function)
+    def convert(data: Buffer, context: Context) -> Any:
+        return function(cdr.decode_record(data, ros_type), context)
 
-    def register(function: F) -> F:
-        def convert(data: Buffer, context: Context) -> Any:
-            return function(cdr.decode_record(data, ros_type.replace("/", "/msg/")), context)
-
-        functools.update_wrapper(convert, function)
-        qos = NEWEST if direction == "in" else Qos()
-        _add_rule(kind, ros_type, direction, name, qos, convert, default, options)
-        return function
-
-    return register
-
-
-def _add_rule(kind: type[Any], ros_type: str, *rest: Any) -> None:
-    direction, name, qos, convert, default, options = rest
-    to = ros_type.replace("/", "/msg/")
-    RULES.append(Rule(schema_of(kind).name, to, direction, name, qos, convert, default, frozenset(options)))
+    return convert
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,11 +271,7 @@ def _picture_rules(plain: Any) -> Iterable[Rule]:
 
 
 def load_converters(modules: Iterable[str]) -> list[str]:
-    """Import modules with conversions: those of entry points, and others; returns what went wrong.
-
-    Args:
-        modules: Names of modules, or files that end in .py.
-    """
+    """Import modules with conversions, of entry points and by name or file (.py); returns what went wrong."""
     problems = []
     entries = [(each.name, each.load) for each in importlib.metadata.entry_points(group=GROUP)]
     for name, load in [*entries, *((each, lambda each=each: _import(each)) for each in modules)]:
@@ -318,6 +308,7 @@ def _add(kind: type[Any], rule: Rule) -> None:
 _SCALARS = {"bool", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64))}
 
 
+@functools.cache
 def ros_type_of(name: str) -> str:
     """Return what a type of Cortex is called in ROS: my_robot/msg/Battery for my_robot/Battery.
 
@@ -381,56 +372,40 @@ def _ros_field(kind: Any, name: str) -> str:
 
 def _writer(plain: Any, ros_type: str) -> Out:
     """Return the conversion to ROS of messages of a schema."""
-    convert = _to_record(plain, ros_type)
-    return lambda message, context: cdr.encode(convert(message, context))
+    return lambda message, context: cdr.encode(_to_record(plain, ros_type, message, context))
 
 
-def _to_record(plain: Any, ros_type: str) -> Callable[[Any, Context], Any]:
-    fields = [(field["name"], _to_value(field["type"])) for field in plain["fields"]]
-    names = [name for name, _ in fields]
-    make = record(ros_type)
+def _to_record(plain: Any, ros_type: str, message: Any, context: Context) -> Any:
+    is_stamped = any(field["name"] == "stamp_ns" for field in plain["fields"])
+    values: list[Any] = []
+    if is_stamped:
+        frame = getattr(message, "frame_id", "") or context.frame_id
+        values.append(header(message.stamp_ns, frame, context))
+    for field in plain["fields"]:
+        name, kind = field["name"], field["type"]
+        if is_stamped and name in ("stamp_ns", "frame_id"):
+            continue
+        value = getattr(message, name)
+        values.append(_to_value(kind, value, context))
+        if isinstance(kind, dict) and len(kind.get("shape", ())) > 1:
+            values.append(np.array(np.shape(value), np.uint32))
+    return record(ros_type)(*values)
 
-    def convert(message: Any, context: Context) -> Any:
-        values: list[Any] = []
-        if "stamp_ns" in names:
-            frame = getattr(message, "frame_id", "") or context.frame_id
-            values.append(header(message.stamp_ns, frame, context))
-        for name, to_value in fields:
-            if name != "stamp_ns" and not (name == "frame_id" and "stamp_ns" in names):
-                values += to_value(getattr(message, name), context)
-        return make(*values)
 
-    return convert
-
-
-def _to_value(kind: Any) -> Callable[[Any, Context], list[Any]]:
-    """Return what makes the values in ROS of a field: one, or for arrays of more dimensions two."""
-    if kind == "bytes":
-        return lambda value, _: [np.frombuffer(bytes(value), np.uint8)]
+def _to_value(kind: Any, value: Any, context: Context) -> Any:
+    """Return the value in ROS of a field."""
     if isinstance(kind, str):
-        return lambda value, _: [value]
+        return np.frombuffer(bytes(value), np.uint8) if kind == "bytes" else value
     if "array" in kind:
-        dtype, many = np.dtype(kind["array"]), len(kind["shape"]) > 1
-
-        def flat(value: Any, _: Context) -> list[Any]:
-            array = np.ascontiguousarray(value, dtype)
-            shape = [np.array(array.shape, np.uint32)] if many else []
-            return [array.reshape(-1), *shape]
-
-        return flat
+        return np.ascontiguousarray(value, kind["array"]).reshape(-1)
     if "enum" in kind:
-        return lambda value, _: [int(getattr(value, "value", value))]
+        return int(getattr(value, "value", value))
     if "message" in kind:
-        inner = _to_record(kind["message"], ros_type_of(kind["message"]["name"]))
-        return lambda value, context: [inner(value, context)]
-    item = _to_value(kind["list"])
-    plain_item = isinstance(kind["list"], str) and kind["list"] != "str"
-
-    def each(values: Any, context: Context) -> list[Any]:
-        items = [item(value, context)[0] for value in values]
-        return [np.array(items, kind["list"]) if plain_item else items]
-
-    return each
+        inner = kind["message"]
+        return _to_record(inner, ros_type_of(inner["name"]), value, context)
+    items = [_to_value(kind["list"], each, context) for each in value]
+    is_row = isinstance(kind["list"], str) and kind["list"] != "str"
+    return np.array(items, kind["list"]) if is_row else items
 
 
 def _reader(kind: type[Any], plain: Any) -> Callable[[Any, Context], Any]:

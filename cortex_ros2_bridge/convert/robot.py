@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
 from cortex import messages
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder
-from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.convert.commands import recorded_rates, unit, xyz
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
 from cortex_ros2_bridge.convert.records import stamp_ns_of
-from cortex_ros2_bridge.convert.registry import NEWEST, PACKETS, RULES, Direction, Rule, encoded
+from cortex_ros2_bridge.convert.registry import NEWEST, PACKETS, standard
 from cortex_ros2_bridge.event_codec import decode_mono
 
 
+@standard(messages.Odometry, "nav_msgs/Odometry", "{topic}", PACKETS, direction="in", robot=True)
 def odometry(message: Any, context: Context) -> messages.Odometry:
     """Convert nav_msgs/Odometry: the velocity is turned from the body frame to that of the pose."""
     pose, twist = message.pose.pose, message.twist.twist
@@ -32,6 +32,15 @@ def odometry(message: Any, context: Context) -> messages.Odometry:
     )
 
 
+@standard(
+    messages.Events,
+    "event_camera_msgs/EventPacket",
+    "{topic}",
+    PACKETS,
+    "packet_rate_hz",
+    direction="in",
+    robot=True,
+)
 def events(message: Any, context: Context) -> messages.Events:
     """Convert event_camera_msgs/EventPacket, in evt3 or mono.
 
@@ -74,34 +83,20 @@ def _decode_evt3(message: Any, stamp_us: int, context: Context) -> EventColumns:
     stamp says the rest; the stamps of drivers are of another clock, so there wraps are counted.
     """
     size = {"width": message.width, "height": message.height}
-    if context.remembered("is_stamped", lambda: True):
+    if context.memory.setdefault("is_stamped", True):
         columns = Evt3Decoder(start_us=stamp_us).decode(message.events, **size)
         if not len(columns.t) or int(columns.t[0]) == stamp_us:
             return columns
         context.memory["is_stamped"] = False
-    decoder: Evt3Decoder = context.remembered("evt3", Evt3Decoder)
+    decoder: Evt3Decoder = context.memory.setdefault("evt3", Evt3Decoder())
     return decoder.decode(message.events, **size)
 
 
-def _decoded(convert: Callable[[Any, Context], Any], ros_type: str) -> Callable[[Any, Context], Any]:
-    return lambda data, context: convert(cdr.decode_record(data, ros_type), context)
-
-
-def _rule(kind: str, ros_type: str, direction: Direction, name: str, convert: Any, *options: str) -> Rule:
-    qos = PACKETS if direction == "in" else NEWEST
-    return Rule(kind, ros_type, direction, name, qos, convert, True, frozenset(options), robot=True)
-
-
-_ODOMETRY, _PACKET = "nav_msgs/msg/Odometry", "event_camera_msgs/msg/EventPacket"
-RULES += [
-    _rule("cortex/Odometry", _ODOMETRY, "in", "{topic}", _decoded(odometry, _ODOMETRY)),
-    _rule("cortex/Events", _PACKET, "in", "{topic}", _decoded(events, _PACKET), "packet_rate_hz"),
-    _rule(
-        "cortex/RateThrustCommand",
-        "mavros_msgs/msg/AttitudeTarget",
-        "out",
-        "{base}/attitude_target",
-        encoded(recorded_rates),
-        "max_thrust_n",
-    ),
-]
+standard(
+    messages.RateThrustCommand,
+    "mavros_msgs/AttitudeTarget",
+    "{base}/attitude_target",
+    NEWEST,
+    "max_thrust_n",
+    robot=True,
+)(recorded_rates)

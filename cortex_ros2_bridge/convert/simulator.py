@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
 from typing import Any
 
 from cortex import messages
@@ -15,19 +15,6 @@ DIAGNOSTICS_INTERVAL_NS = 900_000_000
 """Shortest wall-clock time between two arrays of one phase [ns]: about one a second, as others send them."""
 
 _OK, _WARN, _ERROR = 0, 1, 2
-_SIMULATOR_VALUES = (
-    *("mode", "real_time_factor", "real_time_factor_wanted", "step_count"),
-    *("step_median_ns", "step_p99_ns", "late_p99_ns", "overrun_count", "slipped_ns"),
-)
-_SENSOR_VALUES = (
-    *("subscriber_count", "published_count"),
-    *("dropped_count", "injected_lost_count", "undelivered_count"),
-)
-_VEHICLE_VALUES = (
-    *("command_count", "refused_count", "refused_reason", "superseded_count", "lost_count"),
-    *("clamped_count", "clamped_reason"),
-    *("command_age_ns", "fail_safe_count", "collision_count", "undelivered_count"),
-)
 
 
 @standard(messages.Text, "std_msgs/String")
@@ -81,8 +68,10 @@ def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -
         None, if the array before is not a second old and the phase is the same.
     """
     before: messages.SimulatorStatus | None = context.memory.get("judged")
-    if before is not None and not _is_due(message, before):
-        return None
+    if before is not None:
+        waited_ns = abs(message.wall_ns - before.wall_ns)
+        if message.phase == before.phase and waited_ns < DIAGNOSTICS_INTERVAL_NS:
+            return None
     context.memory["judged"] = message
     judged = _Judged(message, before)
     statuses = [_of_simulator(message, judged)]
@@ -90,10 +79,6 @@ def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -
     statuses += [_of_vehicle(vehicle, judged) for vehicle in message.vehicles]
     array = record("diagnostic_msgs/msg/DiagnosticArray")
     return array(header(message.stamp_ns, "", context), statuses)
-
-
-def _is_due(message: messages.SimulatorStatus, before: messages.SimulatorStatus) -> bool:
-    return message.phase != before.phase or abs(message.wall_ns - before.wall_ns) >= DIAGNOSTICS_INTERVAL_NS
 
 
 class _Judged:
@@ -123,7 +108,7 @@ def _of_simulator(message: messages.SimulatorStatus, judged: _Judged) -> Any:
     if late or slipped_ns:
         said += f"; {late} steps were late, and {slipped_ns / 1e9:.3f} s slipped {judged.period}"
     level = _ERROR if message.phase == "ended" else _WARN if late or slipped_ns else _OK
-    return status_record(level, "simulator", said, "simulator", _pairs(message, _SIMULATOR_VALUES))
+    return status_record(level, "simulator", said, "simulator", _pairs(message))
 
 
 def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
@@ -137,7 +122,7 @@ def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
     if undelivered:
         said = f"{'' if said == 'ok' else f'{said}; '}{undelivered} lost by reliable readers {judged.period}"
     level = _WARN if unwanted or undelivered else _OK
-    return status_record(level, f"sensor {name}", said, sensor.vehicle, _pairs(sensor, _SENSOR_VALUES))
+    return status_record(level, f"sensor {name}", said, sensor.vehicle, _pairs(sensor))
 
 
 def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
@@ -153,9 +138,11 @@ def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
             trouble.append(f"{count} {what} {judged.period}" + (f" ({reason})" if reason else ""))
     mode = f"commands: {vehicle.command_mode}" if vehicle.command_mode else "no command yet"
     said = "; ".join([*trouble, mode])
-    level, values = _WARN if trouble else _OK, _pairs(vehicle, _VEHICLE_VALUES)
+    level, values = _WARN if trouble else _OK, _pairs(vehicle)
     return status_record(level, f"vehicle {vehicle.name}", said, vehicle.name, values)
 
 
-def _pairs(source: Any, names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(name, str(getattr(source, name))) for name in names]
+def _pairs(source: Any) -> list[tuple[str, str]]:
+    """Return the numbers and texts of a status."""
+    values = ((each.name, getattr(source, each.name)) for each in dataclasses.fields(source))
+    return [(name, str(value)) for name, value in values if isinstance(value, int | float | str)]

@@ -124,34 +124,14 @@ def odometry_transform(message: messages.Odometry, context: Context) -> Any:
 @standard(messages.Transform, "tf2_msgs/TFMessage", "/tf_static", LATCHED)
 def transform(message: messages.Transform, context: Context) -> Any:
     """Convert to tf2_msgs/TFMessage."""
-    return _transforms([_transform_of(message, context.frames)])
+    return _transforms([transform_of(message, context.frames)])
 
 
-def static_transforms(
-    transforms: Iterable[messages.Transform], vehicles: Iterable[str], names: FrameNames
-) -> Buffer:
-    """Return one tf2_msgs/TFMessage with all static transforms, and those from map to each vehicle's odom.
-
-    Args:
-        transforms: Where sensors sit.
-        vehicles: Names of the vehicles.
-        names: Names of frames in ROS.
-
-    Raises:
-        ConvertError: A transform has numbers that are not finite, or no rotation.
-    """
-    roots = [
-        transform_record(
-            0, names.ros(frames.WORLD), names.odom_of(vehicle), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-        )
-        for vehicle in vehicles
-    ]
-    return cdr.encode(_transforms(roots + [_transform_of(each, names) for each in transforms]))
-
-
-def check_transform(message: messages.Transform, names: FrameNames) -> None:
-    """Raise `ConvertError` unless a transform is one: finite, with a rotation, between two frames."""
-    _transform_of(message, names)
+def static_transforms(transforms: Iterable[Any], vehicles: Iterable[str], names: FrameNames) -> Buffer:
+    """Return one tf2_msgs/TFMessage with records of `transform_of`, and from map to each vehicle's odom."""
+    origin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+    roots = [transform_record(0, names.ros(frames.WORLD), names.odom_of(each), *origin) for each in vehicles]
+    return cdr.encode(_transforms([*roots, *transforms]))
 
 
 @standard(messages.RotorSpeeds, "actuator_msgs/Actuators", "{topic}", STREAM)
@@ -192,7 +172,12 @@ def _diagonal(deviations: list[float]) -> NDArray[np.float64]:
     return covariance
 
 
-def _transform_of(message: messages.Transform, names: FrameNames) -> Any:
+def transform_of(message: messages.Transform, names: FrameNames) -> Any:
+    """Return a geometry_msgs/TransformStamped.
+
+    Raises:
+        ConvertError: It is none: not finite, without a rotation, or of one frame.
+    """
     what = f"transform to {message.child!r}"
     check_finite(what, message.translation, message.rotation)
     if not message.child or not message.parent:

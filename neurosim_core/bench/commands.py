@@ -64,12 +64,12 @@ QUESTIONS: Sequence[Question] = (
     ),
     Question(
         name="pixel",
-        help="a test bench of the event pixel: ramp, step, sine, darkness, readout",
+        help="a test bench of the event pixel: ramp, step, sine, noise of the presets",
         options=("device",),
     ),
     Question(
         name="render",
-        help="error against run time of rendering, and false events from aliasing",
+        help="error against run time of rendering",
         options=("scene", "device", "samples"),
     ),
     Question(

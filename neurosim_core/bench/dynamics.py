@@ -1,4 +1,4 @@
-"""Dynamics: error against run time, order of convergence, stiff and extreme flights, an hour of flight.
+"""Dynamics: error against run time, stiff and extreme flights.
 
 SciPy judges the vehicle on equations of its own (`dynamics_oracle`); RotorPy stands beside it. Times are CPU
 time of one core, the best of several repetitions; ratios are of times taken in one run.
@@ -16,17 +16,15 @@ import numpy as np
 
 from neurosim_core.bench import rotorpy_peer
 from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, MOTORS_S, Array, Flight, lagging
-from neurosim_core.bench.dynamics_long import measure_drifts, measure_rates
-from neurosim_core.bench.dynamics_oracle import TABLEAUX, Reference, compare, integrate, make_reference
+from neurosim_core.bench.dynamics_oracle import Reference, compare, make_reference
 from neurosim_core.bench.engine import DynamicsError, Multirotor
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, lines
 
 RKMK4, DORMAND_PRINCE, CALLED = "RKMK4 (ours)", "Dormand-Prince (ours)", "ours, called from Python"
 STEPS_S = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
-"""Steps [s]; the methods of the oracle end at 0.5 ms."""
+"""Steps [s]."""
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
-ORDERS = {RKMK4: 4, **{method.name: method.order for method in TABLEAUX}}
 LIMITS_M = {"figure eight": 1e-6, "flip": 1e-10, "tumble": 1e-8}
 """Largest position errors at steps of 1 ms [m]."""
 POSITION_M, ATTITUDE, CPU, STEP = "position [m]", "attitude [rad]", "CPU [s/s]", "step [ms]"
@@ -46,26 +44,20 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         references[name] = make_reference(flights[-1], cross_check=cross_check)
     samples = _sweep(flights, references, quick, progress)
     peers = _peers(flights, references, quick, progress)
-    orders = [
-        fit_order(samples, m, flight, references[flight]) for flight in list(FLIGHTS)[1:] for m in ORDERS
-    ]
     motors = _hard(
         {f"{tau_s:g} s": (functools.partial(lagging, tau_s), False) for tau_s in MOTORS_S}, quick, progress
     )
     extremes = _hard(EXTREMES, quick, progress)
-    drifts = measure_drifts(quick, progress)
     claims = [
-        order_claim(orders),
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
         _hard_claim("any motor time constant", motors, 1e-8),
         _hard_claim("every extreme flight that is flown", extremes, 1e-5),
-        _drift_claim(drifts),
         _peer_claim(peers),
     ]
     errors = {row["method"]: cell(_error_m(row)) for row in _at_one_ms(samples, "figure eight")}
     sampled = (
         "Largest errors over the ends of all holds of 10 ms. CPU is that of the launches per simulated "
-        "second and vehicle; methods without one are NumPy code of this study, here for their errors."
+        "second and vehicle."
     )
     hard = (
         "Position errors [m] after steps of 1 ms, or at rtol 1e-6. RKMK4 (ours) is the vehicle as it is: "
@@ -77,21 +69,16 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         summary="At steps of 1 ms 5 s of a figure eight at 9 m/s end with position errors of "
         + ", ".join(f"{error} m by {method}" for method, error in errors.items())
         + f". Called alike from Python, against RotorPy's RK45: {claims[-1].measured}.\n\nExtreme flights (3 "
-        f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-3].measured}.",
+        f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-2].measured}.",
         claims=claims,
         tables=[
             Table("dynamics-1-ms", "Error at steps of 1 ms, or at rtol 1e-6", _at_one_ms(samples), sampled),
-            Table("dynamics-order", "Observed order of convergence", orders, _ORACLE),
             Table("dynamics-rotorpy", "RotorPy on the same flights", peers, "Ratios of CPU times."),
             Table("dynamics-motor", "Stiff motors, 0.2 s", _pivot(motors), hard),
             Table("dynamics-extremes", "Extreme flights, 0.2 s", _pivot(extremes), hard),
-            Table("dynamics-long", "Drift over time", drifts),
-            Table(
-                "dynamics-throughput", "Steps of 1 ms per second of CPU time", measure_rates(quick, progress)
-            ),
             Table("dynamics-work-precision", "Error against CPU time and step", samples, sampled),
         ],
-        plots=_plots(samples, peers, motors, drifts),
+        plots=_plots(samples, peers, motors),
     )
 
 
@@ -170,13 +157,6 @@ def _sweep(
         rows += [
             _ours(flight, flight.name, method, value, known, 3 if quick else 5) for method, value in settings
         ]
-    for tableau in TABLEAUX:
-        progress(f"all flights with {tableau.name}")
-        rows += [
-            _row(f.name, tableau.name, step_s, integrate(f, step_s, tableau), references[f.name])
-            for f in flights
-            for step_s in STEPS_S[:5]
-        ]
     return sorted(rows, key=lambda row: list(FLIGHTS).index(row["flight"]))
 
 
@@ -221,55 +201,11 @@ def _hard(
         rows += [
             _ours(flight, name, m, value, known, 1) for m, value in ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6))
         ]
-        rows += [_row(name, t.name, 1e-3, integrate(flight, 1e-3, t), known) for t in TABLEAUX]
         if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
             states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
             outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"
             rows.append(_row(name, "RotorPy RK45", 1e-3, states, known, outcome=outcome))
     return sorted(rows, key=lambda row: list(cases).index(row["flight"]))
-
-
-def fit_order(samples: Sequence[Row], method: str, flight: str, reference: Reference) -> Row:
-    """Fit log error against log step where the slope has settled.
-
-    A fit begins at the finest step whose error stands clear of rounding and of what is not known of the
-    reference, and goes on while local slopes stay within 0.2 of the first.
-
-    Args:
-        samples: Rows, among them those of the method on the flight.
-        method: A method of fixed step.
-        flight: Name of the flight.
-        reference: How well the flight is known.
-
-    Returns:
-        A row; an order is None where fewer than three errors are asymptotic.
-    """
-    rows = [row for row in samples if (row["method"], row["flight"]) == (method, flight)]
-    found: Row = {"flight": flight, "method": method, "theory": ORDERS[method]}
-    for heading, key in ((POSITION_M, "position_m"), (ATTITUDE, "attitude_rad")):
-        floor = max(3e-12, 30.0 * getattr(reference.uncertainty, key))
-        usable = sorted((row[STEP], row[heading]) for row in rows if row.get(heading, 0.0) > floor)
-        h, e = np.log(np.array(usable).reshape(-1, 2)).T
-        local = np.diff(e) / np.diff(h)
-        count = 1
-        while count <= len(local) and abs(local[count - 1] - local[0]) < 0.2:
-            count += 1
-        found[heading.split()[0]] = float(np.polyfit(h[:count], e[:count], 1)[0]) if count >= 3 else None
-    return found
-
-
-def order_claim(orders: Iterable[Row]) -> Claim:
-    """Judge every order that could be fitted, within 0.35: slopes are fitted over a few steps."""
-    fitted = [(row, row[k]) for row in orders for k in ("position", "attitude") if row[k] is not None]
-    ours = [slope for row, slope in fitted if row["method"] == RKMK4]
-    row, slope = max(fitted, key=lambda pair: abs(pair[1] - pair[0]["theory"]))
-    return Claim(
-        "every method converges with its order, to 0.35: RKMK4 and RK4 with 4, Euler's with 1",
-        "Munthe-Kaas (1999); Hairer, Norsett, Wanner (1993)",
-        f"RKMK4 {min(ours, default=math.nan):.2f} to {max(ours, default=math.nan):.2f}; furthest off: "
-        f"{row['method']} on {row['flight']}, {slope:.2f}",
-        bool(ours) and abs(slope - row["theory"]) <= 0.35,
-    )
 
 
 def _precision_claim(samples: Sequence[Row], flight: str, limit_m: float) -> Claim:
@@ -292,17 +228,6 @@ def _hard_claim(what: str, rows: Sequence[Row], limit_m: float) -> Claim:
         "adaptive steps where fixed ones tripped the guard"
         + (f"; errors raised: {', '.join(row['flight'] for row in raised)}" if raised else ""),
         _error_m(worst) <= limit_m and len(flown) + len(raised) == len(ours),
-    )
-
-
-def _drift_claim(drifts: Sequence[Row]) -> Claim:
-    last = {row["run"]: row for row in drifts if row["method"] == RKMK4 and "hover" in row["run"]}
-    said = (f"{run}: {cell(row[POSITION_M])} m after {row['after [s]']} s" for run, row in last.items())
-    return Claim(
-        "an hour of hover, still and turning at 29 rad/s: the drift is <= 1e-4 m",
-        "closed form: the vehicle stays where it is",
-        ", ".join(said),
-        all(row[POSITION_M] <= 1e-4 and row["after [s]"] == 3600 for row in last.values()),
     )
 
 
@@ -346,7 +271,7 @@ def _pivot(rows: Sequence[Row]) -> list[Row]:
     return found
 
 
-def _plots(samples: list[Row], peers: list[Row], motors: list[Row], drifts: list[Row]) -> list[Plot]:
+def _plots(samples: list[Row], peers: list[Row], motors: list[Row]) -> list[Plot]:
     def panel(title: str, rows: Iterable[Row], x: str, y: str, **more: Any) -> Panel:
         series = lines(list(rows), x, y, by="method", y_floor=1e-17)
         return Panel(title=title, x_label=x, y_label=y, series=series, x_scale="log", y_scale="log", **more)
@@ -358,17 +283,12 @@ def _plots(samples: list[Row], peers: list[Row], motors: list[Row], drifts: list
     tau, none_s = "motor time constant [s]", 1e-7
     stiff = [{**row, tau: float(row["flight"].split()[0]) or none_s} for row in motors]
     ticks = {"none": none_s, **{f"{tau_s:g}": tau_s for tau_s in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)}}
-    runs = {"spinning hover": POSITION_M, "free top": "energy, relative"}
     timed, stepped = [row for row in (*samples, *peers) if CPU in row], [row for row in samples if row[STEP]]
     steps = [*panels(stepped, STEP, POSITION_M), *panels(stepped, STEP, ATTITUDE)]
     lost = "Stiff motors, steps of 1 ms or rtol 1e-6; no mark: not finite, or too slow"
     motor = panel("", stiff, tau, POSITION_M, x_ticks=ticks, x_lines={"step": 1e-3})
-    long_runs = [
-        panel(run, (r for r in drifts if r["run"] == run), "after [s]", y) for run, y in runs.items()
-    ]
     return [
         Plot("dynamics-work-precision", "Error against CPU time", panels(timed, CPU, POSITION_M), 2, True),
         Plot("dynamics-step", "Error against step size", steps, 4, True),
         Plot("dynamics-motor", lost, [motor]),
-        Plot("dynamics-drift", "Long runs", long_runs, 2),
     ]

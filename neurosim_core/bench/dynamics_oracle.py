@@ -1,11 +1,10 @@
 """What the integrators of the vehicle are judged by: SciPy on equations of its own.
 
 `Equations` states the equations of motion a second time, in NumPy, independently of the kernels of the
-vehicle. SciPy solves them to rounding; small fixed-step methods integrate them for comparison.
+vehicle, and SciPy solves them to rounding.
 
 Reference: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
-aerodynamic effects (the equations); Hairer, Norsett, Wanner (1993), Solving ordinary differential equations I
-(the methods).
+aerodynamic effects.
 """
 
 from __future__ import annotations
@@ -77,83 +76,8 @@ class Equations:
         acceleration = turn(total, 1.0) / config.mass_kg
         acceleration[2] -= config.gravity_m_s2
         angular = self._inertia_inverse @ (torque - _cross(w, self._inertia @ w))
-        return np.concatenate([velocity, acceleration, spin(q, w), angular])
-
-
-def spin(q: Array, w: Array) -> Array:
-    """Return the rate of a quaternion q_WB [xyzw] that turns at w in B [rad/s], shape [4]."""
-    return np.append(0.5 * (q[3] * w + _cross(q[:3], w)), -0.5 * (q[:3] @ w))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tableau:
-    """A method of fixed step: an explicit Runge-Kutta method, or the semi-implicit Euler method."""
-
-    name: str
-    order: int
-    stages: tuple[tuple[float, ...], ...] = ()
-    """Coefficients of the second and later stages, row by row."""
-    weights: tuple[float, ...] = (1.0,)
-    semi_implicit: bool = False
-    """Positions and attitudes move with the velocities at the end of the step."""
-
-
-EULER = Tableau(name="explicit Euler", order=1)
-SEMI_IMPLICIT = Tableau(name="semi-implicit Euler", order=1, semi_implicit=True)
-RK4 = Tableau(
-    name="RK4, quaternion",
-    order=4,
-    stages=((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-    weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
-)
-TABLEAUX = (EULER, SEMI_IMPLICIT, RK4)
-"""Methods to compare with. They integrate rotor speeds as part of the state, as most simulators do, normalise
-the quaternion after each step, and have no guard: what they cannot resolve becomes infinite or NaN."""
-
-
-def integrate(flight: Flight, step_s: float, method: Tableau) -> Array:
-    """Fly with one method.
-
-    Args:
-        flight: What to fly.
-        step_s: Step [s], a divisor of the hold.
-        method: How.
-
-    Returns:
-        States at the end of each hold, shape [K, 13 + R].
-    """
-    equations = Equations(flight.config)
-    tau = equations.time_constant_s
-    lagging = tau > 0.0
-    y = np.concatenate(flight.start)
-    states = []
-
-    def rate(state: Array, command: Array) -> Array:
-        speed = state[13:]
-        motor = np.divide(command - speed, tau, out=np.zeros_like(speed), where=lagging)
-        return np.concatenate([equations.rate(state[:13], speed), motor])
-
-    with np.errstate(all="ignore"):  # what blows up is a result
-        for hold in range(len(flight.commands)):
-            command = flight.held(hold)
-            y[13:] = np.where(lagging, y[13:], command)
-            for _ in range(round(_HOLD_S / step_s)):
-                y = _step(y, step_s, command, method, rate)
-            states.append(y.copy())
-    return np.array(states)
-
-
-def _step(y: Array, h: float, command: Array, method: Tableau, rate: Any) -> Array:
-    rates = [rate(y, command)]
-    for row in method.stages:
-        shift = sum(a * k for a, k in zip(row, rates, strict=True) if a)
-        rates.append(rate(y + h * shift, command))
-    end = y + h * sum(b * k for b, k in zip(method.weights, rates, strict=True) if b)
-    if method.semi_implicit:
-        end[POSITION] = y[POSITION] + h * end[VELOCITY]
-        end[ORIENTATION] = y[ORIENTATION] + h * spin(y[ORIENTATION], end[BODY_RATE])
-    end[ORIENTATION] /= np.linalg.norm(end[ORIENTATION])
-    return np.asarray(end)
+        turning = np.append(0.5 * (q[3] * w + _cross(q[:3], w)), -0.5 * (q[:3] @ w))
+        return np.concatenate([velocity, acceleration, turning, angular])
 
 
 def solve(flight: Flight, solver: Solver, rtol: float) -> Array:

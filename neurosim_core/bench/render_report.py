@@ -22,7 +22,6 @@ from rich.text import Text
 from neurosim_core.bench.report import (
     Chapter,
     Panel,
-    Picture,
     Plot,
     Series,
     Table,
@@ -147,7 +146,7 @@ def draw_plot(plot: Plot) -> bytes:
 
     columns = min(plot.columns, len(plot.panels))
     rows = math.ceil(len(plot.panels) / columns)
-    labels = list(dict.fromkeys(s.label for p in plot.panels if isinstance(p, Panel) for s in p.series))
+    labels = list(dict.fromkeys(s.label for p in plot.panels for s in p.series))
     alone = len(labels) > len(COLOURS)  # then each panel has colours and a legend of its own
     width, height = _PANEL_IN[min(columns, 3)]
     with matplotlib.rc_context(cast(Any, {**matplotlib.rcParamsDefault, **_LOOK})):
@@ -159,11 +158,8 @@ def draw_plot(plot: Plot) -> bytes:
             rows, columns, squeeze=False, sharex=plot.shared_axes, sharey=plot.shared_axes
         ).ravel()
         for axes, panel in zip(places, plot.panels, strict=False):
-            if isinstance(panel, Picture):
-                _draw_picture(axes, panel, figure)
-            else:
-                own = list(dict.fromkeys(series.label for series in panel.series if series.style != "law"))
-                _draw_panel(axes, panel, own if alone else labels)
+            own = list(dict.fromkeys(series.label for series in panel.series if series.style != "law"))
+            _draw_panel(axes, panel, own if alone else labels)
             if alone:
                 axes.legend()
             if plot.shared_axes:
@@ -178,23 +174,15 @@ def draw_plot(plot: Plot) -> bytes:
 
 
 def _draw_panel(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
-    bars = [series for series in panel.series if series.style == "bar"]
     for series in panel.series:
         number = labels.index(series.colour_of or series.label)
         look: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)], "label": series.label}
         x, y = _finite(series.x), _finite(series.y)
-        if series.style == "bar":
-            share = 0.8 / len(bars)
-            places = [place + share * (bars.index(series) - 0.5 * (len(bars) - 1)) for place in x]
-            axes.barh(places, y, height=share, **look)
-        elif series.style == "step":
-            axes.step(x, y, where="mid", **look)
-        else:
-            line = {"line": "-", "dashed": "--", "points": "none", "law": "-"}[series.style]
-            if series.style == "law":
-                look |= {"label": "_", "linewidth": 1.0}
-            marker = "" if series.style == "law" else MARKERS[number % len(MARKERS)]
-            axes.plot(x, y, linestyle=line, marker=marker, **look)
+        line = {"line": "-", "dashed": "--", "points": "none", "law": "-"}[series.style]
+        if series.style == "law":
+            look |= {"label": "_", "linewidth": 1.0}
+        marker = "" if series.style == "law" else MARKERS[number % len(MARKERS)]
+        axes.plot(x, y, linestyle=line, marker=marker, **look)
         _name_points(axes, series, x, y)
     for draw, lines in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
         for label, place in lines.items():
@@ -210,8 +198,6 @@ def _draw_panel(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
         if axis.get_scale() == "log" and ticks is None:
             _plain_ticks(axis)
     axes.set_ylim(panel.y_min, panel.y_max)
-    if bars:
-        axes.invert_yaxis()
 
 
 def _plain_ticks(axis: Axis) -> None:
@@ -232,19 +218,6 @@ def _name_points(axes: Axes, series: Series, x: Sequence[float], y: Sequence[flo
 
 def _finite(values: Sequence[float | None]) -> list[float]:
     return [math.nan if value is None or not math.isfinite(value) else float(value) for value in values]
-
-
-def _draw_picture(axes: Axes, picture: Picture, figure: Figure) -> None:
-    from matplotlib.colors import SymLogNorm
-
-    most = max(map(max, picture.values))
-    log = SymLogNorm(1.0, vmin=0.0, vmax=max(most, 2.0)) if picture.value_scale == "log" else None
-    colours = "magma" if picture.value_label else "gray"
-    shown = axes.imshow(picture.values, cmap=colours, norm=log, interpolation="nearest")
-    if picture.value_label:
-        figure.colorbar(shown, ax=axes, label=picture.value_label, shrink=0.8)
-    axes.set_title(picture.title)
-    axes.axis("off")
 
 
 def _draw_legend(figure: Figure, places: Sequence[Axes], columns: int) -> None:

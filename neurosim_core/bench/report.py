@@ -23,7 +23,7 @@ Row: TypeAlias = dict[str, Any]
 Numbers: TypeAlias = Sequence[float | None]
 """None stands for a value that is unknown or not finite."""
 Scale = Literal["linear", "log"]
-Style = Literal["line", "dashed", "points", "law", "step", "bar"]
+Style = Literal["line", "dashed", "points", "law"]
 
 _NAME = re.compile(r"[a-z0-9]([a-z0-9_-]*[a-z0-9])?")
 
@@ -85,18 +85,6 @@ class Panel:
     y_max: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """A grey picture, such as what a camera sees or where errors are."""
-
-    title: str
-    values: Sequence[Sequence[float]]
-    """Rows from the top, shape [H, W]."""
-    value_label: str = ""
-    """What the scale beside the picture shows; empty: no scale."""
-    value_scale: Scale = "linear"
-
-
 @dataclass(frozen=True)
 class Plot:
     """Panels beside each other; becomes `<name>.png`."""
@@ -104,7 +92,7 @@ class Plot:
     name: str
     """Of the file: lower-case letters, digits, - and _."""
     title: str
-    panels: Sequence[Panel | Picture]
+    panels: Sequence[Panel]
     columns: int = 3
     """The most panels in a row."""
     shared_axes: bool = False

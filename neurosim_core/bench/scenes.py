@@ -1,10 +1,8 @@
-"""Scenes that the benchmarks make: a fine checkerboard, thin structures, and any scene cut finer."""
+"""Scenes that the benchmarks make: a fine checkerboard, and thin structures."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,28 +59,6 @@ def thin_structures(*, seed: int = 0) -> Scene:
     }
     painted = [Material(name=name, base_color=colour) for name, colour in colours.items()]
     return _scene("thin structures", np.concatenate(triangles), np.concatenate(materials), painted)
-
-
-def refined(scene: Scene) -> Scene:
-    """Return a scene with every triangle cut into four of the same shape."""
-    faces = scene.faces
-    corner = {name: getattr(scene, name)[faces] for name in ("vertices", "normals", "uv")}  # [F, 3, ...]
-    order = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-    cut: dict[str, Any] = {}
-    for name, values in corner.items():
-        middles = 0.5 * (values + np.roll(values, -1, axis=1))
-        cut[name] = np.concatenate([values, middles], axis=1)[:, order].reshape(-1, values.shape[-1])
-    length = np.linalg.norm(cut["normals"], axis=1, keepdims=True)
-    cut["normals"] = cut["normals"] / np.where(length > 0.0, length, 1.0)
-    return dataclasses.replace(
-        scene,
-        vertices=cut["vertices"].astype(np.float32),
-        normals=cut["normals"].astype(np.float32),
-        uv=cut["uv"].astype(np.float32),
-        faces=np.arange(12 * len(faces), dtype=np.int32).reshape(-1, 3),
-        face_material=np.repeat(scene.face_material, 4),
-        face_instance=np.repeat(scene.face_instance, 4),
-    )
 
 
 def _box(centre: NDArray[np.float64], size: NDArray[np.float64], turn_rad: float) -> NDArray[np.float64]:

@@ -33,7 +33,6 @@ from neurosim_core.bench.engine import (
 from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, lines
-from neurosim_core.bench.scenes import refined
 from neurosim_core.bench.step import RATE_HZ, time_steps
 
 EXACT, ADAPTIVE = "every step rendered", "at most 0.5 px between renders"
@@ -41,7 +40,7 @@ STACK = "events: the whole stack a call"
 DROP_IN, NAIVE = "events: one frame a call, read by the host", "naive: one frame a call, read by the host"
 """Parts, besides what is rendered: the count of events is read each call, columns only of whole stacks."""
 _VGA, _DAVIS = (640, 480), (346, 260)
-_ALONE = ("renders per launch", "rays per pixel", "triangles")
+_ALONE = ("renders per launch", "rays per pixel")
 """What is varied alone, and the heading of its value."""
 _STAMPS_NS = 1_000_000
 """Between two frames [ns]."""
@@ -78,22 +77,12 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         uploaded = upload_scene(base.scene, config.render, device=device)
         return refit(dataclasses.replace(base, config=config, scene_on_device=uploaded), config)
 
-    def with_triangles(cuts: int) -> Model:
-        cut = base.scene
-        for _ in range(cuts):
-            cut = refined(cut)
-        uploaded = upload_scene(cut, base.config.render, device=device)
-        return dataclasses.replace(base, scene=cut, scene_on_device=uploaded)
-
     cases: list[tuple[str, str, Callable[[], Model]]] = []
     for pixels in sizes:
         cases.append(("resolution", EXACT, partial(model, pixels=pixels)))
         cases.append(("resolution", ADAPTIVE, partial(model, pixels=pixels, max_displacement_px=0.5)))
     cases += [("renders per launch", EXACT, partial(model, launch=count)) for count in counts]
     cases += [("rays per pixel", EXACT, partial(with_rays, count)) for count in options.samples or (1, 4, 16)]
-    cases += [
-        ("triangles", EXACT, partial(with_triangles, cuts)) for cuts in ((0, 1) if quick else (0, 1, 2))
-    ]
     rows = []
     for what, mode, make in cases:
         progress(f"whole steps: {what}, {mode}")

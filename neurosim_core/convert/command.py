@@ -68,8 +68,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="turn a video or a folder of pictures into events, or events into another format",
         description="Let a simulated event camera look at a video (needs PyAV) or at the pictures of a "
         "folder, and write its events as `neurosim run` does. Log radiance is linear between frames. Or copy "
-        "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, or, with "
-        "pictures, depth, poses and IMU: mvsec.h5, .h5, and bags of ROS 2: flight.mcap, bag (a directory).",
+        "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, .es (read), "
+        "or, with pictures, depth, poses and IMU: mvsec.h5, .h5, and bags of ROS 2: flight.mcap, bag.",
     )
     parser.add_argument("source", type=Path, help="video file, folder of pictures, or file of events")
     parser.add_argument("out", type=Path, help="file to write; HDF5 for videos and pictures")

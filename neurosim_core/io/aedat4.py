@@ -1,4 +1,4 @@
-"""AEDAT4 files of iniVation, through faery."""
+"""AEDAT4 files of iniVation, and Event Stream files (`.es`), through faery."""
 
 from __future__ import annotations
 
@@ -44,9 +44,7 @@ class Aedat4Source:
             except BaseException as error:
                 raise _damage(self._path, error) from None
             if track.id == self._track and len(events):
-                polarity = "on" if "on" in events.dtype.names else "p"
-                kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, polarity: np.uint8}
-                yield EventArrays(*(events[name].astype(kind) for name, kind in kinds.items()))
+                yield _columns(events)
 
     def close(self) -> None:
         """Nothing is open between blocks."""
@@ -56,6 +54,39 @@ class Aedat4Source:
             return self._faery.aedat.Decoder(self._path)
         except BaseException as error:
             raise _damage(self._path, error) from None
+
+
+class EsSource:
+    """Reads a file of Event Stream (loris, expelliarmus), of a DVS or an ATIS; their y counts from below."""
+
+    def __init__(self, path: Path) -> None:
+        faery = _import_faery()
+        self._path = path
+        self.notes: list[str] = []
+        with open(path, "rb") as file:
+            if file.read(12) != b"Event Stream":
+                raise EventFileError(f"{path} is not a file of Event Stream")
+        try:
+            self._stream = faery.events_stream_from_file(path, file_type="es")
+            self.size: tuple[int, int] | None = self._stream.dimensions()
+        except BaseException as error:
+            raise _damage(path, error) from None
+
+    def read(self) -> Iterator[EventArrays]:
+        """See `EventSource.read`."""
+        blocks = iter(self._stream)
+        while True:
+            try:
+                events = next(blocks)
+            except StopIteration:
+                return
+            except BaseException as error:
+                raise _damage(self._path, error) from None
+            if len(events):
+                yield _columns(events)
+
+    def close(self) -> None:
+        """Nothing is open between blocks."""
 
 
 class Aedat4Sink:
@@ -94,11 +125,17 @@ class Aedat4Sink:
             encoder.__exit__(None, None, None)
 
 
+def _columns(events: Any) -> EventArrays:
+    polarity = "on" if "on" in events.dtype.names else "p"
+    kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, polarity: np.uint8}
+    return EventArrays(*(events[name].astype(kind) for name, kind in kinds.items()))
+
+
 def _import_faery() -> ModuleType:
     try:
         import faery
     except ImportError as error:
-        raise ImportError(f"AEDAT4 files need faery: {install_hint('formats')}") from error
+        raise ImportError(f"AEDAT4 and Event Stream files need faery: {install_hint('formats')}") from error
     return faery  # type: ignore[no-any-return]
 
 

@@ -30,6 +30,7 @@ FORMATS = {
     "csv": Format("csv", "CsvSource", "CsvSink", (".csv", ".txt"), {}),
     "npz": Format("npz", "NpzSource", "NpzSink", (".npz",), {}),
     "aedat4": Format("aedat4", "Aedat4Source", "Aedat4Sink", (".aedat4",), {}),
+    "es": Format("aedat4", "EsSource", "", (".es",), {}),
     "mvsec": Format("mvsec", "MvsecSource", "MvsecSink", ("mvsec.h5", "mvsec.hdf5"), {}),
     "dsec": Format("dsec", "DsecSource", "", (), {}),
     "recording": Format("hdf5_events", "Hdf5Source", "RecordingSink", (".h5", ".hdf5"), {}),
@@ -126,7 +127,7 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     name = format_of(path, format)
     known = FORMATS[name]
     if not known.sink:
-        raise EventFileError(f"{path}: {name} is only read; write .h5, whose layout of events is the same")
+        raise EventFileError(f"{path}: {name} is only read; write .h5")
     sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
     return EventWriter(path, sink, width=width, height=height)
 

@@ -12,6 +12,7 @@ import torch
 from neurosim_core.learn.descent import Descent, Replayed
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
+from neurosim_core.learn.ppo import count_ended, shares
 from neurosim_core.learn.task import MIRROR_ACTION
 
 Teacher = Callable[[torch.Tensor], torch.Tensor]
@@ -167,11 +168,9 @@ class Dagger:
             action = torch.where(led, seen["label"] + push * self._pushed, self._action) * self._action_sign
             self._now, _, terminated, truncated, info = env.step(action)
             self._begun = (terminated | truncated).float()
-            counted = self._begun * ~led[:, 0]
-            ended += torch.stack([counted.sum(), *((info["metrics"][n] * counted).sum() for n in _COUNTED)])
+            ended += count_ended(self._begun * ~led[:, 0], info["metrics"])
         self._flown += 1
-        episodes, successes, crashes = ended.tolist()
-        return {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
+        return shares(ended)
 
     def _decide(self) -> None:
         """Let teacher and student act on what is in `_seen` and `_told`, half of them in a mirror."""
@@ -208,6 +207,3 @@ class Dagger:
         errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()
         self._losses += torch.stack(errors).detach()
         return errors[0] + self.config.hint_weight * errors[1]
-
-
-_COUNTED = ("success", "crash")

@@ -132,8 +132,13 @@ def count_ended(done: torch.Tensor, metrics: Mapping[str, torch.Tensor]) -> torc
 def flown_log(reward: torch.Tensor, spread: torch.Tensor, ended: torch.Tensor) -> dict[str, float]:
     """Return what to log of the steps of an iteration; `ended` is the sum of their `count_ended`."""
     log = {"reward": float(reward.mean()), "spread": float(spread.mean())}
+    return log | shares(ended)
+
+
+def shares(ended: torch.Tensor) -> dict[str, float]:
+    """Return the shares of success and of crashes, of the sum of `count_ended`; nothing if none has ended."""
     episodes, successes, crashes = ended.tolist()
-    return log | ({"success": successes / episodes, "crash": crashes / episodes} if episodes else {})
+    return {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
 
 
 def minibatches(

@@ -262,7 +262,7 @@ def default_config(
     many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(**({"worlds": 512, "iterations": 40} | teacher)),
+        teacher=PpoConfig(**({"worlds": 1024, "iterations": 50} | teacher)),
         student=DaggerConfig(**(many | student)),
         block=45,
         evaluation_worlds=512,

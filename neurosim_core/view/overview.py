@@ -139,8 +139,12 @@ class FlightSummary:
     def track(self) -> Track:
         """Return where the vehicle was so far, at no more than 20 000 times."""
         stamp_ns, table = self._pose.arrays()
-        table = table.reshape(-1, 8)
-        return Track(stamp_ns=stamp_ns, position=table[:, :3], velocity=table[:, 3:6], heading=table[:, 6:8])
+        position, velocity, orientation = np.split(table.reshape(-1, 10), [3, 6], axis=1)
+        heading = np.zeros((0, 2))
+        if len(stamp_ns):
+            R_WC = Rotation.from_quat(orientation) * Rotation.from_quat(self._q_BC)
+            heading = R_WC.apply([0.0, 0.0, 1.0])[:, :2]
+        return Track(stamp_ns=stamp_ns, position=position, velocity=velocity, heading=heading)
 
     def series(self) -> list[Series]:
         """Return the numbers that sensors measured so far, at no more than 20 000 times each."""
@@ -152,10 +156,9 @@ class FlightSummary:
 
     def _log_pose(self, packet: Any) -> None:
         self._pose_sensor = self._pose_sensor or packet.sensor
-        if packet.sensor == self._pose_sensor and self._pose.takes_next():
-            R_WC = Rotation.from_quat(packet.orientation) * Rotation.from_quat(self._q_BC)
-            forward = R_WC.apply([0.0, 0.0, 1.0])
-            self._pose.add(packet.stamp_ns, np.array([*packet.position, *packet.velocity, *forward[:2]]))
+        if packet.sensor == self._pose_sensor:
+            row = np.concatenate([packet.position, packet.velocity, packet.orientation])
+            self._pose.add(packet.stamp_ns, row)
 
     def _look(self, stamp_ns: int) -> Snapshot:
         begin_us, end_us = (stamp_ns - self._window_ns) // 1000, stamp_ns // 1000
@@ -202,16 +205,10 @@ class _Rows:
         self._stride = 1
         self._count = 0
 
-    def takes_next(self) -> bool:
-        """Return whether the next row is kept; count it if not."""
-        taken = self._count % self._stride == 0
-        self._count += not taken
-        return taken
-
     def add(self, stamp_ns: int, values: NDArray[Any]) -> None:
-        if not self.takes_next():
-            return
         self._count += 1
+        if (self._count - 1) % self._stride:
+            return
         self._stamp_ns.append(stamp_ns)
         self._rows.append(values.astype(np.float64))
         if len(self._rows) > _ROWS_MAX:

@@ -276,6 +276,7 @@ def _draw_strips(
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e7ea", linewidth=0.8)
         axes.set_axisbelow(True)
+        axes.ticklabel_format(axis="y", useOffset=False)  # it would be below the title
         axes.locator_params(axis="y", nbins=3 if len(strips) > 2 else 4)
         axes.tick_params(length=3, labelsize=9.5, labelbottom=row == len(strips) - 1)
         axes.axvline(stamp_ns * 1e-9, color=_INK, linewidth=0.9, linestyle=(0, (3, 3)))

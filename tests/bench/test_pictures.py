@@ -19,7 +19,7 @@ from neurosim_core.bench.engine import (
 )
 from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.options import Options
-from neurosim_core.bench.scenes import checkerboard_floor, refined, thin_structures
+from neurosim_core.bench.scenes import checkerboard_floor
 
 LENS = PinholeConfig(width=24, height=18, horizontal_fov_rad=1.5)
 
@@ -62,18 +62,20 @@ def test_samples_out_of_range_are_refused():
 
 
 def test_render_study_and_its_claim(monkeypatch):
-    """Filtering keeps false events away; a default that does not filter is seen."""
+    """Filtering keeps errors small; a default that does not filter is seen."""
     monkeypatch.setattr(render, "free_views", lambda *_, **__: (np.array([[0.0, 0.0, 1.2]]), np.zeros(1)))
     chapter = render.measure(Options(quick=True, device="cpu", samples=(1, 4)))
-    pictures, pan = (table.rows for table in chapter.tables)
-    board = {
-        (r["filter"], r["rays per pixel"]): r["RMS error"] for r in pictures if r["scene"] == "checkerboard"
-    }
+    rows = chapter.tables[0].rows
+    board = {(r["filter"], r["rays per pixel"]): r["RMS error"] for r in rows if r["scene"] == "checkerboard"}
     assert board["trilinear", 4] < board["trilinear", 1] < 0.5 * board["nearest", 1]
     assert chapter.claims[0].met
-    assert pan[0]["of the reference"] - pan[0]["missing"] + pan[0]["false"] == pan[0]["events"]
-    unfiltered = [pan[0], {**pan[0], "setting": pan[2]["setting"]}]
-    assert not render._chapter(pictures, unfiltered, [], "cpu", "96x72").claims[0].met
+    unfiltered = [
+        {**r, "RMS error": board["nearest", 1]}
+        if (r["filter"], r["rays per pixel"]) == ("trilinear", 1)
+        else r
+        for r in rows
+    ]
+    assert not render._chapter(unfiltered, "cpu", "96x72").claims[0].met
 
 
 def test_a_shifted_lens_sees_the_same_picture_by_other_rays():
@@ -107,26 +109,12 @@ def test_naive_events_follow_their_rule(device):
         level[fired] = frames[number][fired]
 
 
-def area_of(scene):
-    a, b, c = (scene.vertices[scene.faces[:, k]].astype(float) for k in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-
-
-def test_finer_triangles_are_the_same_surface():
-    scene = thin_structures()
-    finer = refined(scene)
-    assert len(finer.faces) == 4 * len(scene.faces)
-    assert area_of(finer) == pytest.approx(area_of(scene), rel=1e-5)
-    assert finer.bounds_m == pytest.approx(scene.bounds_m)
-
-
 @pytest.mark.slow
 def test_throughput_study(tmp_path):
     scene = Path(room_scene(tmp_path)["file"])
     chapter = throughput.measure(Options(quick=True, device="cpu", samples=(1,), scene=scene))
     steps, parts = (table.rows for table in chapter.tables)
     assert all(row["slowest"] <= row["whole steps/s"] <= row["fastest"] for row in steps)
-    assert [row["triangles"] for row in steps[-2:]] == [steps[0]["triangles"], 4 * steps[0]["triangles"]]
     assert all(row["us per frame"] > 0.0 for row in parts)
     assert chapter.claims[0].met is None  # it is of a CUDA device
 

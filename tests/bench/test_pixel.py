@@ -7,17 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from neurosim_core.bench import pixel, pixel_noise
+from neurosim_core.bench import pixel
 from neurosim_core.bench.options import Options
-from neurosim_core.bench.pixel_bench import TestBench, make_pixel, make_preset, rates_hz
+from neurosim_core.bench.pixel import TestBench, make_pixel, make_preset, rates_hz
 
 BENCH = TestBench(device="cpu", quick=True)
-
-
-def verdicts(curves):
-    """Return what is claimed of curves, and whether it is met."""
-    rules = [rule for rule in pixel._RULES if any(c.pattern.startswith(rule.patterns) for c in curves)]
-    return [pixel._claim(rule, curves).met for rule in rules]
 
 
 def test_the_chapter_meets_its_claims():
@@ -31,26 +25,20 @@ def test_the_chapter_meets_its_claims():
 
 
 @pytest.mark.parametrize(
-    ("module", "pattern", "fault"),
-    [
-        (pixel, pixel.ramp, {"threshold_on": 0.2005}),
-        (pixel, pixel.staircase, {"threshold_on": 0.21, "threshold_off": 0.21}),
-        (pixel, pixel.latency, {"threshold_on": 0.201}),
-        (pixel_noise, pixel_noise.readout, {"shot_noise": {"rate_hz": 50.0, "bright_factor": 1.0}}),
-        (pixel_noise, pixel_noise.hot_pixels, {"hot_pixels": {"fraction": 0.02, "rate_hz": 100.0}}),
-    ],
+    ("pattern", "fault"),
+    [(pixel.ramp, {"threshold_on": 0.2005}), (pixel.latency, {"threshold_on": 0.201})],
 )
-def test_a_planted_fault_is_seen(module, pattern, fault, monkeypatch):
-    assert all(verdicts(pattern(BENCH)))
-    monkeypatch.setattr(module, "make_pixel", lambda **settings: make_pixel(**{**settings, **fault}))
-    assert not all(verdicts(pattern(BENCH)))
+def test_a_planted_fault_is_seen(pattern, fault, monkeypatch):
+    assert all(claim.met for claim in pixel.claims_of(pattern(BENCH)))
+    monkeypatch.setattr(pixel, "make_pixel", lambda **settings: make_pixel(**{**settings, **fault}))
+    assert not all(claim.met for claim in pixel.claims_of(pattern(BENCH)))
 
 
 def test_noise_that_its_source_does_not_have_is_seen(monkeypatch):
-    assert all(row["within"] for row in pixel_noise.measure_noise_figures(BENCH))
+    assert all(row["within"] for row in pixel.measure_noise_figures(BENCH))
     plain = make_preset("gen3", shot_noise={"rate_hz": 5.0}, readout=None)
-    monkeypatch.setattr(pixel_noise, "make_preset", lambda *_, **__: plain)
-    assert not all(row["within"] for row in pixel_noise.measure_noise_figures(BENCH))
+    monkeypatch.setattr(pixel, "make_preset", lambda *_, **__: plain)
+    assert not all(row["within"] for row in pixel.measure_noise_figures(BENCH))
 
 
 def test_rates_are_from_the_first_to_the_last_event_of_a_pixel():

@@ -17,7 +17,6 @@ from neurosim_core.bench.report import (
     Chapter,
     Claim,
     Panel,
-    Picture,
     Plot,
     Series,
     Table,
@@ -43,15 +42,16 @@ def chapter(name: str = "flight") -> Chapter:
         y_scale="log",
         y_lines={"limit": 1e-6},
     )
-    bars = Panel(series=[Series(label="n", x=[0, 1], y=[3, 4], style="bar")], y_ticks={"one": 0, "two": 1})
-    picture = Picture(title="seen", values=np.eye(4).tolist(), value_label="events", value_scale="log")
+    marks = Panel(
+        series=[Series(label="n", x=[3, 4], y=[0, 1], style="points")], y_ticks={"one": 0, "two": 1}
+    )
     return Chapter(
         name=name,
         title="A <flight>",
         summary="First.\n\nSecond & last.",
         claims=[Claim("it flies", "Newton (1687)", "1 m", True), Claim("it lands", "same", "not", False)],
         tables=[Table(f"{name}-table", "Errors", ROWS, "A note.")],
-        plots=[Plot(f"{name}-plot", "Errors", [panel, bars, picture], 2)],
+        plots=[Plot(f"{name}-plot", "Errors", [panel, marks], 2)],
         facts={"date": "today"},
     )
 
@@ -79,7 +79,8 @@ def test_a_chapter_survives_json(tmp_path):
     assert again.claims == chapter().claims
     assert again.tables[0].rows[0] == ROWS[0]
     assert again.tables[0].rows[1]["error [m]"] is None  # JSON has no nan
-    assert json.loads((tmp_path / "flight.json").read_text())["plots"][0]["panels"][2]["values"][1][1] == 1.0
+    (plot,) = json.loads((tmp_path / "flight.json").read_text())["plots"]
+    assert plot["panels"][1]["y_ticks"]["two"] == 1.0
     assert draw_plot(again.plots[0]) == draw_plot(chapter().plots[0])
     assert read_chapter(tmp_path, "other") is None
 

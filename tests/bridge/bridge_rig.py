@@ -68,7 +68,7 @@ class Rig:
         """Whether the calibration that goes with each picture has come to what publishes on a topic."""
         feeds = self.bridge._connections.feeds.values()
         outputs = [o for f in feeds for o in f._outputs if o.route.ros_topic == topic]
-        return bool(outputs) and all(o._context.camera_info is not None for o in outputs)
+        return bool(outputs) and all(o.context.camera_info is not None for o in outputs)
 
     def tally(self, name: str) -> Any:
         return self.bridge.totals()[name]

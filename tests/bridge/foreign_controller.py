@@ -38,8 +38,8 @@ SETTINGS: dict[str, Any] = {
     "scene": {"kind": "apartment", "rooms": 2},
     "vehicle": {"on_collision": "report"},
     "path": {"kind": "figure_eight", "speed_max_m_s": 2.5, "ramp_s": 1.0, "center_m": [0.0, 0.0, 1.2]},
-    "control": {"rate_hz": 100},
-    "sensors": {"imu": {"kind": "imu", "rate_hz": 100}},
+    "control": {"rate_hz": 50},
+    "sensors": {"imu": {"kind": "imu", "rate_hz": 50}},
     "live": {"mode": "lockstep", "command_deadline_s": 60.0, "command_timeout_s": 5.0},
 }
 

@@ -75,7 +75,7 @@ class RecordingBackend:
 
     name = "recording"
     distro = "jazzy"
-    failure = trouble = ""
+    failure = ""
 
     def __init__(self) -> None:
         self.publishers: dict[str, RecordedPublisher] = {}

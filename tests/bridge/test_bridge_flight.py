@@ -99,6 +99,6 @@ def test_a_figure_eight_through_dds(registry: None, dds_domain: int, tmp_path: P
     assert [flight["mode"] for flight in flights] == list(MODES)
     for flight in flights:
         alone_m = fly_in_process(flight["mode"])
-        assert flight["count"] == 401
+        assert flight["count"] == 201
         assert alone_m < 0.15
         assert flight["rms_m"] == pytest.approx(alone_m, rel=0.1)

@@ -20,7 +20,7 @@ import pytest
 from cortex import messages
 from cortex.evt3 import Evt3Decoder
 from cortex_ros2_bridge import cdr, frames
-from cortex_ros2_bridge.convert import RULES, Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.convert import RULES, Context, ConvertError, static_transforms, transform_of
 from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
@@ -45,9 +45,11 @@ from cortex_ros2_bridge.typestore import typestore
 OUT = {(r.cortex_type, r.ros_type): r for r in RULES if r.direction == "out" and not r.robot}
 IN = {(r.ros_type, r.cortex_type): r for r in RULES if r.direction in ("in", "call") and not r.robot}
 convert = SimpleNamespace(
-    **{rule.convert.__name__: rule.convert for rule in RULES if rule.direction != "record"},
+    **{
+        rule.convert.__name__: rule.convert for rule in RULES if rule.direction != "record" and not rule.robot
+    },
     static_transforms=static_transforms,
-    check_transform=check_transform,
+    transform_of=transform_of,
 )
 GOLDEN = Path(__file__).with_name("golden")
 TURN = np.array([0.5, 0.5, 0.5, 0.5])
@@ -487,15 +489,21 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                     "running, 0.5 x real time; 4 steps were late, and 2.500 s slipped so far",
                     "simulator",
                     [
+                        pair("stamp_ns", str(STAMP_NS)),
+                        pair("wall_ns", "1"),
+                        pair("phase", "running"),
+                        pair("reason", ""),
                         pair("mode", "streaming"),
-                        pair("real_time_factor", "0.5"),
                         pair("real_time_factor_wanted", "1.0"),
+                        pair("real_time_factor", "0.5"),
                         pair("step_count", "100"),
                         pair("step_median_ns", "10"),
                         pair("step_p99_ns", "20"),
+                        pair("late_median_ns", "0"),
                         pair("late_p99_ns", "0"),
                         pair("overrun_count", "4"),
                         pair("slipped_ns", "2500000000"),
+                        pair("sequence", "0"),
                     ],
                 ),
                 *(
@@ -506,18 +514,23 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                         said,
                         "drone",
                         [
+                            pair("vehicle", "drone"),
+                            pair("name", name.rpartition("/")[2]),
+                            pair("active", active),
                             pair("subscriber_count", subscribers),
                             pair("published_count", published),
                             pair("dropped_count", dropped),
                             pair("injected_lost_count", injected),
                             pair("undelivered_count", undelivered),
+                            pair("late_p99_ns", "0"),
                         ],
                     )
-                    for level, name, said, subscribers, published, dropped, injected, undelivered in (
+                    for level, name, said, active, subscribers, published, dropped, injected, undelivered in (
                         (
                             0,
                             "sensor drone/imu",
                             "2 dropped so far, as its link is configured",
+                            "True",
                             "1",
                             "1000",
                             "2",
@@ -528,6 +541,7 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                             1,
                             "sensor drone/rgb",
                             "5 dropped so far; 3 lost by reliable readers so far",
+                            "False",
                             "0",
                             "30",
                             "5",
@@ -545,17 +559,21 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                     "2 collisions so far; commands: rates",
                     "drone",
                     [
+                        pair("name", "drone"),
+                        pair("command_mode", "rates"),
                         pair("command_count", "9"),
                         pair("refused_count", "3"),
-                        pair("refused_reason", "three rotors"),
                         pair("superseded_count", "0"),
                         pair("lost_count", "0"),
-                        pair("clamped_count", "0"),
-                        pair("clamped_reason", ""),
                         pair("command_age_ns", "5"),
+                        pair("fail_safe", "True"),
                         pair("fail_safe_count", "1"),
                         pair("collision_count", "2"),
                         pair("undelivered_count", "0"),
+                        pair("refused_reason", "three rotors"),
+                        pair("clamped_count", "0"),
+                        pair("clamped_reason", ""),
+                        pair("command_source", ""),
                     ],
                 ),
             ],
@@ -713,7 +731,8 @@ def test_static_transforms_are_one_message_from_the_map_on():
         translation=np.array([0.1, 0.2, 0.3]),
         rotation=TURN,
     )
-    data = static_transforms([mount], ["a", "b"], FrameNames(map="earth"))
+    names = FrameNames(map="earth")
+    data = static_transforms([transform_of(mount, names)], ["a", "b"], names)
     identity = (0.0, 0.0, 0.0, 1.0)
     expected = record(
         "tf2_msgs/TFMessage",
@@ -732,7 +751,7 @@ def test_frames_of_a_flight_form_one_tree():
     mount = messages.Transform(0, "drone/base_link", "drone/imu", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     parents = {}
     for data in (
-        static_transforms([mount], ["drone"], FrameNames()),
+        static_transforms([transform_of(mount, FrameNames())], ["drone"], FrameNames()),
         convert.odometry_transform(ODOMETRY, context()),
     ):
         for each in cdr.decode(data, "tf2_msgs/msg/TFMessage").transforms:
@@ -1337,7 +1356,9 @@ if __name__ == "__main__":
     (GOLDEN / "event_image.cdr").write_bytes(event_image_bytes())
     tf_static = messages.Transform(STAMP_NS, "a/base_link", "a/imu", np.array([0.1, 0.2, 0.3]), TURN)
     (GOLDEN / "static_transforms.cdr").write_bytes(
-        static_transforms([tf_static], ["a", "b"], FrameNames(map="earth"))
+        static_transforms(
+            [transform_of(tf_static, FrameNames(map="earth"))], ["a", "b"], FrameNames(map="earth")
+        )
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.event_codec import EventPicture, decode_mono, encode_mono, read_dvs
+from cortex_ros2_bridge.event_codec import decode_mono, encode_mono, read_dvs
 
 WIDTH, HEIGHT = 640, 480
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -373,17 +373,3 @@ def test_arrays_of_dvs_msgs_are_read(count):
     if count:
         with pytest.raises(EventCodecError, match="are no dvs_msgs/EventArray"):
             read_dvs(array[:-8])
-
-
-def test_picture_shows_the_last_event_of_each_pixel():
-    picture = EventPicture(width=3, height=2)
-    picture.add(
-        np.array([0, 2, 2, 1], np.uint16), np.array([0, 1, 1, 0], np.uint16), np.array([1, 1, 0, 0], np.uint8)
-    )
-    picture.add(np.array([1], np.uint16), np.array([0], np.uint16), np.array([1], np.uint8))
-    white, red, blue = EventPicture.COLORS.tolist()
-    assert (red[0] > red[2], blue[2] > blue[0]) == (True, True)
-    assert picture.take().tolist() == [[blue, blue, white], [white, white, red]]
-    assert picture.take().tolist() == [[white] * 3] * 2
-    with pytest.raises(EventCodecError, match="column 3"):
-        picture.add(np.array([3], np.uint16), np.array([0], np.uint16), np.array([1], np.uint8))

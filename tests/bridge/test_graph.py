@@ -107,14 +107,14 @@ def test_the_layout_is_that_of_the_first_node(make: Any, foreigner: Start, distr
     node = make()
     node.publisher("/drone/imu", IMU, Qos())
     wait_for(lambda: {"/words", "/kin"} <= {topic.topic for topic in node.topics()})
-    assert (node.layout, kin.layout) == (None, None)
+    assert (node.graph.layout, kin.graph.layout) == (None, None)
     assert stranger.do("nodes", gid_bytes=16) == stranger.do("nodes", gid_bytes=24) == {}
 
     ros = foreigner()
     ros_node(ros, distro)
     size = GID_BYTES[distro]
     wait_for(lambda: announced(ros, size) and announced(ros, size)[1]["writers"])
-    assert (node.layout, kin.layout) == (distro, distro)
+    assert (node.graph.layout, kin.graph.layout) == (distro, distro)
     assert ros.do("nodes", gid_bytes=40 - size) == {}
 
 
@@ -122,12 +122,12 @@ def test_humble_wins_where_both_are(make: Any, foreigner: Start, caplog: pytest.
     node = make(distro="jazzy")
     ros_node(foreigner(), "humble")
     wait_for(lambda: "nodes of ROS Humble are here too" in caplog.text)
-    assert node.layout == "jazzy"
+    assert node.graph.layout == "jazzy"
     ros_node(foreigner(), "jazzy")
     wait_for(lambda: node.topics() == [TopicInfo("/chatter", STRING, (Qos(), Qos()), ())])
     late = make(node_name="late")
-    wait_for(lambda: late.layout is not None)
-    assert late.layout == "humble"
+    wait_for(lambda: late.graph.layout is not None)
+    assert late.graph.layout == "humble"
     assert caplog.text.count("nodes of ROS Humble are here too") == 1
 
 
@@ -137,7 +137,7 @@ def test_ros_distro_is_believed(
     other = foreigner()
     monkeypatch.setenv("ROS_DISTRO", "humble")
     node = make()
-    assert (node.distro, node.layout) == ("humble", "humble")
+    assert (node.distro, node.graph.layout) == ("humble", "humble")
     wait_for(lambda: announced(other, 24))
     assert chosen_distro("jazzy") == "jazzy"
     monkeypatch.setenv("ROS_DISTRO", "zebra")

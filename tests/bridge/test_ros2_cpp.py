@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from processes import ROOT
 
+from cortex.cppgen import write_headers
 from cortex_ros2_bridge.event_codec import decode_mono
 
 EXAMPLE = ROOT / "examples" / "ros2_cpp"
@@ -71,14 +72,24 @@ def test_events_of_the_component_are_those_of_the_bridge(tmp_path: Path) -> None
 
 @pytest.mark.skipif(not HAS_RCLCPP, reason="no rclcpp: source a ROS installation")
 @pytest.mark.parametrize("name", ["circle_controller", "cortex_events"])
-def test_nodes_compile_against_the_headers_of_ros(name: str) -> None:
+def test_nodes_compile_against_the_headers_of_ros(name: str, tmp_path: Path) -> None:
     source = (EXAMPLE / "src" / f"{name}.cpp").read_text(encoding="utf-8")
     if "cortex/node.hpp" in source and not Path("/usr/include/zmq.hpp").is_file():
         pytest.skip("cppzmq is not installed")
+    write_headers(tmp_path)  # as the build of the client does
     headers = [f"-isystem{path}" for path in INCLUDES]
     flags = ["-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", f"-I{EXAMPLE / 'src'}"]
     subprocess.run(
-        ["g++", *flags, f"-I{ROOT / 'cortex' / 'cpp' / 'include'}", *headers, "-x", "c++", "-"],
+        [
+            "g++",
+            *flags,
+            f"-I{ROOT / 'cortex' / 'cpp' / 'include'}",
+            f"-I{tmp_path}",
+            *headers,
+            "-x",
+            "c++",
+            "-",
+        ],
         input=source,
         text=True,
         check=True,

@@ -220,9 +220,7 @@ def test_the_command_does_what_launch_asks(dds_domain: int, runtime: Path) -> No
                 with BridgeProcess("--backend", "run.bag", "--ros-args", *arguments) as wrong:
                     assert wrong.process.wait(60.0) == 1
                     wrong.hear()
-                    assert (
-                        "--backend: a backend is auto, rclpy, dds or a path that ends in .mcap" in wrong.said
-                    )
+                    assert "backend: a backend is auto, rclpy, dds or a path that ends in .mcap" in wrong.said
                 with BridgeProcess("--backend", "dds", "--ros-args", *arguments) as second:
                     assert second.process.wait(60.0) == 1
                     second.hear()

@@ -129,7 +129,7 @@ def test_the_tasks_of_a_loop_are_woken_by_one_reader(numbers, monkeypatch):
             super().__init__(*arguments)
             made.append(self)
 
-    monkeypatch.setattr("cortex.subscriber.LoopReader", Counted)
+    monkeypatch.setattr("cortex.loop_reader.LoopReader", Counted)
 
     async def run():
         tasks = [asyncio.ensure_future(subscriber.recv_async()) for _ in range(3)]
@@ -274,7 +274,7 @@ def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
 @pytest.mark.parametrize("where", ["socket", "queue"])
 def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers, where, monkeypatch):
     """A task that was never suspended cannot have let another one run; here no time is too long for that."""
-    monkeypatch.setattr("cortex.subscriber.PAUSE_NS", 10**12)
+    monkeypatch.setattr("cortex.loop_reader.PAUSE_NS", 10**12)
     publisher, subscriber = numbers
     for value in range(200):
         publisher.publish(Number(0, value))

@@ -142,7 +142,7 @@ def _dies(_pipe: Any, _job: None) -> None:
 
 
 def _hangs(pipe: Any, _job: None) -> None:
-    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     pipe.send([os.getpid(), helper.pid])
     helper.wait()
 
@@ -315,6 +315,8 @@ def test_another_checkout_is_measured_beside_each_way_of_cortex():
     assert batch.contestants[-1] == Contestant("cortex, before", "cortex", {"checkout": "/there"})
     assert batch.bars[-1] == Bar("cortex", ("cortex, before",), ">=", 2.0)
     assert latency.bars[-1] == Bar("cortex", ("cortex, before",), "<=", 1.05, "rtt_p50_us")
+    for case in (case.beside("/there") for case in CASES):
+        assert all(bar.metric in case.metrics for bar in case.bars), case.name
 
 
 # Tables.

@@ -20,6 +20,7 @@ from processes import SOON_S, wait_for
 import cortex.link
 import cortex.subscriber
 from cortex import keep_last, reliable
+from cortex.broadcast import Listener
 from cortex.compiled import native
 from cortex.wire import MESSAGE, Header, pack_header
 
@@ -428,3 +429,29 @@ def test_a_reader_in_the_same_process_has_the_ring_as_others(make_node):
     publisher.publish(make_block(1, 100))
     assert subscriber.recv(SOON_S).number == 1
     assert subscriber.carriers == ["ipc, shared memory"]
+
+
+def test_a_reader_that_leaves_before_it_attaches_is_forgotten(tmp_path):
+    """What it has handed over is closed; a reader that is still about to attach stays."""
+    listener = Listener(tmp_path / "1.ring")
+    idle, other = socket.socketpair()
+    leaving, staying = (
+        native.RingReader(str(tmp_path / "1.ring"), SOURCE, n, idle.fileno(), nothing, zmq.Again, 20)
+        for n in (1, 2)
+    )
+    assert listener.take(SOURCE, 3) is None  # both have been heard
+    before = len(os.listdir("/proc/self/fd"))
+    listener.forget()
+    assert len(os.listdir("/proc/self/fd")) == before
+    leaving.close()
+    after_close = len(os.listdir("/proc/self/fd"))
+    listener.forget()
+    assert len(os.listdir("/proc/self/fd")) == after_close - 3  # socket, page and bell
+    assert listener.take(SOURCE, 1) is None
+    hello = listener.take(SOURCE, 2)
+    assert hello is not None
+    hello.close()
+    staying.close()
+    listener.close()
+    idle.close()
+    other.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -13,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -118,8 +119,29 @@ def finish(child: subprocess.Popen[str], timeout_s: float = SOON_S) -> tuple[int
     return child.returncode, output, errors
 
 
-def cortex(*arguments: object, **options: object) -> tuple[int, str, str]:
-    return finish(start(*arguments, **options))  # type: ignore[arg-type]
+def cortex(*arguments: object, columns: int = 120, **options: object) -> tuple[int, str, str]:
+    """Run a command that ends by itself: in this process, if it needs no directory, environment or log."""
+    if options or arguments[0] == "discovery":
+        return finish(start(*arguments, columns=columns, **options))  # type: ignore[arg-type]
+    output, errors = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, signals_kept():
+        patch.setenv("COLUMNS", str(columns))
+        with redirect_stdout(output), redirect_stderr(errors):
+            status = main([str(argument) for argument in arguments])
+    return status, output.getvalue(), errors.getvalue()
+
+
+@contextmanager
+def signals_kept() -> Iterator[None]:
+    """`main` takes the signals over, which pytest wants back."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    path = list(sys.path)
+    try:
+        yield
+    finally:
+        sys.path[:] = path
+        for number, handler in kept.items():
+            signal.signal(number, handler)
 
 
 def interrupt(child: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[int, str, str]:
@@ -543,19 +565,6 @@ def test_errors_are_one_line(
     assert "=True" not in errors
 
 
-@contextmanager
-def signals_kept() -> Iterator[None]:
-    """`main` takes the signals over, which pytest wants back."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    path = list(sys.path)
-    try:
-        yield
-    finally:
-        sys.path[:] = path
-        for number, handler in kept.items():
-            signal.signal(number, handler)
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -588,25 +597,10 @@ def test_wrong_use_is_told_from_failure(
 # Tools
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "",
-        "topics",
-        "nodes",
-        "info",
-        "echo",
-        "hz",
-        "bw",
-        "delay",
-        "record",
-        "play",
-        "keys",
-        "cpp",
-        "bench",
-        "discovery",
-    ],
-)
+COMMANDS = "topics nodes top info echo hz bw delay record play keys doctor schema cpp bench discovery"
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS.split()])
 def test_every_command_has_help(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,7 +23,7 @@ def scan(number, size_bytes):
 
 def slots_of(publisher):
     """Number and size of a publisher's slots; None if there is no ring."""
-    with publisher._outlets.lock:
+    with publisher._pub_sockets.lock:
         ring = publisher._fanout.ring._ring
         return None if ring is None else (ring.slots, ring.slot_bytes)
 

@@ -65,7 +65,7 @@ class Stream:
 
 
 def slots_held(publisher):
-    with publisher._outlets.lock:
+    with publisher._pub_sockets.lock:
         return publisher._fanout.ring._ring.leased()
 
 

@@ -39,7 +39,7 @@ def connected(node, kind, policy, **options):
 
 def slots_held(publisher):
     """Slots that any reader holds."""
-    with publisher._outlets.lock:
+    with publisher._pub_sockets.lock:
         return publisher._fanout.ring._ring.leased()
 
 
@@ -214,7 +214,7 @@ def test_many_readers(node, count):
         assert publisher.publish(scan(number, 30_000))
         messages = [subscriber.recv(SOON_S) for subscriber in subscribers]
         assert all(message == scan(number, 30_000) for message in messages)
-        with publisher._outlets.lock:
+        with publisher._pub_sockets.lock:
             assert len(publisher._fanout.ring._readers) == min(count, 64)
         del messages
     assert sum(subscriber.counters.lost for subscriber in subscribers) == 0

@@ -36,12 +36,12 @@ def node(make_node):
 def way(request, monkeypatch):
     """Without the C module there is only the long way."""
     if request.param == "the long way":
-        monkeypatch.setattr(Publisher, "_send_lent", lambda *_: None)
+        monkeypatch.setattr(Publisher, "_send_loaned", lambda *_: None)
     elif native is None:
         pytest.skip("without the C module there is no short cut")
     else:
-        send, taken = Publisher._send_lent, []
-        monkeypatch.setattr(Publisher, "_send_lent", lambda *args: taken.append(send(*args)) or taken[-1])
+        send, taken = Publisher._send_loaned, []
+        monkeypatch.setattr(Publisher, "_send_loaned", lambda *args: taken.append(send(*args)) or taken[-1])
         yield taken
         return
     yield []

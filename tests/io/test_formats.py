@@ -125,6 +125,24 @@ def test_what_faery_writes(name, version, tmp_path):
     assert same(read(path), events)
 
 
+def test_event_stream_of_another_writer(tmp_path):
+    """Its rows count from below; the time of its first event is kept."""
+    faery = pytest.importorskip("faery")
+    events, path = draw(20_000, span_us=40_000_000, begin_us=5_000), tmp_path / "events.es"
+    rows = np.empty(len(events.t), faery.EVENTS_DTYPE)
+    for name, column in zip(rows.dtype.names, events, strict=True):
+        rows[name] = column
+    rows["y"] = HEIGHT - 1 - rows["y"]
+    with faery.es.Encoder(path, "dvs", False, (WIDTH, HEIGHT)) as encoder:
+        encoder.write(rows)
+    assert same(read(path), events)
+    path.write_bytes(path.read_bytes()[:12])
+    with pytest.raises(EventFileError, match=r"events\.es is damaged"):
+        read(path)
+    with pytest.raises(EventFileError, match="es is only read"):
+        create_events(tmp_path / "new.es", width=4, height=4)
+
+
 def test_dv_processing_reads_aedat4(tmp_path):
     dv = pytest.importorskip("dv_processing")
     pytest.importorskip("faery")

@@ -7,8 +7,8 @@ import pytest
 
 import neurosim_core as ns
 from neurosim_core import sim
-from neurosim_core.scene.apartment import HallConfig, make_hall
 from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
+from neurosim_core.scene.hall import HallConfig, make_hall
 
 BOX = {"position_m": (2.0, 1.0, 1.5), "size_m": (1.0, 0.4, 3.0), "yaw_rad": 0.5 * np.pi}
 

@@ -69,7 +69,7 @@ class Hover(Task):
     def advance(self, view: View) -> None:
         """Count for how long each vehicle has hovered."""
         slow = view.velocity.norm(dim=1) < SPEED_MAX_M_S
-        self._held_s = torch.where(slow & ~view.crashed, self._held_s + view.step_s, 0.0)
+        self._held_s.add_(view.step_s).masked_fill_(~slow | view.crashed, 0.0)
         self._best_s = torch.maximum(self._best_s, self._held_s)
 
     def observe(self, view: View) -> Observations:

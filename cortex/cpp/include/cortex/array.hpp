@@ -158,7 +158,7 @@ class Array {
     return array;
   }
   // As `view`, and `writable()` writes there: a loan's arrays in their slot.
-  static Array lent(T* data, const Shape& shape) noexcept {
+  static Array loaned(T* data, const Shape& shape) noexcept {
     Array array = view(data, shape);
     array.mutable_ = data;
     return array;

@@ -19,7 +19,7 @@
 #include <vector>
 
 #include "cortex/directory.hpp"
-#include "cortex/outlet.hpp"
+#include "cortex/pub_socket.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/publisher.hpp"
 #include "cortex/publisher_core.hpp"
@@ -78,7 +78,7 @@ class Node {
   Publisher<T> advertise(const std::string& topic, const PublisherOptions& options = {}) {
     check_open(topic);
     const auto max_wait_ms = static_cast<std::uint32_t>(std::clamp<std::int64_t>(options.max_wait.count(), 0, 86'400'000));
-    auto core = std::make_shared<detail::PublisherCore>(outlets_, topic, Codec<T>::fingerprint, Codec<T>::stamped,
+    auto core = std::make_shared<detail::PublisherCore>(pub_sockets_, topic, Codec<T>::fingerprint, Codec<T>::stamped,
                                                         options.latch, options.inline_max, max_wait_ms, Codec<T>::fixed,
                                                         complaints_);
     {
@@ -124,10 +124,10 @@ class Node {
     for (const auto& publisher : publishers()) publisher->close();
     linger();
     {
-      const std::lock_guard<std::mutex> lock(outlets_->mutex);
-      outlets_->closed = true;
-      outlets_->lossy.socket.close();
-      outlets_->strict.socket.close();
+      const std::lock_guard<std::mutex> lock(pub_sockets_->mutex);
+      pub_sockets_->closed = true;
+      pub_sockets_->lossy.socket.close();
+      pub_sockets_->strict.socket.close();
     }
     directory_.reset();
     router_.close();
@@ -167,16 +167,16 @@ class Node {
 
   void open_sockets() {
     const bool tcp = !options_.listen.empty();
-    outlets_ = std::make_shared<detail::Outlets>(context_, tcp, files_->path("ring"));
-    lossy_fd_ = outlets_->lossy.socket.get(zmq::sockopt::fd);
-    strict_fd_ = outlets_->strict.socket.get(zmq::sockopt::fd);
+    pub_sockets_ = std::make_shared<detail::PubSockets>(context_, tcp, files_->path("ring"));
+    lossy_fd_ = pub_sockets_->lossy.socket.get(zmq::sockopt::fd);
+    strict_fd_ = pub_sockets_->strict.socket.get(zmq::sockopt::fd);
     router_ = net::make_socket(context_, zmq::socket_type::router, tcp, 4096, 200);
     router_.set(zmq::sockopt::router_mandatory, true);
     router_.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
     records::Endpoint local{"ipc", files_->endpoint("lossy"), files_->endpoint("strict"), files_->endpoint("control"),
                             ""};
-    outlets_->lossy.socket.bind(local.lossy);
-    outlets_->strict.socket.bind(local.strict);
+    pub_sockets_->lossy.socket.bind(local.lossy);
+    pub_sockets_->strict.socket.bind(local.strict);
     router_.bind(local.control);
     endpoints_.push_back(local);
     if (!tcp) return;
@@ -192,8 +192,8 @@ class Node {
       socket.bind("tcp://" + (bare ? "[" + options_.listen + "]" : options_.listen) + ":*");
       return socket.get(zmq::sockopt::last_endpoint);
     };
-    const std::string lossy = bind(outlets_->lossy.socket);
-    const std::string strict = bind(outlets_->strict.socket);
+    const std::string lossy = bind(pub_sockets_->lossy.socket);
+    const std::string strict = bind(pub_sockets_->strict.socket);
     endpoints_.push_back({"tcp", lossy, strict, bind(router_), keys_ == nullptr ? "" : keys_->public_key()});
   }
 
@@ -273,10 +273,10 @@ class Node {
     bool in_time = true;
     while (in_time) {
       {
-        const detail::Lock lock(outlets_->mutex);
-        outlets_->refresh();
-        outlets_->ended.repeat(monotonic_ns());
-        if (outlets_->ended.empty()) return;
+        const detail::Lock lock(pub_sockets_->mutex);
+        pub_sockets_->refresh();
+        pub_sockets_->ended.repeat(monotonic_ns());
+        if (pub_sockets_->ended.empty()) return;
       }
       in_time = backoff.wait();
     }
@@ -322,10 +322,10 @@ class Node {
     directory_->tick();
     connected_ = directory_->connected();
     {
-      const detail::Lock lock(outlets_->mutex, std::try_to_lock);
+      const detail::Lock lock(pub_sockets_->mutex, std::try_to_lock);
       if (lock.owns_lock()) {
-        outlets_->refresh();
-        outlets_->ended.repeat(monotonic_ns());
+        pub_sockets_->refresh();
+        pub_sockets_->ended.repeat(monotonic_ns());
       }
     }
     changed = directory_->take_changed() || changed;
@@ -436,7 +436,7 @@ class Node {
   std::shared_ptr<const Keys> keys_;
   zmq::context_t context_;
   std::unique_ptr<Authenticator> authenticator_;
-  std::shared_ptr<detail::Outlets> outlets_;
+  std::shared_ptr<detail::PubSockets> pub_sockets_;
   zmq::socket_t router_;
   int lossy_fd_ = -1;
   int strict_fd_ = -1;

@@ -39,7 +39,7 @@ class Placer {
     std::size_t bytes = sizeof(T);
     if (!known(extents, shape, bytes)) return;
     std::uint8_t* at = take(bytes);
-    if (at != nullptr) out = Array<T, Rank>::lent(reinterpret_cast<T*>(at), shape);
+    if (at != nullptr) out = Array<T, Rank>::loaned(reinterpret_cast<T*>(at), shape);
   }
   template <std::size_t Rank>
   void any(const char* name, AnyArray<Rank>& out, const std::array<Extent, Rank>& extents) {
@@ -49,14 +49,14 @@ class Placer {
       if (field != name || !known(extents, shape, bytes)) continue;
       std::uint8_t* at = take(bytes);
       if (at != nullptr) {
-        out = AnyArray<Rank>(dtype, shape, Array<std::uint8_t>::lent(at, {static_cast<std::uint32_t>(bytes)}));
+        out = AnyArray<Rank>(dtype, shape, Array<std::uint8_t>::loaned(at, {static_cast<std::uint32_t>(bytes)}));
       }
       return;
     }
   }
   template <class T, std::size_t Rank>
   void fixed(std::size_t at, Array<T, Rank>& out, const std::array<std::uint32_t, Rank>& shape) {
-    if (body_.data() != nullptr) out = Array<T, Rank>::lent(reinterpret_cast<T*>(body_.data() + at), shape);
+    if (body_.data() != nullptr) out = Array<T, Rank>::loaned(reinterpret_cast<T*>(body_.data() + at), shape);
   }
 
  private:

@@ -15,7 +15,7 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/outlet.hpp"
+#include "cortex/pub_socket.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/readers.hpp"
 #include "cortex/runtime.hpp"
@@ -28,11 +28,11 @@ namespace cortex::detail {
 // What does not depend on the type of the messages. Bodies are written without the lock, by one thread at a time.
 class PublisherCore {
  public:
-  PublisherCore(std::shared_ptr<Outlets> outlets, std::string topic, std::uint64_t fingerprint, bool stamped,
+  PublisherCore(std::shared_ptr<PubSockets> pub_sockets, std::string topic, std::uint64_t fingerprint, bool stamped,
                 bool latch, std::size_t inline_max, std::uint32_t max_wait_ms, bool exact,
                 std::shared_ptr<net::Complaints> complaints)
       : source(random_number()),
-        outlets_(std::move(outlets)),
+        pub_sockets_(std::move(pub_sockets)),
         topic_(std::move(topic)),
         fingerprint_(fingerprint),
         flags_(stamped ? wire::flag_stamp : 0),
@@ -41,8 +41,8 @@ class PublisherCore {
         max_wait_ms_(max_wait_ms),
         exact_(exact),
         complaints_(std::move(complaints)) {
-    const Lock lock(outlets_->mutex);
-    outlets_->publishers[source] = this;
+    const Lock lock(pub_sockets_->mutex);
+    pub_sockets_->publishers[source] = this;
   }
 
   ~PublisherCore() { close(); }
@@ -61,7 +61,7 @@ class PublisherCore {
 
   // Whether a message would reach anybody; otherwise it is counted as published and need not be encoded.
   bool wanted() {
-    Lock lock(outlets_->mutex);
+    Lock lock(pub_sockets_->mutex);
     prepare(lock, false);
     if (!readers_.empty() || latch_) return true;
     ++sequence_;
@@ -71,16 +71,16 @@ class PublisherCore {
 
   // Sends a frame whose body is in place after room for the header; false if a reliable subscriber lost it.
   bool publish_inline(zmq::message_t frame, std::int64_t stamp_ns) {
-    Lock lock(outlets_->mutex);
+    Lock lock(pub_sockets_->mutex);
     prepare(lock, false);
     const std::size_t size = frame.size() - wire::header_size;
     write_header(static_cast<std::uint8_t*>(frame.data()), 'M', sequence_++, stamp_ns, size, 0);
     ++counters_.published;
     counters_.bytes += size;
     if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
-    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
+    if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
     bool on_time = !is_late_ && !readers_.is_moving(true);
-    if (has_sockets(outlets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
+    if (has_sockets(pub_sockets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
     on_time &= send_to_ring(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
     return on_time;
@@ -88,7 +88,7 @@ class PublisherCore {
 
   // Memory for a message; for a loan without a buffer if every slot is out on loan.
   Slot acquire(std::size_t size, bool for_loan) {
-    Lock lock(outlets_->mutex);
+    Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
     if (!provide(lock, size)) return private_slot(size);
     Slot slot = readers_.ring().acquire();
@@ -109,13 +109,13 @@ class PublisherCore {
 
   void abandon(const Slot& slot) noexcept {
     if (slot.index < 0) return;
-    const Lock lock(outlets_->mutex);
+    const Lock lock(pub_sockets_->mutex);
     if (readers_.has_members()) readers_.ring().abandon(slot);
   }
 
   // Sends what was written into a slot; false if a reliable subscriber lost it.
   bool publish_slot(const Slot& slot, std::size_t size, std::int64_t stamp_ns) {
-    Lock lock(outlets_->mutex);
+    Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
     const std::uint64_t sequence = sequence_++;
     ++counters_.published;
@@ -129,8 +129,8 @@ class PublisherCore {
     }
     bool on_time = !is_late_ && !readers_.is_moving(true);
     bool passed_over = false;
-    for (Outlet* outlet : {&outlets_->lossy, &outlets_->strict}) {
-      if (!outlets_->closed && has_sockets(*outlet)) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
+    for (PubSocket* pub_socket : {&pub_sockets_->lossy, &pub_sockets_->strict}) {
+      if (!pub_sockets_->closed && has_sockets(*pub_socket)) on_time &= send_large(lock, *pub_socket, slot, head, size, passed_over);
     }
     on_time &= send_large_to_ring(lock, slot, sequence, stamp_ns, size);
     if (passed_over) ++counters_.skipped;
@@ -140,22 +140,22 @@ class PublisherCore {
 
   // After a burst: tells readers which number comes next, so that they know of a loss at its end.
   void tend(std::int64_t now_ns) {
-    const Lock lock(outlets_->mutex, std::try_to_lock);
-    if (!lock.owns_lock() || closed_ || outlets_->closed) return;
+    const Lock lock(pub_sockets_->mutex, std::try_to_lock);
+    if (!lock.owns_lock() || closed_ || pub_sockets_->closed) return;
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame(wire::header_size);
     write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, 0);
     bool sent = !is_late_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
-    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
-    if (has_sockets(outlets_->strict)) sent &= outlets_->strict.try_send(std::move(frame));
+    if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
+    if (has_sockets(pub_sockets_->strict)) sent &= pub_sockets_->strict.try_send(std::move(frame));
     if (sent) told_ = sequence_;
   }
 
   // A reader has come; called under the lock.
-  void attach(Outlet& outlet, const std::string& key, wire::AttachKey request) {
+  void attach(PubSocket& pub_socket, const std::string& key, wire::AttachKey request) {
     if (closed_ || readers_.size() >= 1024) return;
     request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
-    const auto& reader = readers_.add(outlet, key, request, sequence_, outlets_->listener);
+    const auto& reader = readers_.add(pub_socket, key, request, sequence_, pub_sockets_->listener);
     answer(*reader, latched_);
   }
 
@@ -163,7 +163,7 @@ class PublisherCore {
   void detach(const std::string& key) {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
-    if (reader->outlet->strict && reader->member < 0) is_late_ = false;
+    if (reader->pub_socket->strict && reader->member < 0) is_late_ = false;
   }
 
   // A reliable reader has accounted for all below a sequence; called under the lock.
@@ -175,27 +175,27 @@ class PublisherCore {
   }
 
   std::size_t reader_count() {
-    const Lock lock(outlets_->mutex);
-    if (!outlets_->closed) outlets_->refresh();
+    const Lock lock(pub_sockets_->mutex);
+    if (!pub_sockets_->closed) pub_sockets_->refresh();
     return readers_.size();
   }
 
   PublisherCounters counters() const {
-    const Lock lock(outlets_->mutex);
+    const Lock lock(pub_sockets_->mutex);
     return counters_;
   }
 
   bool closed() const {
-    const Lock lock(outlets_->mutex);
-    return closed_ || outlets_->closed;
+    const Lock lock(pub_sockets_->mutex);
+    return closed_ || pub_sockets_->closed;
   }
 
   // Leaves the topic. What readers have not got yet is delivered by the node.
   void close() noexcept {
-    const Lock lock(outlets_->mutex);
+    const Lock lock(pub_sockets_->mutex);
     if (closed_) return;
     closed_ = true;
-    outlets_->publishers.erase(source);
+    pub_sockets_->publishers.erase(source);
     try {
       say_end();
     } catch (...) {  // no memory to keep it: it is lost, as with the end of the process
@@ -220,11 +220,11 @@ class PublisherCore {
       std::this_thread::sleep_for(std::chrono::microseconds(100));
       lock.lock();
     }
-    if (closed_ || outlets_->closed) throw std::logic_error("the publisher of " + topic_ + " is closed");
+    if (closed_ || pub_sockets_->closed) throw std::logic_error("the publisher of " + topic_ + " is closed");
     const std::int64_t time_ns = monotonic_ns();
     if (!now && time_ns < refresh_at_ns_) return;
     refresh_at_ns_ = time_ns + refresh_ns;
-    outlets_->refresh();
+    pub_sockets_->refresh();
   }
 
   // Tells readers that this was all; the node says it again to those that read sockets, until they confirm it.
@@ -232,16 +232,16 @@ class PublisherCore {
     std::uint8_t last[wire::header_size];
     write_header(last, 'N', sequence_, 0, 0, 0);
     readers_.end({last, sizeof last});  // what is in the ring stays the readers'
-    if (outlets_->closed) return;
+    if (pub_sockets_->closed) return;
     zmq::message_t frame(last, sizeof last);
-    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
-    if (has_sockets(outlets_->strict)) outlets_->strict.try_send(std::move(frame));
+    if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
+    if (has_sockets(pub_sockets_->strict)) pub_sockets_->strict.try_send(std::move(frame));
     std::vector<EndedPublishers::Reader> owed;
     for (const auto& reader : readers_.release()) {
       const bool owes = reader->request.confirms && reader->member < 0 && reader->confirmed < sequence_;
-      if (owes) owed.push_back({reader->key, reader->outlet, reader->request.reader});
+      if (owes) owed.push_back({reader->key, reader->pub_socket, reader->request.reader});
     }
-    outlets_->ended.add(sequence_, std::string(reinterpret_cast<const char*>(last), sizeof last), std::move(owed));
+    pub_sockets_->ended.add(sequence_, std::string(reinterpret_cast<const char*>(last), sizeof last), std::move(owed));
   }
 
   void answer(const Reader& reader, const std::string& latched) {
@@ -249,11 +249,11 @@ class PublisherCore {
     answer.sequence = sequence_;
     answer.latched = {reinterpret_cast<const std::uint8_t*>(latched.data()), latched.size()};
     zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
-    if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
+    if (!reader.pub_socket->try_send(share(frame)) && reader.pub_socket->strict) reader.pub_socket->send_anyway(std::move(frame));
   }
 
-  // Whether the outlet itself serves some reader.
-  bool has_sockets(const Outlet& outlet) const noexcept { return readers_.socket_count(outlet) > 0; }
+  // Whether the socket itself serves some reader.
+  bool has_sockets(const PubSocket& pub_socket) const noexcept { return readers_.socket_count(pub_socket) > 0; }
 
   // Tries to send until it works or the time is over; the lock is let go while sleeping.
   template <class Attempt>
@@ -266,8 +266,8 @@ class PublisherCore {
       lock.unlock();
       in_time = backoff.wait();
       lock.lock();
-      if (closed_ || outlets_->closed) break;
-      outlets_->refresh();
+      if (closed_ || pub_sockets_->closed) break;
+      pub_sockets_->refresh();
       sent = attempt();
     }
     blocked_ = false;
@@ -279,15 +279,15 @@ class PublisherCore {
     complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
   }
 
-  // Sends over the strict outlet, waiting for the slowest reader.
+  // Sends over the strict socket, waiting for the slowest reader.
   bool send_strict(Lock& lock, zmq::message_t& frame, zmq::send_flags flags) {
-    Outlet& outlet = outlets_->strict;
-    const auto attempt = [&] { return outlet.try_send(share(frame), flags); };
-    if (attempt() || await_room(lock, readers_.timeout_ms(outlet), attempt)) return true;
-    if (closed_ || outlets_->closed) return false;
+    PubSocket& pub_socket = pub_sockets_->strict;
+    const auto attempt = [&] { return pub_socket.try_send(share(frame), flags); };
+    if (attempt() || await_room(lock, readers_.timeout_ms(pub_socket), attempt)) return true;
+    if (closed_ || pub_sockets_->closed) return false;
     late_until_ = sequence_;
     is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
-    outlet.send_anyway(share(frame), flags);
+    pub_socket.send_anyway(share(frame), flags);
     return false;
   }
 
@@ -316,7 +316,7 @@ class PublisherCore {
       const std::int64_t end_ns = begin_ns + std::int64_t{patience_ms} * 1'000'000;
       const std::int64_t left_ms = std::max<std::int64_t>((end_ns - monotonic_ns() + 999'999) / 1'000'000, 0);
       if (await_room(lock, static_cast<std::uint32_t>(left_ms), attempt)) break;
-      if (closed_ || outlets_->closed) return false;
+      if (closed_ || pub_sockets_->closed) return false;
       readers_.give_up(frame_size, monotonic_ns() - begin_ns);
     }
     return true;
@@ -340,22 +340,22 @@ class PublisherCore {
   }
 
   // Header and body, the body from where it lies.
-  bool send_large(Lock& lock, Outlet& outlet, const Slot& slot, const std::string& head, std::size_t size,
+  bool send_large(Lock& lock, PubSocket& pub_socket, const Slot& slot, const std::string& head, std::size_t size,
                   bool& passed_over) {
     const auto fits = [&] { return *private_bytes_ + size <= std::max<std::size_t>(private_bytes_max, 4 * size); };
-    if (!fits() && !(outlet.strict && await_room(lock, readers_.timeout_ms(outlet), fits))) {
+    if (!fits() && !(pub_socket.strict && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
       passed_over = true;
-      return !outlet.strict;
+      return !pub_socket.strict;
     }
     zmq::message_t header = message_of(head);
     bool on_time = true;
-    if (outlet.strict) {
+    if (pub_socket.strict) {
       on_time = send_strict(lock, header, zmq::send_flags::sndmore);
     } else {
-      outlet.try_send(std::move(header), zmq::send_flags::sndmore);
+      pub_socket.try_send(std::move(header), zmq::send_flags::sndmore);
     }
     // The second part goes where the first went: it must not be refused.
-    outlet.send_anyway(private_message(slot, size, private_bytes_));
+    pub_socket.send_anyway(private_message(slot, size, private_bytes_));
     return on_time;
   }
 
@@ -366,12 +366,12 @@ class PublisherCore {
     if (readers_.ring().provide(size, exact_, readers_.member_count())) return true;
     complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
     readers_.dissolve();
-    const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(outlets_->lossy), readers_.timeout_ms(outlets_->strict)});
+    const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(pub_sockets_->lossy), readers_.timeout_ms(pub_sockets_->strict)});
     await_room(lock, timeout_ms, [&] { return !readers_.is_moving(false); });
     return false;
   }
 
-  std::shared_ptr<Outlets> outlets_;
+  std::shared_ptr<PubSockets> pub_sockets_;
   const std::string topic_;
   const std::uint64_t fingerprint_;
   const std::uint8_t flags_;
@@ -393,10 +393,10 @@ class PublisherCore {
   bool closed_ = false;
 };
 
-inline void Outlets::refresh() {
-  for (Outlet* outlet : {&lossy, &strict}) {
+inline void PubSockets::refresh() {
+  for (PubSocket* pub_socket : {&lossy, &strict}) {
     zmq::message_t event;
-    while (outlet->socket.recv(event, zmq::recv_flags::dontwait)) {
+    while (pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
       wire::AttachKey request;
       if (bytes.empty()) continue;
@@ -419,8 +419,8 @@ inline void Outlets::refresh() {
         attached.erase(key);
         if (bytes[0] == 0) ended.detach(key);
       } else if (bytes[0] == 1) {
-        attached[key] = outlet;
-        publisher->second->attach(*outlet, key, request);
+        attached[key] = pub_socket;
+        publisher->second->attach(*pub_socket, key, request);
       } else if (attached.erase(key) > 0) {
         publisher->second->detach(key);
       }

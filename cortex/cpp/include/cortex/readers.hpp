@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/outlet.hpp"
+#include "cortex/pub_socket.hpp"
 #include "cortex/broadcast.hpp"
 #include "cortex/wire.hpp"
 
@@ -20,8 +20,8 @@ namespace cortex::detail {
 struct Reader {
   std::string key;
   wire::AttachKey request;
-  Outlet* outlet = nullptr;
-  int member = -1;  // its number in the ring, through which its frames go; -1: through the outlet
+  PubSocket* pub_socket = nullptr;
+  int member = -1;  // its number in the ring, through which its frames go; -1: through the socket
   std::uint64_t confirmed = 0;  // it has accounted for all below this
   bool is_moving = false;       // it was sent from the ring to its socket, and has not come there yet
 };
@@ -36,19 +36,19 @@ class Readers {
   bool has_members() const noexcept { return members_ > 0; }
   bool empty() const noexcept { return all_.empty(); }
   std::size_t size() const noexcept { return all_.size(); }
-  // Those that the outlet itself serves.
-  std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
+  // Those that the socket itself serves.
+  std::size_t socket_count(const PubSocket& pub_socket) const noexcept { return pub_socket.strict ? strict_ : lossy_; }
 
   // Takes a reader in; through the ring, if it asks for that and there is room. `first` is the sequence of the first
   // message for it.
-  const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
+  const std::shared_ptr<Reader>& add(PubSocket& pub_socket, const std::string& key, const wire::AttachKey& request,
                                      std::uint64_t first, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
-    reader->outlet = &outlet;
+    reader->pub_socket = &pub_socket;
     if (request.shared_memory) join(*reader, first, listener);
-    ++(reader->member >= 0 ? members_ : outlet.strict ? strict_ : lossy_);
+    ++(reader->member >= 0 ? members_ : pub_socket.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
 
@@ -59,7 +59,7 @@ class Readers {
     if (found == all_.end()) return nullptr;
     const std::shared_ptr<Reader> reader = std::move(*found);
     all_.erase(found);
-    --(reader->member >= 0 ? members_ : reader->outlet->strict ? strict_ : lossy_);
+    --(reader->member >= 0 ? members_ : reader->pub_socket->strict ? strict_ : lossy_);
     if (reader->member >= 0) ring_->remove(reader->member);
     return reader;
   }
@@ -80,7 +80,7 @@ class Readers {
       reader->member = -1;
       reader->is_moving = true;
       --members_;
-      ++(reader->outlet->strict ? strict_ : lossy_);
+      ++(reader->pub_socket->strict ? strict_ : lossy_);
     }
   }
   // Whether some reader has still to come to its socket; a reliable one misses what is sent meanwhile.
@@ -119,11 +119,11 @@ class Readers {
     return std::exchange(all_, {});
   }
 
-  // The longest that a reader which this outlet itself serves may hold up the publisher.
-  std::uint32_t timeout_ms(const Outlet& outlet) const noexcept {
+  // The longest that a reader which this socket itself serves may hold up the publisher.
+  std::uint32_t timeout_ms(const PubSocket& pub_socket) const noexcept {
     std::uint32_t longest = 0;
     for (const auto& reader : all_) {
-      if (reader->outlet == &outlet && reader->member < 0) longest = std::max(longest, reader->request.timeout_ms);
+      if (reader->pub_socket == &pub_socket && reader->member < 0) longest = std::max(longest, reader->request.timeout_ms);
     }
     return longest;
   }

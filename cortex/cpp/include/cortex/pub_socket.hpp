@@ -27,7 +27,7 @@ class PublisherCore;
 
 // One XPUB socket. A strict one refuses a message for which some reader's queue is full; a lossy one drops it for
 // that reader, which sees the gap in the sequence.
-struct Outlet {
+struct PubSocket {
   zmq::socket_t socket;
   bool strict = false;
 
@@ -51,12 +51,12 @@ inline zmq::message_t share(zmq::message_t& message) {
 inline zmq::message_t message_of(const std::string& bytes) { return zmq::message_t(bytes.data(), bytes.size()); }
 
 // Publishers that have closed and still wait for readers of sockets to say that they have everything. Calls are made
-// under the lock of the outlets.
+// under the lock of the sockets.
 class EndedPublishers {
  public:
   struct Reader {
     std::string key;
-    Outlet* outlet = nullptr;
+    PubSocket* pub_socket = nullptr;
     std::uint64_t number = 0;  // the reader's own
   };
 
@@ -80,9 +80,9 @@ class EndedPublishers {
     if (now_ns - told_ns_ < repeat_ns) return;
     told_ns_ = now_ns;
     for (const auto& ended : list_) {
-      std::set<Outlet*> outlets;
-      for (const auto& reader : ended.readers) outlets.insert(reader.outlet);
-      for (Outlet* outlet : outlets) outlet->try_send(message_of(ended.last));
+      std::set<PubSocket*> pub_sockets;
+      for (const auto& reader : ended.readers) pub_sockets.insert(reader.pub_socket);
+      for (PubSocket* pub_socket : pub_sockets) pub_socket->try_send(message_of(ended.last));
     }
   }
 
@@ -111,10 +111,10 @@ class EndedPublishers {
   std::int64_t told_ns_ = 0;
 };
 
-// Both outlets of a node under one lock, and the publishers whose readers come and go through them.
-class Outlets {
+// Both sockets of a node under one lock, and the publishers whose readers come and go through them.
+class PubSockets {
  public:
-  Outlets(zmq::context_t& context, bool tcp, const std::string& ring_path)
+  PubSockets(zmq::context_t& context, bool tcp, const std::string& ring_path)
       : listener(ring_path),
         lossy{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), false},
         strict{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), true} {
@@ -126,10 +126,10 @@ class Outlets {
 
   std::mutex mutex;
   Listener listener;  // where local readers ask for rings
-  Outlet lossy;
-  Outlet strict;
+  PubSocket lossy;
+  PubSocket strict;
   std::map<std::uint64_t, PublisherCore*> publishers;
-  std::map<std::string, Outlet*> attached;
+  std::map<std::string, PubSocket*> attached;
   EndedPublishers ended;
   bool closed = false;
 };

@@ -28,26 +28,26 @@ ATTACHED_MAX = 16_384
 
 
 class Attachable(Protocol):
-    """What the outlets tell a publisher; called under the outlets' lock."""
+    """What the sockets tell a publisher; called under the sockets' lock."""
 
-    def attach(self, outlet: Outlet, key: bytes, request: AttachKey) -> None:
+    def attach(self, pub_socket: PubSocket, key: bytes, request: AttachKey) -> None:
         """A reader has come."""
         ...
 
-    def detach(self, outlet: Outlet, request: AttachKey) -> None:
+    def detach(self, pub_socket: PubSocket, request: AttachKey) -> None:
         """A reader has left or died."""
         ...
 
-    def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
+    def resume(self, pub_socket: PubSocket, reader: int, sequence: int) -> None:
         """A reader has accounted for all below a sequence."""
         ...
 
 
 @dataclass(eq=False)
-class Outlet:
+class PubSocket:
     """One XPUB socket.
 
-    A strict outlet refuses a message for which some reader's queue is full (back-pressure); a lossy one drops
+    A strict socket refuses a message for which some reader's queue is full (back-pressure); a lossy one drops
     it for that reader, which sees the gap in the sequence.
     """
 
@@ -62,7 +62,7 @@ class Outlet:
         self._frames = Frames(self.socket)
         self.send: Callable[..., object] = self._frames.send
 
-    def lend(self, body: memoryview) -> zmq.MessageTracker:
+    def send_uncopied(self, body: memoryview) -> zmq.MessageTracker:
         """Send a frame without a copy; the tracker says when its memory is free."""
         tracker = self.socket.send(body, DONTWAIT, copy=False, track=True)
         assert tracker is not None
@@ -90,14 +90,14 @@ class Outlet:
             self.socket.setsockopt(zmq.XPUB_NODROP, 1)
 
 
-def open_outlet(
+def open_pub_socket(
     addresses: Sequence[str],
     *,
     strict: bool,
     local: bool,
     listener: Listener | None = None,
     secure: Callable[[zmq.Socket[bytes]], None] | None = None,
-) -> Outlet:
+) -> PubSocket:
     """Bind an XPUB socket.
 
     Args:
@@ -118,25 +118,25 @@ def open_outlet(
     except zmq.ZMQError:
         socket.close(0)
         raise
-    return Outlet(socket, strict, local, listener)
+    return PubSocket(socket, strict, local, listener)
 
 
-class Outlets:
-    """All outlets of a node under one lock, and the publishers whose readers come and go through them."""
+class PubSockets:
+    """All sockets of a node under one lock, and the publishers whose readers come and go through them."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
-        self._outlets: list[Outlet] = []
+        self._pub_sockets: list[PubSocket] = []
         self._publishers: dict[int, Attachable] = {}
-        self._attached: dict[bytes, Outlet] = {}
+        self._attached: dict[bytes, PubSocket] = {}
         self._notes: deque[str] = deque(maxlen=100)
         self._refreshed_ns = 0
         self.closed = False
 
-    def add(self, outlet: Outlet) -> None:
-        """Take an outlet into service."""
+    def add(self, pub_socket: PubSocket) -> None:
+        """Take an socket into service."""
         with self.lock:
-            self._outlets.append(outlet)
+            self._pub_sockets.append(pub_socket)
 
     def register(self, source: int, publisher: Attachable) -> None:
         """Tell a publisher from now on who attaches to its source."""
@@ -151,13 +151,13 @@ class Outlets:
     def refresh(self) -> None:
         """Read who has come and gone; the caller holds the lock."""
         self._refreshed_ns = time.monotonic_ns()
-        for outlet in self._outlets:
-            while int(outlet.socket.get(EVENTS)) & POLLIN:
+        for pub_socket in self._pub_sockets:
+            while int(pub_socket.socket.get(EVENTS)) & POLLIN:
                 try:
-                    event = outlet.socket.recv(DONTWAIT)
+                    event = pub_socket.socket.recv(DONTWAIT)
                 except zmq.Again:
                     break
-                self._handle(outlet, event)
+                self._handle(pub_socket, event)
 
     def refresh_if_older(self, stamp_ns: int) -> None:
         """Do `refresh`, unless that was after a time of the monotonic clock [ns], for whichever publisher."""
@@ -174,21 +174,24 @@ class Outlets:
             logger.warning("%s", self._notes.popleft())
 
     def tick(self) -> None:
-        """Do `refresh`, unless a publisher is at it."""
+        """Do `refresh`, and forget readers that left early, unless a publisher is at it."""
         if self.lock.acquire(blocking=False):
             try:
                 if not self.closed:
                     self.refresh()
+                    for pub_socket in self._pub_sockets:
+                        if pub_socket.listener is not None:
+                            pub_socket.listener.forget()
             finally:
                 self.lock.release()
 
-    def _handle(self, outlet: Outlet, event: bytes) -> None:
+    def _handle(self, pub_socket: PubSocket, event: bytes) -> None:
         key = event[1:]
         request = parse_attach_key(key)
         if request is None:
             resumed = parse_resume_key(key)
             if resumed is not None and event[0] == 1 and resumed[0] in self._publishers:
-                self._publishers[resumed[0]].resume(outlet, *resumed[1:])
+                self._publishers[resumed[0]].resume(pub_socket, *resumed[1:])
             return
         publisher = self._publishers.get(request.source)
         if publisher is None:
@@ -196,18 +199,18 @@ class Outlets:
         if event[0] == 1:
             if len(self._attached) >= ATTACHED_MAX:
                 return
-            self._attached[key] = outlet
-            publisher.attach(outlet, key, request)
+            self._attached[key] = pub_socket
+            publisher.attach(pub_socket, key, request)
         elif self._attached.pop(key, None) is not None:
-            publisher.detach(outlet, request)
+            publisher.detach(pub_socket, request)
 
     def close(self) -> None:
         """Close the sockets; queued frames are still sent for a second."""
         with self.lock:
             self.closed = True
-            for outlet in self._outlets:
-                outlet.close()
-            self._outlets.clear()
+            for pub_socket in self._pub_sockets:
+                pub_socket.close()
+            self._pub_sockets.clear()
 
 
 class Backoff:
