@@ -325,3 +325,10 @@ def test_an_old_embreex_is_refused(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "files", lambda name: [])
     with pytest.raises(EmbreeError, match="carries no Embree 4"):
         packet_width()
+
+
+def test_a_camera_in_the_plane_of_a_surface_sees_past_it(width):
+    """As it would from either side of the plane, but for what is nearer than rounding."""
+    scene = scene_of(plane(8.0), plane(8.0, 2.0), plane(8.0, 2.0, flipped=True))
+    seen = render(scene, LENS, [((0.3, 0.1, 2.0), LOOK_DOWN)], outputs=("depth",))
+    np.testing.assert_allclose(seen["depth"], 2.0, rtol=1e-6)

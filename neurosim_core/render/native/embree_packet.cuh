@@ -1,6 +1,7 @@
 // Casts the 16 rays `ray` [3][16] from `origin_of(axis, lane)`; rays of zero length are not cast. The results are `faces`,
 // `ts`, `us`, `vs` [16] and `normal` [3][16]. Embree's u and v weigh the second and the third corner of a
 // triangle, Warp's weigh the first and the second. The packet has the layout of RTCRayHit4, 8 or 16.
+constexpr float NEAR_M = 1e-5f; // a surface that the rays begin in is not seen
 alignas(64) float ts[16], us[16], vs[16], normal[3][16];
 alignas(64) int faces[16];
 for (int begin = 0; begin < 16; begin += WIDTH) {
@@ -22,7 +23,8 @@ for (int begin = 0; begin < 16; begin += WIDTH) {
             packet.origin[axis][lane] = origin_of(axis, from);
             packet.ray[axis][lane] = ray[axis][from];
         }
-        packet.near_t[lane] = packet.time[lane] = 0.0f;
+        packet.near_t[lane] = NEAR_M;
+        packet.time[lane] = 0.0f;
         packet.far_t[lane] = far_m;
         packet.mask[lane] = -1;
         packet.id[lane] = packet.flags[lane] = 0;
