@@ -33,17 +33,14 @@ logger = logging.getLogger(__name__)
 Convert = Callable[[Any, Context], "Buffer | None"]
 
 QUEUES: dict[type[Any] | None, int] = {Image: 72, PointCloud: 72, Events: 128}
-"""Messages that wait for their conversion; the option `queue` changes it.
-
-More than by default, so that Cortex makes room in shared memory for those that wait while others are busy."""
+"""Messages that wait for their conversion (the option `queue` changes it): more than by default, so that
+Cortex makes room in shared memory for those that wait while others are busy."""
 QUEUE = 1024
 REMIND_S = (0.1, 0.5, 2.0)
 """When the last message of a latched topic is sent again after somebody in ROS has come [s].
 
 DDS calls a subscriber matched when it knows it, not when the subscriber knows us; and who answers a state at
 once may not be heard yet. In lockstep both would wait for ever."""
-
-
 RECEIVE_S = 0.5
 """How long the thread of a large topic waits before it looks whether it is still wanted [s]."""
 CLOSE_S = 2.0

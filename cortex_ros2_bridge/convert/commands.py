@@ -19,6 +19,8 @@ DEFAULT_MAX_THRUST_N = 50.13
 """Thrust of an AttitudeTarget with thrust 1 [N], if neither an option nor the simulator says otherwise.
 
 It is that of the airframe that Neurosim flies by default: four rotors at 1500 rad/s with 5.57e-6 N s^2."""
+_AT_START_NS = 1
+"""What `_target` stamps an answer to the state of 0 ns with: 0 would mean now, also when it is said again."""
 _VELOCITY = ("frame", "max_speed_m_s", "max_rate_rad_s", "beyond")
 _POSITION = ("max_position_m", "beyond")
 _IGNORE_RATES = (1, 2, 4)
@@ -256,7 +258,8 @@ def _stamp_ns(message: Any, context: Context) -> int:
     stamp = message.header.stamp
     if stamp.sec < 0 or stamp.nanosec >= 1_000_000_000:
         raise ConvertError(f"a stamp of {stamp.sec} s and {stamp.nanosec} ns")
-    return stamp_ns_of(stamp) or context.now_ns
+    stamp_ns = stamp_ns_of(stamp)
+    return 0 if stamp_ns == _AT_START_NS else stamp_ns or context.now_ns
 
 
 def _thrust_n(message: Any, context: Context) -> float:
@@ -277,7 +280,7 @@ def max_thrust_n(context: Context) -> float:
 
 def _target(message: Any, mask: int, orientation: Any, rate: Any, context: Context) -> Any:
     return record("mavros_msgs/msg/AttitudeTarget")(
-        header(message.stamp_ns, context.frames.body_of(context.vehicle), context),
+        header(message.stamp_ns or _AT_START_NS, context.frames.body_of(context.vehicle), context),
         mask,
         quaternion(orientation),
         vector(rate),

@@ -1075,7 +1075,15 @@ def test_normalized_actuators_beyond_their_range_are_refused(value):
 def test_a_command_without_a_stamp_answers_the_newest_state():
     assert take(convert.actuators, Actuators(velocity=[1.0])).stamp_ns == 99
     assert take(convert.twist, Twist(), options={"frame": "map"}).stamp_ns == 99
-    assert take(convert.actuators, stamped(Actuators(velocity=[1.0]), "", 0, 1)).stamp_ns == 1
+    assert take(convert.actuators, stamped(Actuators(velocity=[1.0]), "", 0, 2)).stamp_ns == 2
+
+
+def test_an_answer_to_the_first_state_is_none_to_the_newest():
+    """A stamp of 0 would mean now: said again, it would answer a state that it does not know."""
+    command = messages.RateThrustCommand(0, thrust_n=5.0, body_rate=np.zeros(3))
+    (out,) = (r for r in RULES if r.direction == "record" and r.cortex_type == "cortex/RateThrustCommand")
+    sent = out.convert(command, context())
+    assert convert.rates(sent, context(now_ns=99)).stamp_ns == 0
 
 
 @pytest.mark.parametrize(("second", "nanosecond"), [(-1, 0), (0, 10**9), (5, 2**32 - 1)])

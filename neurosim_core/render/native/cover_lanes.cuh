@@ -18,6 +18,7 @@ if (even) {
         middle[0][0][lane] = middle[1][0][lane] = 0.0f;
     }
 } else {
+#ifndef __CUDA_ARCH__
     using Row = float __attribute__((ext_vector_type(SAMPLES)));
     using Bits = bool __attribute__((ext_vector_type(SAMPLES)));
     static_assert(SAMPLES == 32, "a bit of an unsigned for each point");
@@ -26,6 +27,7 @@ if (even) {
         columns_of_points[sample] = points[0][sample];
         rows_of_points[sample] = points[1][sample];
     }
+#endif
     int layer_of[MOST], touching = 0;
     float plane[MOST][3]; // of touching faces: the nearness [1/m] along a direction is its product with this
     alignas(64) unsigned shown[MOST][LANES]; // bits of the points that show it
@@ -76,8 +78,14 @@ if (even) {
                                      + OVERLAP * (value[0][term][lane] + value[1][term][lane] + value[2][term][lane]);
             for (unsigned rest = crossed[side]; rest; rest &= rest - 1) {
                 const int lane = lowest_of(rest);
+#ifdef __CUDA_ARCH__
+                unsigned outside = 0;
+                for (int sample = 0; sample < SAMPLES; ++sample)
+                    outside |= at[0][lane] + points[0][sample] * at[1][lane] + points[1][sample] * at[2][lane] < 0.0f ? 1u << sample : 0u;
+#else
                 const Row value_of = at[0][lane] + columns_of_points * at[1][lane] + rows_of_points * at[2][lane];
                 const unsigned outside = __builtin_bit_cast(unsigned, __builtin_convertvector(value_of < 0.0f, Bits));
+#endif
                 inside[lane] &= ~outside;
             }
         }
