@@ -32,6 +32,7 @@ from neurosim_core.io import is_event_file
 from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
+from neurosim_core.record.hdf5 import import_h5py
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
@@ -384,13 +385,15 @@ class _Files:
 def _load(model: Model, *, rerun: bool) -> None:
     """Load what is used later, while the scene is lit: kernels, and the libraries of `_LIBRARIES`."""
     warm_flight(model)
-    for library in _LIBRARIES:
-        if importlib.util.find_spec(library) is None or (library == "rerun" and not rerun):
-            continue
-        if library == "rerun":
-            import_rerun()  # which keeps it quiet
-        else:
-            importlib.import_module("matplotlib.figure" if library == "matplotlib" else library)
+    imports: list[Callable[[], object]] = [
+        import_h5py,
+        functools.partial(importlib.import_module, "matplotlib.figure"),
+    ]
+    if rerun:
+        imports.append(import_rerun)
+    for load in imports:
+        with contextlib.suppress(ImportError):  # what is left out for want of it is told by `_has`
+            load()
 
 
 def _planned_track(model: Model, end_ns: int) -> Track:

@@ -35,14 +35,7 @@ class Aedat4Source:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        decoder = self._decoder()
-        while True:
-            try:
-                track, events = next(decoder)
-            except StopIteration:
-                return
-            except BaseException as error:
-                raise _damage(self._path, error) from None
+        for track, events in _whole(self._path, self._decoder()):
             if track.id == self._track and len(events):
                 yield _columns(events)
 
@@ -74,14 +67,7 @@ class EsSource:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        blocks = iter(self._stream)
-        while True:
-            try:
-                events = next(blocks)
-            except StopIteration:
-                return
-            except BaseException as error:
-                raise _damage(self._path, error) from None
+        for events in _whole(self._path, iter(self._stream)):
             if len(events):
                 yield _columns(events)
 
@@ -123,6 +109,18 @@ class Aedat4Sink:
         if self._encoder is not None:
             encoder, self._encoder = self._encoder, None
             encoder.__exit__(None, None, None)
+
+
+def _whole(path: Path, blocks: Iterator[Any]) -> Iterator[Any]:
+    """Yield what can be decoded; what faery raises for the rest, panics too, tells of damage."""
+    while True:
+        try:
+            block = next(blocks)
+        except StopIteration:
+            return
+        except BaseException as error:
+            raise _damage(path, error) from None
+        yield block
 
 
 def _columns(events: Any) -> EventArrays:
