@@ -216,7 +216,8 @@ def test_a_bag_of_what_flew(simulator, tmp_path):
         command.end(signal.SIGINT)
     with AnyReader([tmp_path / "run"]) as reader:
         found = [c for c, _, _ in reader.messages() if c.topic == "/drone/gyro"]
-    assert [c.msgtype for c in found[:3]] == ["sensor_msgs/msg/Imu"] * 3
+    assert len(found) in (3, 4)  # the last may have come too late
+    assert {c.msgtype for c in found} == {"sensor_msgs/msg/Imu"}
 
 
 def taken_by_bridge(node: Node, topic: str) -> int:

@@ -29,11 +29,13 @@ def message_to_plain(schema: Schema, message: Any) -> dict[str, Any]:
 
 def message_from_plain(schema: Schema, plain: dict[str, Any]) -> Any:
     """Return a message of `type_from_schema(schema)` from its value in the files."""
-    cls = type_from_schema(schema)
-    bindings = cls.__cortex_bindings__  # type: ignore[attr-defined]
+    return _message_from_plain(schema, type_from_schema(schema), plain)
+
+
+def _message_from_plain(schema: Schema, cls: Any, plain: dict[str, Any]) -> Any:
     values = {
         field.name: _from_plain(field.type, bound, plain[field.name])
-        for field, bound in zip(schema.fields, bindings, strict=True)
+        for field, bound in zip(schema.fields, cls.__cortex_bindings__, strict=True)
     }
     return cls(**values)
 
@@ -59,7 +61,7 @@ def _to_plain(kind: FieldType, value: Any) -> Any:
 
 def _from_plain(kind: FieldType, bound: Any, plain: Any) -> Any:
     if isinstance(kind, Schema):
-        return message_from_plain(kind, plain)
+        return _message_from_plain(kind, bound, plain)
     if isinstance(kind, OptionalType):
         return None if plain is None else _from_plain(kind.item, bound, plain)
     if isinstance(kind, ListType):
