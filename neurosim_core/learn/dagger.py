@@ -47,6 +47,8 @@ class DaggerConfig:
     hint_weight: float = 2.0
     """Of the error of the estimated velocity, against that of the action."""
     gradient_max: float = 1.0
+    inverted: float = 0.0
+    """Share of the stretches that are learnt from with brighter and darker exchanged, as in a negative."""
     hidden: int = 128
     """Width of the student's GRU,"""
     widths: tuple[int, ...] = (32, 48, 48, 48, 48)
@@ -141,6 +143,7 @@ class Dagger:
         self._action = torch.zeros((env.num_envs, 4), device=env.device)
         self._act = Replayed(self._decide, on_cuda=env.device.type == "cuda")
         self._rows = torch.zeros(config.batch, dtype=torch.int64, device=env.device)
+        self._inverted = torch.zeros((config.batch, 1, 1, 1, 1, 1), dtype=torch.bool, device=env.device)
         self._losses = torch.zeros(2, device=env.device)
         self._flown = 0
 
@@ -194,6 +197,8 @@ class Dagger:
                 stretches, (config.batch,), generator=self._generator, device=self.env.device
             )
             self._rows.copy_(rows)
+            drawn = torch.rand(self._inverted.shape, generator=self._generator, device=self.env.device)
+            torch.lt(drawn, config.inverted, out=self._inverted)
             self.descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()
         return {"imitation": imitation, "hint": hint}
@@ -202,6 +207,9 @@ class Dagger:
         """Return the loss of the stretches that `_rows` names; adds to `_losses`."""
         part = {name: value.flatten(0, 1).index_select(0, self._rows) for name, value in self._kept.items()}
         memory = part.pop("memory")
+        if self.config.inverted > 0.0:
+            pairs = part["surface"].unflatten(2, (-1, 2))  # off and on
+            part["surface"] = torch.where(self._inverted, pairs.flip(3), pairs).flatten(2, 3)
         part = {name: value.transpose(0, 1) for name, value in part.items()}
         action, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
         errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()
