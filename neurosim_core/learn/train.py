@@ -52,7 +52,7 @@ class TrainConfig:
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
     rays_per_pixel: int | None = None
-    """Rays that a pixel takes the mean of in training; None: as the task says. Tests take what the task says."""
+    """Rays that a pixel takes the mean of in training; None: as the task says, as in tests."""
     randomise: str = "training"
     """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
     learn, or nothing (`none`)."""
