@@ -259,15 +259,16 @@ def default_config(
     if not find_device(device).startswith("cuda"):
         few: dict[str, Any] = {
             "worlds": 64,
-            "iterations": 90,
+            "iterations": 150,
             "updates": 8,
             "replay": 10,
             "learning_rate": 2e-3,
+            "inverted": 0.5,
         }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
-            config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=90
+            config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=75
         )
     many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(

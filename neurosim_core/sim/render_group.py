@@ -185,7 +185,7 @@ def make_render_group(
         )
         for _ in range(in_flight)
     ]
-    motions: Any = upload_motions(bodies, device) if bodies else None
+    motions: Any = upload_motions(bodies, device, world_count=worlds.count) if bodies else None
     processes, further = _picture_processes(
         images,
         renderers,
