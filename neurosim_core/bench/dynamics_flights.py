@@ -160,7 +160,10 @@ MOTORS_S = (1e-1, 1e-2, 5e-3, 1e-3, 5e-4, 3e-4, 1e-4, 1e-5, 1e-6, 0.0)
 """Time constants of motors, from sluggish to none [s]."""
 
 _FAST = 200.0 / math.sqrt(3.0)
-_STORM = {"wind_m_s": (100.0, 0.0, 0.0), "parasitic_drag_kg_m": preset("hummingbird").parasitic_drag_kg_m}
+_STORM: dict[str, Any] = {
+    "wind_m_s": (100.0, 0.0, 0.0),
+    "parasitic_drag_kg_m": preset("hummingbird").parasitic_drag_kg_m,
+}
 _INERTIA = np.array(preset("crazyflie").inertia_kg_m2)
 _MASSES_KG = {"30 g": 3e-2, "5.3 g": 5.3e-3, "3 g": 3e-3, "0.3 g": 3e-4, "30 mg": 3e-5, "3 mg": 3e-6}
 _RATIOS = {"1:10:100": (1.0, 10.0, 100.0), "1:10:10.9": (1.0, 10.0, 10.9), "1:100:100.9": (1.0, 100.0, 100.9)}
