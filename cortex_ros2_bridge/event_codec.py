@@ -118,8 +118,8 @@ def decode_libcaer_cmp(data: Buffer | Bytes, *, base_ns: int, width: int, height
     polarity = np.where(is_vector, sign, own >> 11)[row].astype(np.uint8)
     t = ((high << 12 | low) * 1000 + base_ns)[row]
     inside = (x[row] < width) & (y < height)
-    columns = EventColumns(t, x[row].astype(np.uint16), y.astype(np.uint16), polarity)
-    return EventColumns(*(column[inside] for column in columns))
+    places = x[row][inside].astype(np.uint16), y[inside].astype(np.uint16)
+    return EventColumns(t[inside], *places, polarity[inside])
 
 
 DVS_RECORD = np.dtype(
