@@ -61,6 +61,10 @@ class DenseConfig:
     """Windows that are kept to be seen again; of more, the oldest go."""
     reuse: float = 4.0
     """Worlds fly on when their windows have been seen so often, on average."""
+    renders: int | None = None
+    """Of the event camera in a window, of worlds; None: as in other flights, ten in 50 ms."""
+    threshold_spread: float = 0.25
+    """Each world draws its thresholds up to this share above the nominal ones, or below, in each flight."""
     size_px: int = 48
     """Of the pictures of all flights that are flown here [px]."""
     test_flights: int = 8
@@ -315,7 +319,10 @@ def _source(
 
         fly_device = config.fly_device or config.device
         settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
+        flown = world_windows(
+            settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
+            renders=config.renders, threshold_spread=config.threshold_spread,
+        )  # fmt: skip
         while len(pool) < min(config.batch, worlds):
             pool.add(next(flown))
 
