@@ -351,8 +351,9 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         return self.shutter if self.shutter.window_ns else None
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet."""
-        return Image(data=picture, encoding=self.encoding, **header)
+        """Return a picture as a packet, whose class has `data` and `encoding`."""
+        packet: Packet = self.packet_type(data=picture, encoding=self.encoding, **header)  # type: ignore[call-arg]
+        return packet
 
 
 class FrameSensor(Protocol):

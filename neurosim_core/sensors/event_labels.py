@@ -28,7 +28,7 @@ from neurosim_core.packets import Events, FieldSpec, as_numpy
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
 from neurosim_core.runtime.cuda import BufferPool, PooledBuffer, size_class
-from neurosim_core.scene.bodies import Motion, body_orientation, body_position, body_velocity
+from neurosim_core.scene.bodies import Motion, body_orientation, body_position, velocity_on_body
 from neurosim_core.scene.labels import label_scenes
 from neurosim_core.sensors.base import FrameContext
 from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
@@ -162,9 +162,8 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                     if body >= 0:
                         p_WO = body_position(model.motions[body], stamp_ns)
                         q_WO = body_orientation(model.motions[body], stamp_ns)
-                        arm_O = wp.quat_rotate_inv(q_WO, p_WC + wp.float64(r) * ray_W - p_WO)
-                        turning = wp.quat_rotate(q_WO, wp.cross(model.motions[body].spin, arm_O))
-                        v_W += body_velocity(model.motions[body], stamp_ns) + turning
+                        p_W = p_WC + wp.float64(r) * ray_W
+                        v_W += velocity_on_body(model.motions[body], stamp_ns, p_WO, q_WO, p_W)
                 v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
             rate = project_velocity(model.lens, p_C, v_C)
             out.pairs[event] = wp.vec2(float(rate[0]), float(rate[1]))
