@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from neurosim_core.sensors.state_sampler import (
         ErrorConfig,
         Errors,
+        LateConfig,
         Motion,
+        Sampling,
         StateSampler,
         error_adder,
         make_errors,
+        make_reader,
     )
 
 _HOMES = {
@@ -35,9 +38,12 @@ _HOMES = {
     "neurosim_core.sensors.state_sampler": (
         "StateSampler",
         "Motion",
+        "Sampling",
+        "LateConfig",
         "ErrorConfig",
         "Errors",
         "make_errors",
+        "make_reader",
         "error_adder",
     ),
 }
@@ -48,14 +54,17 @@ __all__ = [
     "Errors",
     "FrameSensorConfig",
     "ImageSensorConfig",
+    "LateConfig",
     "Motion",
     "RateHz",
     "Sampler",
     "SamplerContext",
+    "Sampling",
     "StateSampler",
     "StateSensorConfig",
     "error_adder",
     "make_errors",
+    "make_reader",
 ]
 
 
