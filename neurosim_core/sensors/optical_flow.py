@@ -29,7 +29,7 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.render.projection import projector, velocity_projector
 from neurosim_core.render.ray_times import RayTimes
-from neurosim_core.scene.bodies import velocity_on_body
+from neurosim_core.scene.bodies import make_body_poses, velocity_on_body
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
 from neurosim_core.sensors.occlusion import (
     NEAR_RATIO,
@@ -41,7 +41,7 @@ from neurosim_core.sensors.occlusion import (
     measure_clearance,
     measure_tiles,
 )
-from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of, make_rays
+from neurosim_core.sensors.pixel_process import Batch, PixelProcess, Views, element_of, make_rays, make_views
 
 VISIBLE, HIDDEN, OUTSIDE = (wp.constant(value) for value in (0, 1, 2))
 """Values of the mask: seen at both times; hidden by something at the other time; outside the picture then."""
@@ -120,14 +120,9 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
         return _Before(self.window_ns) if self.direction == "forward" and self.window_ns else None
 
     @property
-    def pose_offset_ns(self) -> int | None:
-        """The other time."""
-        return None if not self.window_ns else 0 if self.timing else -self.window_ns
-
-    @property
-    def needs_twist(self) -> bool:
-        """Velocities need it."""
-        return not self.window_ns
+    def look_back_ns(self) -> int:
+        """To the earlier picture."""
+        return self.window_ns
 
     def make_process(self, context: PictureContext) -> "FlowProcess":
         """Return what makes flow of ranges."""
@@ -150,6 +145,8 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
 class _Model:
     around: Surroundings
     rays: wp.array3d[wp.vec3]
+    there: Views  # at the other time
+    twist: wp.array[wp.spatial_vectord]
     # Of each view, of C with respect to T, the camera at the other time:
     R_TC: wp.array[wp.mat33d]
     p_TC: wp.array[wp.vec3d]
@@ -167,7 +164,7 @@ def _relate_views(model: _Model, focal_px: float, batch: Batch):
     world = wp.tid() // batch.instant_count
     view = world * batch.stride + wp.tid() % batch.instant_count
     here = batch.here
-    there = batch.there
+    there = model.there
     q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
     q_WT = wp.normalize(wp.quatd(there.q_WC[view]))
     p_W = wp.vec3d(here.p_WC[view]) - wp.vec3d(there.p_WC[view])
@@ -203,7 +200,7 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         col = at.col
         view = at.view
         here = batch.here
-        there = batch.there
+        there = model.there
         number = batch.lens_of_world[at.world]
         lens = model.around.lenses[number]
         ray_C = wp.vec3d(model.rays[number, row, col])
@@ -219,7 +216,7 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         if wp.static("bodies" in terms):
             body = wp.max(-1, instance[slot, row, col] - model.around.scene_instances)
         if wp.static("velocity" in terms):
-            motion = batch.twist[view]
+            motion = model.twist[view]
             w_C = wp.vec3d(motion[3], motion[4], motion[5])
             p_C = ray_C
             v_C = -wp.cross(w_C, ray_C)
@@ -331,6 +328,18 @@ class FlowProcess(PixelProcess):
         view_count = len(context.lens_of_world) * context.stride
         for name, dtype in (("R_TC", wp.mat33d), ("p_TC", wp.vec3d), ("p_CT", wp.vec3), ("clearance", float)):
             setattr(model, name, wp.zeros(view_count, dtype=dtype, device=device))
+        twist_count, view_count = (0, view_count) if config.window_ns else (view_count, 0)
+        model.twist = wp.zeros(twist_count, dtype=wp.spatial_vectord, device=device)
+        body_count = 0 if context.motions is None else context.motions.shape[0]
+        self._there = {
+            "p_WC": wp.zeros(view_count, dtype=wp.vec3, device=device),
+            "q_WC": wp.zeros(view_count, dtype=wp.quat, device=device),
+            "stamps": wp.zeros((view_count, 1), dtype=wp.int64, device=device),
+            "bodies": make_body_poses(view_count, body_count, device),
+        }
+        model.there = make_views(**self._there)
+        offset_ns = 0 if config.timing else -config.window_ns
+        self._offsets_ns: Any = wp.array([offset_ns], dtype=wp.int64, device=device)
         model.unresolved_count = wp.zeros(1, dtype=int, device=device)
         self._focal_px, self._listed = 0.0, None
         variant = terms
@@ -348,7 +357,10 @@ class FlowProcess(PixelProcess):
 
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
-        if "velocity" not in self.terms:
+        if "velocity" in self.terms:
+            views.find_twists(self._model.twist)
+        else:
+            views.look(self._offsets_ns, **self._there)
             batch = self.batch_of(views)
             view_count = views.image_slot.shape[0] // batch.stride * views.instant_count
             inputs = [self._model, self._focal_px, batch]

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.render.launch import launch_split
-from neurosim_core.scene.bodies import make_body_poses
+from neurosim_core.scene.bodies import BodyPoses, make_body_poses
 from neurosim_core.sensors.base import PictureContext, PictureViews
 
 
@@ -42,9 +42,6 @@ class Batch:
     lens_of_world: wp.array[int]
     scene_of_world: wp.array[int]
     here: Views
-    there: Views
-    """At the further time that the sensor asks for."""
-    twist: wp.array[wp.spatial_vectord]
 
 
 @wp.struct
@@ -127,8 +124,9 @@ class PixelProcess:
         """Return a batch for a kernel; it is valid until the next one."""
         batch = self._batch
         batch.instant_count, batch.image_slot = views.instant_count, views.image_slot
-        batch.active, batch.twist = views.active, views.twist
-        batch.here, batch.there = (_views_at(each, self.device) for each in (views, views.then or views))
+        batch.active = views.active
+        bodies = views.bodies or _no_bodies(str(self.device))
+        batch.here = make_views(views.p_WC, views.q_WC, views.stamps, bodies)
         return batch
 
 
@@ -138,11 +136,10 @@ def make_rays(context: PictureContext) -> Any:
     return wp.array(rays, dtype=wp.vec3, device=context.source.device)
 
 
-def _views_at(views: PictureViews, device: Any) -> Any:
-    bodies = views.bodies or _no_bodies(str(device))
+def make_views(p_WC: Any, q_WC: Any, stamps: Any, bodies: BodyPoses) -> Any:
+    """Return the poses of one time for a kernel."""
     at = Views()
-    at.p_WC, at.q_WC, at.stamps = views.p_WC, views.q_WC, views.stamps
-    at.p_WO, at.q_WO = bodies.p_WO, bodies.q_WO
+    at.p_WC, at.q_WC, at.stamps, at.p_WO, at.q_WO = p_WC, q_WC, stamps, bodies.p_WO, bodies.q_WO
     return at
 
 
