@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -18,48 +20,43 @@ from numpy.typing import NDArray
 
 SIZE_MAX = 256 * 2**20
 """Bytes of all entries together."""
-POINTS_MIN = 10_000
-"""Scenes of fewer points are lit as fast as they are read."""
 
 
-def cached_light(
-    inputs: tuple[object, ...], count: int, compute: Callable[[], NDArray[np.float32]]
-) -> NDArray[np.float32]:
+def cached_arrays(
+    inputs: tuple[object, ...], compute: Callable[[], dict[str, NDArray[Any]]]
+) -> dict[str, NDArray[Any]]:
     """Return what `compute` returned for the same inputs before, or call it and keep what it returns.
 
     Args:
-        inputs: All that the light depends on: arrays by their bytes, the rest by its `repr`.
-        count: Points that are lit, the length of the result.
-        compute: Returns the light of each point.
+        inputs: All that the result depends on: arrays by their bytes, the rest by its `repr`.
+        compute: Returns arrays by name.
     """
-    if count < POINTS_MIN:
-        return compute()
     digest = hashlib.blake2b(digest_size=16)
     for part in inputs:
         array = isinstance(part, np.ndarray)
         digest.update(np.ascontiguousarray(part).data if array else repr(part).encode())
-    entry = Path(str(wp.config.kernel_cache_dir), "light", f"{digest.hexdigest()}.npy")
-    with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or damaged
-        found: NDArray[np.float32] = np.load(entry)
-        if len(found) == count:
-            os.utime(entry)
-            return found
-    light = compute()
+    entry = Path(str(wp.config.kernel_cache_dir), "light", f"{digest.hexdigest()}.npz")
+    with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):  # not there, or damaged
+        with entry.open("rb") as source, np.load(source) as kept:
+            found = dict(kept)
+        os.utime(entry)
+        return found
+    made = compute()
     with contextlib.suppress(OSError):  # a folder that cannot be written to, a full disk
         entry.parent.mkdir(parents=True, exist_ok=True)
         part_file = entry.with_suffix(f".{os.getpid()}")
         try:
             with part_file.open("wb") as file:
-                np.save(file, light)
+                np.savez(file, **cast(Any, made))
             part_file.replace(entry)
         finally:
             part_file.unlink(missing_ok=True)
         _remove_oldest(entry.parent)
-    return light
+    return made
 
 
 def _remove_oldest(folder: Path) -> None:
-    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*.npy")), reverse=True)
+    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*.npz")), reverse=True)
     total = 0
     for _, file in entries:
         total += file.stat().st_size

@@ -20,6 +20,7 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from neurosim_core.render.config import LightingConfig
 from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_width
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.light_cache import cached_light
+from neurosim_core.render.light_cache import cached_arrays
 from neurosim_core.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
@@ -38,6 +39,8 @@ log = logging.getLogger(__name__)
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BURIED = 0.1  # occluders at 5 % of the ambient radius all around
 _OFFSET_M = wp.constant(1.0e-3)
+_KEPT_FACES_MIN = 10_000
+"""Scenes of fewer triangles are lit as fast as their light is read."""
 
 
 @wp.func
@@ -423,19 +426,20 @@ def bake_light(
     Returns:
         Linear light, shape [2, F, 3, 3]: front and back, face, corner, RGB.
     """
-    normals = corner_normals(mesh)
-    group, example = _group_corners(mesh, normals)
 
-    def compute() -> NDArray[np.float32]:
+    def compute() -> dict[str, NDArray[Any]]:
+        normals = corner_normals(mesh)
+        group, example = _group_corners(mesh, normals)
         light, openness = _light_groups(scene, mesh, config, normals, group, example, device, embree)
         _unbury(light, openness, group.reshape(-1, 3))
-        return light
+        return {"light": light, "group": group.astype(np.int32)}
 
     caster = wp.get_device(device).name, embree and packet_width()
-    inputs = scene.vertices, _shading_faces(scene), mesh.vertices, mesh.faces, normals
+    inputs = scene.vertices, _shading_faces(scene), mesh.vertices, mesh.faces, mesh.normals
     rest = scene.lights, scene.ambient, config, caster, wp.__version__, _source()
-    per_group = cached_light((*inputs, *rest), len(example), compute)
-    return np.ascontiguousarray(np.moveaxis(per_group[group], 1, 0)).reshape(2, -1, 3, 3)
+    found = cached_arrays((*inputs, *rest), compute) if len(mesh.faces) >= _KEPT_FACES_MIN else compute()
+    per_corner = found["light"][found["group"]]
+    return np.ascontiguousarray(np.moveaxis(per_corner, 1, 0)).reshape(2, -1, 3, 3)
 
 
 @functools.cache

@@ -267,7 +267,7 @@ def test_lists_hold_what_rays_hit(device):
     """Every triangle that a ray meets within the reach, hidden or not, by brute force in float64."""
     part = soup(60, 6)
     poses = path(6, 0.03, 0.02)
-    renderer, _ = lists_of(scene_of(part), poses, device, instants=6, face_count_max=64)
+    renderer, _ = lists_of(scene_of(part), poses, device, instants=8, face_count_max=64)
     data = renderer.candidates.data
     count, reach = data.count.numpy()[0], data.reach.numpy()[0]
     lists = data.faces.numpy().reshape(len(count), 64)
