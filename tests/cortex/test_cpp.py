@@ -73,6 +73,7 @@ def test_between_threads(programs: Path) -> None:
 
 def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
     """Under the thread sanitizer: shared publishers, leases that end elsewhere, nodes that end early."""
+    ensure_registry(0)
     done = subprocess.run(
         [programs / "node_test"],
         capture_output=True,
@@ -350,26 +351,13 @@ def test_new_registry_learns_of_cpp(start: Callable[..., Peer], make_node: Calla
     assert peer.process.poll() is None
 
 
-def test_static_peer_without_registry(
-    programs: Path, make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    node = make_node(registry="off")
-    scans = node.publisher("/scan", Scan)
-    monkeypatch.setenv("CORTEX_TEST_PEER", node.nodes()[0].endpoints[0].control)
-    peer = Peer([programs / "peer", "count", "/scan", "reliable", 0, 0])
-    assert scans.wait_for_subscribers(1, SOON_S)
-    scans.publish(Scan(-1, np.zeros(0, np.float32)))
-    assert json.loads(peer.line())["received"] == 0
-    peer.end()
-
-
 def test_lies_are_rejected(
     programs: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A subscriber counts every frame that is wrong and reads those between; a false ring does no harm."""
     impostor = Impostor(runtime)
     try:
-        monkeypatch.setenv("CORTEX_TEST_PEER", impostor.control)
+        monkeypatch.setenv("CORTEX_TEST_REGISTRY", impostor.registry)
         peer = Peer([programs / "peer", "count", "/scan", "8", 0, 0])
         key = impostor.await_key()
         body = codec_of(Scan).encode(Scan(0, np.zeros(4, np.float32)), 1000)

@@ -420,7 +420,7 @@ class RingImpostor(Impostor):
 @pytest.fixture
 def impostor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RingImpostor]:
     liar = RingImpostor(runtime)
-    monkeypatch.setenv("CORTEX_TEST_PEER", liar.control)
+    monkeypatch.setenv("CORTEX_TEST_REGISTRY", liar.registry)
     yield liar
     liar.close()
     shutil.rmtree(runtime, ignore_errors=True)
