@@ -84,35 +84,6 @@ def test_tally_tells_of_the_first_message_once():
     assert told == ["connected"]
 
 
-def batches(*groups: list[int]) -> Any:
-    """Return the report of a tally that was handed these sequences as arrays."""
-    tally = Tally(FLOATS, lambda: None)
-    handle = tally.batch_handler()
-
-    def feed() -> None:
-        for group in groups:
-            tags = [[1.0 + (sequence & 1)] * FLOATS for sequence in group]
-            handle(np.array(group, np.int64), np.array(tags, np.float32))
-
-    with pytest.raises(Finished):
-        feed()
-    return tally.report
-
-
-@pytest.mark.parametrize(
-    ("groups", "counts"),
-    [
-        (([WARM], [WARM, 0, 1], [2, 3, 4], [5], [6, 7, END]), (8, 0, 0)),
-        (([0, 1, 2], [5, 6], [END]), (5, 2, 0)),
-        (([0, 1, 2], [3, 5, 4, 6], [END]), (7, 0, 1)),
-    ],
-)
-def test_batches_are_counted_as_single_messages_are(groups: Any, counts: tuple[int, int, int]):
-    report = batches(*groups)
-    assert (report["received"], report["lost"], report["misordered"]) == counts
-    assert report["corrupt"] == 0
-
-
 def test_ages_count_from_the_stamp_to_the_use():
     ages = Ages(lambda: None, busy=False)
     ages.use(WARM, None)

@@ -159,7 +159,7 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
     node = make_node()
     stopped = start("count", "/scan", policy, 0, 0)
     others = [node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) for _ in range(3)]
-    writer = start("publish", "/scan", 9000, "10", "", 4)
+    writer = start("publish", "/scan", 9000, "100", "", 4)
     for number in range(9000):
         assert {other.recv(SOON_S).stamp_ns for other in others} == {number}
         if number in (500, 8000):  # meanwhile comes more than the ring holds

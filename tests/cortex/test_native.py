@@ -207,29 +207,6 @@ def test_drain_takes_what_follows_and_hands_back_what_ends_it(
     assert flags[1:] == [zmq.DONTWAIT] * (len(flags) - 1)
 
 
-@pytest.mark.parametrize(
-    ("kept", "more", "limit", "count", "left"),
-    [
-        (range(20), [], 64, 20, 0),
-        (range(20), [], 7, 7, 13),
-        ([0, 1, 2, 5, 6], [], 64, 3, 1),
-        ([0, 1], [b"x"], 64, 2, 0),
-    ],
-)
-def test_gather_joins_the_bodies_that_follow_one_another(kept, more, limit, count, left):
-    """What ends it is handed back; every eighth message is timed."""
-    coder, codec = coder_of(Numbers3, HEAD), codec_of(Numbers3)
-    frames = [coder.frame(Numbers3(s, float(s)), s, 0, 1000) for s in kept]
-    script, latency = Script([*frames, *more]), [0] * 8
-    expected, bodies, found, frame = coder_of(Numbers3, HEAD).gather(
-        script, zmq.Again, 0, limit, latency, 10**12
-    )
-    assert (expected, found, len(script.frames)) == (count, count, left)
-    assert frame == ([*frames, *more][count] if len(frames) + len(more) > count + left else None)
-    assert np.frombuffer(bodies, codec.record_dtype)["value"].tolist() == list(range(count))
-    assert sum(latency) == (count + 7) // 8
-
-
 def test_drain_passes_errors_on():
     def broken(flags):
         raise OSError("gone")

@@ -304,7 +304,7 @@ def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     done = threading.Event()
 
     def publish():
-        for value in range(20_000):
+        for value in range(40_000):
             assert publisher.publish(Number(0, value))
         done.set()
 

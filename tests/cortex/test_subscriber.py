@@ -268,74 +268,6 @@ def test_several_threads_share_a_stream(numbers):
     assert subscriber.counters.received == 2000
 
 
-# Batches
-
-
-def test_a_batch_holds_what_is_there(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    values, stamps, sizes = [], [], []
-    for start in range(0, 1000, 200):
-        for value in range(start, start + 200):
-            publisher.publish(Number(10 * value, value))
-        while len(values) < start + 200:
-            batch = subscriber.recv_batch(SOON_S)
-            assert batch.dtype == codec_of(Number).record_dtype
-            assert not batch.flags.writeable
-            values += batch["value"].tolist()
-            stamps += batch["stamp_ns"].tolist()
-            sizes.append(len(batch))
-    assert values == list(range(1000))
-    assert stamps == [10 * value for value in values]
-    assert max(sizes) > 10
-    assert subscriber.counters.received == 1000
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-
-
-def test_single_messages_after_batches(node):
-    """Who has asked for batches may go on one by one, in order."""
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-    for value in range(100):
-        publisher.publish(Number(value, value))
-    first = subscriber.recv_batch(SOON_S)["value"].tolist()
-    rest = [subscriber.recv_with_info(SOON_S) for _ in range(100 - len(first))]
-    assert first + [message.value for message, _ in rest] == list(range(100))
-    assert [info.sequence for _, info in rest] == list(range(len(first), 100))
-    assert subscriber.counters.received == 100
-
-
-@pytest.mark.parametrize("depth", [1, 10])
-def test_batches_are_bounded_by_the_policy(node, depth):
-    """Of a thousand, the last ones wait."""
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=keep_last(depth))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-    for value in range(1000):
-        publisher.publish(Number(value, value))
-    values = []
-    while not values or values[-1] < 999:
-        values += subscriber.recv_batch(SOON_S)["value"].tolist()
-    assert values == list(range(1000 - depth, 1000))
-    counters = subscriber.counters
-    assert (counters.received, counters.overtaken) == (depth, 1000 - depth)
-
-
-def test_a_type_of_varying_size_has_no_batches(node):
-    subscriber = node.subscriber("/scans", Scan)
-    with pytest.raises(TypeError, match="only a type of fixed size"):
-        subscriber.recv_batch(0.0)
-    with pytest.raises(TypeError, match="only a type of fixed size"):
-        node.subscriber("/scans", None).recv_batch(0.0)
-
-
 # Raw and generic
 
 
@@ -482,7 +414,6 @@ def test_use_after_close(numbers):
         lambda: subscriber.recv(0.0),
         lambda: subscriber.recv_with_info(0.0),
         lambda: subscriber.recv_raw(0.0),
-        lambda: subscriber.recv_batch(0.0),
         lambda: subscriber.wait_for_publisher(0.0),
         lambda: asyncio.run(subscriber.recv_async(0.0)),
     ]
@@ -524,7 +455,7 @@ def test_many_publishers_of_a_topic(node):
         assert streams[publisher.source] == [(number, value, value) for value in range(40)]
 
 
-@pytest.mark.parametrize("how", ["recv", "recv_batch", "callback"])
+@pytest.mark.parametrize("how", ["recv", "callback"])
 @pytest.mark.parametrize("policy", [reliable(16, 60.0), keep_last(64)], ids=str)
 def test_no_publisher_starves_another(node, policy, how):
     """Two that send more than is read: both come through."""
@@ -558,11 +489,8 @@ def test_no_publisher_starves_another(node, policy, how):
         while not done.is_set() and time.monotonic() < deadline:
             if how == "callback":
                 done.wait(0.01)
-            elif how == "recv":
-                take(subscriber.recv(SOON_S))
             else:
-                for stamp_ns, value in subscriber.recv_batch(SOON_S).tolist():
-                    take(Number(stamp_ns, value))
+                take(subscriber.recv(SOON_S))
     finally:
         starved = not done.is_set()
         done.set()
