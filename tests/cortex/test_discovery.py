@@ -91,28 +91,6 @@ def change_and_leave(one, two):
     assert one.changes == [frozenset({two.id})] * 3
 
 
-def test_changes_made_together_travel_together(make):
-    one, two = make("one"), make("two")
-    drive([one, two], lambda: one.names and two.names)
-    begin = time.monotonic()
-    for index in range(200):
-        publishers = [publisher(f"/topic_{k}") for k in range(index + 1)]
-        two.record = dataclasses.replace(two.record, publishers=publishers)
-        two.directory.announce()
-        two.directory.tick()
-    drive([one, two], lambda: len(one.directory.nodes[two.id].publishers) == 200)
-    assert one.directory.nodes[two.id].revision <= 3 + (time.monotonic() - begin) / 0.01
-
-
-def test_two_hundred_topics_with_large_schemas(make):
-    one, two = make("one"), make("two")
-    schema = "x" * 5000
-    two.record = dataclasses.replace(two.record, publishers=[publisher(f"/t{k}", schema) for k in range(200)])
-    two.directory.announce()
-    drive([one, two], lambda: one.names and len(one.directory.nodes[two.id].publishers) == 200)
-    assert one.directory.nodes[two.id].publishers == two.record.publishers
-
-
 def test_fifty_nodes_see_each_other(make):
     nodes = [make(f"node {k:02}") for k in range(50)]
     drive(nodes, lambda: all(len(node.directory.nodes) == 49 for node in nodes))
@@ -130,27 +108,6 @@ def test_a_node_that_is_started_before_the_registry(make, base):
     assert not early[0].directory.connected
     with serving():
         drive(early, lambda: early[0].names == ["two"] and early[1].names == ["one"])
-
-
-def test_domains_are_apart(make, context):
-    one = make("one")
-    record = make_record("other")
-    other = Directory(context, domain=1, record=lambda: record)
-    try:
-        drive([one], lambda: one.directory.connected)
-        deadline = time.monotonic() + SOON_S
-        while not other.connected:
-            assert time.monotonic() < deadline
-            other.tick()
-            other.handle(other.sockets()[0])
-            time.sleep(0.005)
-        drive_for([one], 0.3)
-        assert not one.directory.nodes
-        assert not other.nodes
-    finally:
-        other.close()
-        os.kill(registry_pid(1), signal.SIGTERM)
-        wait_for(lambda: registry_pid(1) is None)
 
 
 # Death
@@ -216,18 +173,6 @@ def test_a_killed_node_disappears_with_its_files(make):
             wait_for(lambda directory=directory: not list(directory.glob(f"{0xBAD:016x}.*")))
             watcher.close()
     assert min(took_s) < 0.5 * LEASE_S  # a busy machine makes some of them late, but not each
-
-
-def test_a_node_whose_process_lives_is_given_time(make):
-    """A long call that holds Python's lock must not cut its streams."""
-    with serving(stalled_s=1e6), node_process("sleeper") as sleeper:
-        watcher = make("watcher")
-        drive([watcher], lambda: watcher.names == ["sleeper"])
-        sleeper.send_signal(signal.SIGSTOP)
-        drive_for([watcher], 2 * LEASE_S)
-        assert watcher.names == ["sleeper"]
-        sleeper.kill()  # but not once it is dead
-        drive([watcher], lambda: not watcher.directory.nodes)
 
 
 def test_a_node_that_was_stopped_for_too_long_comes_back(make):
@@ -315,14 +260,6 @@ def test_a_missing_number_makes_the_node_ask_again(played):
     played.say(Alive(9, 6, 1))
     played.expect(Heartbeat)
     assert played.node.names == ["lost", "other"]
-
-
-def test_an_old_revision_held_by_the_registry_is_renewed(played):
-    played.expect(Hello)
-    played.say(Welcome(9, 0, [], []))
-    played.expect(Heartbeat)
-    played.say(Alive(9, 0, 0))  # it has lost us
-    assert played.expect(Hello).record.node == played.node.id
 
 
 def test_a_new_registry_must_confirm_within_a_lease(played):
