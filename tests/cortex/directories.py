@@ -27,7 +27,6 @@ from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, FileLock, runtime_dir
 from cortex.records import (
     Alive,
     Changed,
-    Describe,
     Gone,
     Heartbeat,
     Hello,
@@ -217,7 +216,7 @@ def dealer(context):
     return socket
 
 
-TYPES = control_types(Alive, Changed, Describe, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
+TYPES = control_types(Alive, Changed, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
 
 
 def receive(socket, timeout_ms=1e3 * SOON_S):
