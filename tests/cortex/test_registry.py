@@ -41,7 +41,6 @@ from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, runtime_di
 from cortex.records import (
     Alive,
     Changed,
-    Describe,
     Endpoint,
     Gone,
     Heartbeat,
@@ -233,7 +232,6 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
             Hello(False, record),
             Heartbeat(record.node, 1, 0),
             Leave(record.node),
-            Describe(record.node),
             Welcome(1, 1, [1, 2], [3, 4]),
         )
     ]
