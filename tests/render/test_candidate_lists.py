@@ -387,11 +387,15 @@ def test_events_of_a_flight_are_the_same(tmp_path):
         "sampling_rate_hz": 1000,
         "packet_rate_hz": 50,
     }
+    turn = [
+        {"time_s": time_s, "position_m": [time_s, 0.0, 1.2], "rpy_rad": [0.0, 0.0, 0.2 + 3.0 * time_s]}
+        for time_s in (0.0, 0.1, 0.2)
+    ]
     settings = {
         "duration_s": 0.2,
         "device": "cpu",
         "scene": room_scene(tmp_path),
-        "path": {"kind": "circle", "radius_m": 1.0},
+        "path": {"kind": "poses", "keyframes": turn},
         "sensors": {"events": camera},
     }
     light = {"lighting": {"mode": "unshadowed"}, "exposure": 1.0, "samples_per_pixel": 1}
