@@ -371,10 +371,8 @@ class Subscriber(Generic[T]):
                 attached = any(link.attached for link in self._links)
                 if self._queue:
                     self.wakeup.set()  # whoever sleeps on the descriptors would not notice
-            if attached:
-                return True
-            if time.monotonic() >= deadline_s:
-                return False
+            if attached or time.monotonic() >= deadline_s:
+                return attached
             time.sleep(0.5e-3)
 
     @property
