@@ -257,10 +257,10 @@ def test_another_checkout_is_measured_beside_each_way_of_cortex():
 # Tables.
 
 
-def printed(function: Any, results: Any, *, judged: bool = True) -> str:
+def printed(function: Any, results: Any, **options: Any) -> str:
     console = make_console()
     with console.capture() as capture:
-        function(console, results, judged=judged)
+        function(console, results, **options)
     return capture.get()
 
 
@@ -273,7 +273,7 @@ def results() -> list[CaseResult]:
 
 
 def test_summary_says_met_or_missed_and_counts():
-    text = printed(print_summary, results())
+    text = printed(print_summary, results(), judged=True)
     assert "0.90 ± 0.00" in text
     assert "1 met, 1 missed" in text
 
