@@ -29,18 +29,8 @@ logger = logging.getLogger(__name__)
 WAITING_MAX = 256
 """Readers that have asked and not attached; older ones are forgotten."""
 
-PAGE = 4096
-SLOTS_BYTES = 4 << 20
-"""Small slots take this much in all, so that they stay in cache."""
-GROWTH_BYTES = 4 << 20
-"""What slots that replace ones for smaller messages have to spare, at most: to make them takes a millisecond
-or more, and who publishes waits for it."""
-DEEP_BYTES = 16 << 20
-DEEP_SLOTS = 128
-"""What slots take, and how many there are, where a reader keeps more messages than by default."""
 DEEP_QUOTA = 67
 """A reader that may hold so many messages keeps more than by default, see `keep_last`."""
-SLOTS_BYTES_MAX = 2 << 30
 MOVE_S = 0.1
 """How long readers have at least to come to their sockets, where there is no memory for slots."""
 RETRY_S = 5.0
@@ -261,30 +251,16 @@ class Broadcast:
     def _provide(self, size: int, *, exact: bool) -> bool:
         """Make slots for bodies of a size, if need be; whether there are any."""
         ring, deep = self._ring, any(r.request.quota >= DEEP_QUOTA for r in self._readers.values())
-
-        def wanted(slot_bytes: int) -> int:
-            least = 2 * len(self._readers) + 2
-            return max(least, min(DEEP_SLOTS, DEEP_BYTES // slot_bytes)) if deep else least
-
-        fits = ring.slot_bytes >= size
-        if fits and ring.slots >= wanted(ring.slot_bytes):
+        if ring.slot_bytes >= size and time.monotonic() < self._unavailable_until_s:
             return True
-        slot_bytes = size if exact else size + size // 4
-        if ring.slots and not exact and not fits:  # messages grow: the next slots are to last
-            slot_bytes = max(slot_bytes, size + min(size, GROWTH_BYTES))
-        slot_bytes = -(-max(slot_bytes, ring.slot_bytes) // PAGE) * PAGE
-        slots = max(min(max(SLOTS_BYTES // slot_bytes, 4), 64), wanted(slot_bytes))
-        slots = max(4, min(slots, SLOTS_BYTES_MAX // slot_bytes))
-        if (fits and ring.slots >= slots) or time.monotonic() < self._unavailable_until_s:
-            return bool(fits)
         try:
-            ring.provide(slots, slot_bytes)
+            if time.monotonic() >= self._unavailable_until_s:
+                ring.provide(size, exact, deep)
         except OSError as error:
             self._unavailable_until_s = time.monotonic() + RETRY_S
-            if not fits:
-                self._note(f"no shared memory for slots of {slot_bytes} bytes: {error}")
-            return bool(fits)
-        return True
+            if ring.slot_bytes < size:
+                self._note(f"no shared memory for slots of {size} bytes: {error}")
+        return bool(ring.slot_bytes >= size)
 
     def _dissolve(self) -> None:
         """Send all readers to their sockets, for good, and wait a little until they are there."""
