@@ -18,11 +18,6 @@ SHAPE = (60, 480, 3)
 DIMS = dict(zip(("height", "width", "channels"), SHAPE, strict=True))
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 @pytest.fixture(params=["as it is", "the long way"])
 def way(request, monkeypatch):
     """Without the C module there is only the long way."""

@@ -354,11 +354,6 @@ def test_nothing_of_any_kind_is_leaked():
 # Through a ring
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 @message
 class Frames:
     """Nothing in it is of a size known in advance."""

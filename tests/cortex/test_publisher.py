@@ -18,11 +18,6 @@ from cortex.publisher import Closed
 LARGE = 100_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def scan(number, size=3):
     return Scan(number, np.full(size, number, np.float32))
 

@@ -25,19 +25,6 @@ from cortex.schema import TypeMismatch, schema_of
 LARGE = 100_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
-@pytest.fixture
-def numbers(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    return publisher, subscriber
-
-
 def scan(number, size=LARGE):
     return Scan(number, np.full(size, number, np.float32))
 
