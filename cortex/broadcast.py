@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import zmq
 
+from cortex.back_pressure import BackPressure
 from cortex.compiled import native
-from cortex.patience import Patience
 from cortex.pub_socket import PubSocket
 from cortex.wire import AttachKey
 
@@ -133,8 +133,8 @@ class Broadcast:
 
     Args:
         source: The publisher's number.
-        patience: Waits for readers; the lock is let go meanwhile.
-        await_room: As `patience.wait_for`; says so when a reader was too late.
+        back_pressure: Waits for readers; the lock is let go meanwhile.
+        await_room: As `back_pressure.wait_for`; says so when a reader was too late.
         reroute: Called when frames go another way to readers of the ring.
         note: Says that something goes wrong.
         expected_bytes: Make slots for messages of this size before the first reader is answered; 0: do not.
@@ -143,14 +143,14 @@ class Broadcast:
     def __init__(
         self,
         source: int,
-        patience: Patience,
+        back_pressure: BackPressure,
         await_room: Callable[[Callable[[], bool], float], bool],
         reroute: Callable[[], None],
         note: Callable[[str], None],
         expected_bytes: int = 0,
     ) -> None:
         self._source = source
-        self._patience = patience
+        self._back_pressure = back_pressure
         self._await_room = await_room
         self._reroute = reroute
         self._note = note
@@ -199,7 +199,7 @@ class Broadcast:
 
     @property
     def short_cut(self) -> Any:
-        """The ring in C, if it has readers and slots enough for them; see `gate.py`."""
+        """The ring in C, if it has readers and slots enough for them; see `fast_send.py`."""
         if not self._readers or self._ring.slots < 2 * len(self._readers) + 2:
             return None
         return self._ring
@@ -270,7 +270,7 @@ class Broadcast:
         self._forget()
         self._reroute()
         timeout_s = max(MOVE_S, *(reader.timeout_s for reader in self._moving))
-        self._patience.wait_for(lambda: not self._moving, timeout_s)
+        self._back_pressure.wait_for(lambda: not self._moving, timeout_s)
 
     @property
     def has_lost(self) -> bool:
@@ -304,7 +304,7 @@ class Broadcast:
             timeout_s = min(reader.timeout_s for reader in slow)
             if self._await_room(attempt, timeout_s - (time.monotonic() - begin_s)):
                 return
-            waited_s, is_over = time.monotonic() - begin_s, self._patience.is_over()
+            waited_s, is_over = time.monotonic() - begin_s, self._back_pressure.is_over()
             for member in in_the_way():
                 if is_over or self._readers[member].timeout_s <= waited_s:
                     self._ring.give_up(member)

@@ -12,7 +12,7 @@ from peer import Number
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
-from cortex.inlet import PAUSE_COUNT
+from cortex.fast_receive import PAUSE_COUNT
 
 STREAM = 12 * PAUSE_COUNT
 

@@ -60,7 +60,7 @@ def test_the_same_bytes_as_a_message_that_is_copied(node, way):
         with pytest.raises(RuntimeError, match="before"):
             loan.publish(expected)
         del room, body, lent_body, loan
-    assert not way or True in way  # not each: now and then the gate looks who has come
+    assert not way or True in way  # not each: now and then the fast path looks who has come
     wait_for(lambda: slots_held(publisher) == 0)
 
 

@@ -229,7 +229,7 @@ def test_closing_while_another_thread_is_held_up(node):
     for thread in threads:
         thread.start()
     published = -1
-    while published != (published := publisher._gate.sequence) or published < 100:
+    while published != (published := publisher._fast_send.sequence) or published < 100:
         time.sleep(0.05)
     publisher.close()
     for thread in threads:
