@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from neurosim_core.live.cameras import CameraThread
 from neurosim_core.live.config import LiveConfig
@@ -52,7 +53,7 @@ class StreamingLoop:
             stats: Counts overruns.
             wakeup: Set when there are new packets or requests.
         """
-        self._vehicles = {vehicle.name: vehicle for vehicle in vehicles}
+        self._vehicles = vehicles
         for vehicle in vehicles:
             vehicle.publisher.lateness_ns = pacer.lateness_ns
         self._cameras = cameras
@@ -77,14 +78,13 @@ class StreamingLoop:
             RuntimeError: The cameras failed.
         """
         drop = live.overrun == "drop" and self._pacer.factor > 0.0
-        for vehicle in self._vehicles.values():
-            engine = vehicle.engine
+        for vehicle in self._vehicles:
             if drop:
-                self._cameras.drop_until(vehicle.name, stamp_ns - engine.period_count_max * period_ns)
-            if not self._cameras.wait_for(lambda e=engine: e.can_fly(drop=drop), stop):  # type: ignore[misc]
+                self._cameras.drop_until(vehicle, stamp_ns - vehicle.period_count_max * period_ns)
+            if not self._cameras.wait_for(partial(vehicle.can_fly, drop=drop), stop):
                 return False
             is_late = drop and self._pacer.lateness_ns(stamp_ns) > BEHIND_MAX_NS / 2
-            self._cameras.render(vehicle.name, engine, vehicle.fly(stamp_ns), is_late=is_late)
+            self._cameras.render(vehicle, vehicle.fly(stamp_ns), is_late=is_late)
         return True
 
     def catch_up(self, stamp_ns: int, stop: Callable[[], bool]) -> None:
@@ -99,7 +99,7 @@ class StreamingLoop:
     def publish_rendered(self, stamp_ns: int) -> None:
         """Publish what the cameras have rendered and what arrives by a tick at which time stands [ns]."""
         self.offer_rendered()
-        for vehicle in self._vehicles.values():
+        for vehicle in self._vehicles:
             vehicle.publisher.publish_due(stamp_ns)
 
     def publish_until(
@@ -134,7 +134,7 @@ class StreamingLoop:
         self._handle_overrun(end_ns, period_ns, live)
         while not leave():
             self.offer_rendered()
-            dues = (vehicle.publisher.next_due_ns for vehicle in self._vehicles.values())
+            dues = (vehicle.publisher.next_due_ns for vehicle in self._vehicles)
             due_ns = min([end_ns, *(due for due in dues if due is not None)])
             late_ns = self._pacer.wait_until(due_ns, interrupted)
             if late_ns < 0:
@@ -142,7 +142,7 @@ class StreamingLoop:
             if due_ns == end_ns:
                 self._stats.late_times.add(late_ns)
                 return True
-            for vehicle in self._vehicles.values():
+            for vehicle in self._vehicles:
                 vehicle.publisher.publish_due(due_ns)
         return False
 
@@ -163,8 +163,8 @@ class StreamingLoop:
 
     def offer_rendered(self) -> None:
         """Send what the cameras have rendered."""
-        for name, packets in self._cameras.take():
-            self._vehicles[name].publisher.offer(packets)
+        for vehicle, packets in self._cameras.take():
+            vehicle.publisher.offer(packets)
 
     def _handle_overrun(self, end_ns: int, period_ns: int, live: LiveConfig) -> None:
         """Delay time if a period was computed after its end [ns] and that cannot be caught up."""
