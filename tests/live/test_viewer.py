@@ -30,7 +30,8 @@ from neurosim_core.live import viewer as viewer_module
 from neurosim_core.live.session import ViewOptions
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
-from neurosim_core.view import FileTarget, event_picture
+from neurosim_core.view.pictures import event_picture
+from neurosim_core.view.rerun_targets import FileTarget
 
 BODY = "/world/vehicles/drone"
 

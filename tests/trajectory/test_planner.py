@@ -12,22 +12,12 @@ from pydantic import ValidationError
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
-from neurosim_core.trajectory import (
-    FlightLimits,
-    HoverConfig,
-    LineConfig,
-    Path,
-    PlanningError,
-    TourConfig,
-    WaypointsConfig,
-    flight_bounds,
-    make_path,
-    minimum_snap,
-    plan_tour,
-    plan_waypoints,
-    prove_clearance,
-)
-from neurosim_core.trajectory.certify import segment_clearance
+from neurosim_core.trajectory import Path, TourConfig, make_path
+from neurosim_core.trajectory.certify import prove_clearance, segment_clearance
+from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds
+from neurosim_core.trajectory.minsnap import minimum_snap
+from neurosim_core.trajectory.planner import PlanningError, WaypointsConfig, plan_tour, plan_waypoints
+from neurosim_core.trajectory.shapes import HoverConfig, LineConfig
 from neurosim_core.vehicle import preset
 
 

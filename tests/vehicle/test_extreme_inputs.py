@@ -13,26 +13,24 @@ import pytest
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.control import MODES, PathFollower, Se3Config, make_controller, mode_kernel
 from neurosim_core.frames import Mount, as_rows, heading_rad
-from neurosim_core.trajectory import (
+from neurosim_core.trajectory import Path, TourConfig
+from neurosim_core.trajectory.feasibility import FlightLimits
+from neurosim_core.trajectory.heading import follow_travel
+from neurosim_core.trajectory.minsnap import minimum_snap
+from neurosim_core.trajectory.path import PathCursor, upload_paths
+from neurosim_core.trajectory.planner import WaypointsConfig
+from neurosim_core.trajectory.shapes import (
     CircleConfig,
     FigureEightConfig,
-    FlightLimits,
     HoverConfig,
     LineConfig,
     LissajousConfig,
-    Path,
-    PathCursor,
-    TourConfig,
-    WaypointsConfig,
     circle,
     figure_eight,
     hover,
     line,
     lissajous,
-    minimum_snap,
-    upload_paths,
 )
-from neurosim_core.trajectory.heading import follow_travel
 from neurosim_core.vehicle import DynamicsError, Multirotor, preset
 
 NAN, INF = math.nan, math.inf

@@ -16,7 +16,8 @@ import pytest
 import rerun as rr
 from processes import SOON_S, wait_for
 
-from neurosim_core.view import RerunViewer, ViewerEnded, rerun_viewer
+from neurosim_core.view import rerun_viewer
+from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
