@@ -268,12 +268,13 @@ class LiveSession:
 
     def _log_status(self, status: msg.SimulatorStatus) -> None:
         self.phase = status.phase
-        stamp_ns, log = status.stamp_ns, self._logger.log_simulator
+        stamp_ns, log = status.stamp_ns, self._logger.log_values
         if status.phase == "running":
             times = ("step_median_ns", "step_p99_ns", "late_median_ns", "late_p99_ns")
             names = (name.removesuffix("_ns").replace("_", ", ") for name in times)
-            log("timing", stamp_ns, {n: 1e-6 * getattr(status, t) for n, t in zip(names, times, strict=True)})
-            log("real_time_factor", stamp_ns, {"real-time factor": status.real_time_factor})
+            milliseconds = {n: 1e-6 * getattr(status, t) for n, t in zip(names, times, strict=True)}
+            log("simulator/timing", stamp_ns, milliseconds)
+            log("simulator/real_time_factor", stamp_ns, {"real-time factor": status.real_time_factor})
         lost = self._lost()
         by_links = sum(sensor.injected_lost_count for sensor in status.sensors)
         losses = {
@@ -285,7 +286,7 @@ class LiveSession:
             "commands lost or refused": sum(v.lost_count + v.refused_count for v in status.vehicles),
             "lost on the way here": sum(lost.values()),
         }
-        log("losses", stamp_ns, losses)
+        log("simulator/losses", stamp_ns, losses)
         text = describe_status(status, rates_hz=self._rates.update(status), lost=lost)
         self._logger.log_status(stamp_ns, text)
 
