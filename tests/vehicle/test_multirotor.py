@@ -88,7 +88,7 @@ def test_derivatives_of_an_odd_airframe(device):
     vehicle = Multirotor(config, count=20, device=device)
     vehicle.reset(*states)
     assert set(TERMS) - set(vehicle.terms) == {
-        "rotor_lags", "turbulence", "ground", "ground_effect",
+        "turbulence", "ground", "ground_effect",
     }  # fmt: skip
     rates = np.array([derivative(config, np.concatenate([*s[:4]]), s[4]) for s in zip(*states, strict=True)])
     assert relative(vehicle.acceleration.linear, rates[:, 3:6]) < 1e-12
