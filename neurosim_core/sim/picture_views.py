@@ -11,9 +11,8 @@ import warp as wp
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.render.renderer import Renderer, RenderWorlds
-from neurosim_core.scene.bodies import BodyPoses, make_body_poses, pose_bodies
-from neurosim_core.sensors.base import PictureContext, PictureSensorConfig, PictureViews
-from neurosim_core.sim.trace import Trace
+from neurosim_core.scene.bodies import BodyPoses, make_body_poses
+from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,42 +76,3 @@ def make_further(config: PictureSensorConfig, rows: int, body_count: int, device
         bodies=make_body_poses(rows_then, body_count, device) if has_bodies else None,
         twist=wp.zeros(rows, dtype=wp.spatial_vectord, device=device) if twists else None,
     )
-
-
-def look_further(
-    more: Further,
-    views: PictureViews,
-    trace: Trace,
-    slots: Any,
-    *,
-    count: int,
-    p_BC: Any,
-    q_BC: Any,
-    motions: Any,
-    instants: Any,
-) -> PictureViews:
-    """Launch what a picture sensor needs to know besides, and return all of it.
-
-    Args:
-        more: Overwritten.
-        views: From where and when rays were cast.
-        trace: Where the states are.
-        slots: Slots of the instants in the trace, shape [K].
-        count: How many of them to use.
-        p_BC: Position of the camera on the body [m].
-        q_BC: Orientation of the camera against the body, xyzw.
-        motions: Of the bodies.
-        instants: 0, 1, ... N K - 1.
-    """
-    mount = {"count": count, "p_BC": p_BC, "q_BC": q_BC}
-    if more.offsets_ns is not None:
-        poses = {"p_WC": more.p_WC, "q_WC": more.q_WC, "stamps": more.stamps}
-        trace.ray_poses(slots, more.offsets_ns, **mount, **poses)
-        if more.bodies is not None:
-            pose_bodies(motions, more.stamps, instants, count=more.stamps.shape[0], poses=more.bodies)
-        then = views._replace(p_WC=more.p_WC, q_WC=more.q_WC, stamps=more.stamps, bodies=more.bodies)
-        views = views._replace(then=then)
-    if more.twist is not None:
-        trace.camera_twists(slots, **mount, twist=more.twist)
-        views = views._replace(twist=more.twist)
-    return views

@@ -27,11 +27,11 @@ from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples, VehicleStates
-from neurosim_core.sim.parameters import lenses_differ, vary_sensors
+from neurosim_core.sim.parameters import WorldSettings, lenses_differ, vary_sensors
 from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
-from neurosim_core.sim.state import State, WorldSettings, make_state, reset_vehicles
+from neurosim_core.sim.state import State, make_state, reset_vehicles
 from neurosim_core.sim.step import launch, launch_first
 
 _logger = logging.getLogger(__name__)

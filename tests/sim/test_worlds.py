@@ -149,7 +149,7 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     commands = commands_of("rates", 4, 2)
     worlds = Simulation(settings(textured, sensors=rig, render=walking), worlds=2)
     seen = record(worlds, commands)
-    walk = worlds._state.groups[0].renderers[0].candidates
+    walk = worlds._state.groups[0].buffers[0].renderer.candidates
     left, left_room = int(walk.data.unresolved_count.numpy()[0]), walk.data.unresolved.shape[0]
     assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
     for world in range(2):

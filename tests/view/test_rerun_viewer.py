@@ -72,7 +72,7 @@ def test_a_port_is_kept_to():
 
 def test_it_ends_with_a_parent_that_is_killed():
     code = (
-        "from neurosim_core.view import RerunViewer\n"
+        "from neurosim_core.view.rerun_viewer import RerunViewer\n"
         "viewer = RerunViewer(web=True)\n"
         "print(viewer._process.pid, flush=True)\n"
         "input()\n"
