@@ -167,8 +167,8 @@ class Multirotor:
         self.terms = tuple(term for term in TERMS if term in chosen)
         """The terms that are compiled in."""
         self.arrays = allocate_arrays(count, config.rotor_count, self.device)
-        self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
-        self._adaptive = (rtol, atol, evaluation_count_max)
+        self._kernels = make_kernels(frozenset(self.terms))
+        self._adaptive = (integrator == "dormand_prince", rtol, atol, evaluation_count_max)
         self._model = make_airframe(config, self.device)
         self.airframes = alike(self._model.airframe, count, self.device)
         """Parameters of each vehicle, [N], which may be written between steps."""
@@ -396,7 +396,7 @@ class Multirotor:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lag = lag_constants(step_s, self.config.motor_time_constant_s)
-        rtol, atol, evaluation_count_max = self._adaptive
+        is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
         interval = _struct(
             Interval,
             duration_ns=duration_ns,
@@ -407,6 +407,7 @@ class Multirotor:
             square_nodes=wp.vec3d(*lag.square_nodes),
             decay=lag.decay,
             lag_rate=lag.rate_1_s,
+            is_adaptive=is_adaptive,
             rtol=rtol,
             atol=atol,
             evaluation_count_max=evaluation_count_max,
