@@ -26,7 +26,7 @@ from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.observation import Observation, Samples, VehicleStates
+from neurosim_core.sim.observation import Observation, Samples
 from neurosim_core.sim.parameters import WorldSettings, lenses_differ, vary_sensors
 from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
@@ -349,15 +349,7 @@ class Simulation:
                 offsets_ns=offsets_ns,
             )
         return Observation(
-            state=VehicleStates(
-                position=arrays.position,
-                velocity=arrays.velocity,
-                orientation=arrays.orientation,
-                body_rate=arrays.body_rate,
-                air_velocity=arrays.air_velocity,
-                rotor_speed=arrays.rotor_speed,
-                stamp_ns=arrays.stamp_ns,
-            ),
+            state=arrays,
             clock_ns=state.fleet.clock_ns,
             frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
             images={name: picture for group in state.groups for name, picture in group.pictures.items()},
