@@ -63,7 +63,7 @@ class CollisionFreeConfig(Settings):
     """Distance from the path to the scene [m]: more than the vehicle's collision radius; holds everywhere."""
     limits: FlightLimits = FlightLimits()
     """What the path may ask of the vehicle; time is scaled so that the tightest of them is met."""
-    lookahead_s: float = Field(default=0.5, gt=0.0)
+    lookahead_s: float = Field(default=0.5, gt=0.0, le=1e6)
     """The vehicle looks to where it will be after this time [s]."""
 
 
