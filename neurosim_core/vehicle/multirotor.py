@@ -121,9 +121,8 @@ class Multirotor:
             velocity and of body rate.
         atol: What is added to that [m, m/s, rad, rad/s].
         evaluation_count_max: The most evaluations of the right-hand side for one interval of one vehicle.
-        seed: Of the turbulence, 0 <= seed < 2^64; each vehicle of the batch has its own, by its index.
-        seeds: A seed for each vehicle, device array of uint64, shape [N], in place of `seed`: its turbulence
-            is then that of a vehicle that flies alone with that seed.
+        seed: Of the turbulence, 0 <= seed < 2^64: that of vehicle 0; the others count on from it.
+        seeds: A seed for each vehicle in place of `seed`, device array of uint64, shape [N].
 
     Raises:
         TypeError: What counts is not an integer.
@@ -172,16 +171,18 @@ class Multirotor:
         self._model = make_airframe(config, self.device)
         self.airframes = alike(self._model.airframe, count, self.device)
         """Parameters of each vehicle, [N], which may be written between steps."""
+        if seeds is None:
+            own = np.arange(count, dtype=np.uint64) + np.uint64(seed)
+            seeds = wp.array(own, dtype=wp.uint64, device=self.device)
         wind = make_wind(
             config.gusts if "gusts" in self.terms else (),
             config.turbulence,
             turbulent="turbulence" in self.terms,
             wind_m_s=config.wind_m_s,
             ground_height_m=0.0 if config.ground is None else config.ground.height_m,
-            seed=seed,
+            seeds=seeds,
             count=count,
             device=self.device,
-            seeds=seeds,
         )
         self._around = _struct(
             Surroundings,
