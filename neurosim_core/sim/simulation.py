@@ -179,11 +179,6 @@ class Simulation:
         return self._scenes.models
 
     @property
-    def command_width(self) -> Mapping[str, int]:
-        """Numbers in a command of each mode that was used; of `motor_speeds`, rotors."""
-        return {mode: int(buffer.array.shape[1]) for mode, buffer in self._state.commands.items()}
-
-    @property
     def common_ns(self) -> int:
         """Some worlds can be reset when all of them have flown for a multiple of this [ns]; 0: never."""
         return self._timetable.common_ns
