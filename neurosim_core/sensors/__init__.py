@@ -18,10 +18,13 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core.sensors.state_sampler import (
         ErrorConfig as ErrorConfig,
         Errors as Errors,
+        LateConfig as LateConfig,
         Motion as Motion,
+        Sampling as Sampling,
         StateSampler as StateSampler,
         error_adder as error_adder,
         make_errors as make_errors,
+        make_reader as make_reader,
     )
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

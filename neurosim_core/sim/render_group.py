@@ -38,6 +38,7 @@ from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
+    PictureContext,
     PictureProcess,
     PictureSensorConfig,
     SensorConfig,
@@ -48,7 +49,6 @@ from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings, lens_tables
-from neurosim_core.sim.picture_views import Further, make_further, make_picture_context
 
 MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
@@ -82,8 +82,6 @@ class BatchBuffers:
     """Pictures on the host by source; empty: they stay on the device."""
     processes: Mapping[str, PictureProcess]
     """What pictures go through on the device, by the name of the sensor."""
-    further: Mapping[str, Further]
-    """What their processing needs besides, likewise."""
     p_WC: wp.array[wp.vec3]
     """Where the camera is at the instants [m], shape [N K]; [N K J] where rays have times of their own."""
     q_WC: wp.array[wp.quat]
@@ -290,20 +288,23 @@ def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
         worlds=plan.worlds,
         times=plan.times,
     )
+    worlds, scene = plan.worlds, plan.model.scene_on_device
+    one_scene = not worlds.arrays or worlds.scene_of_world is None
+    first_scene = wp.zeros(worlds.count, dtype=int, device=device)
     processes: dict[str, PictureProcess] = {}
     for name, image in plan.images.items():
-        context = make_picture_context(
-            name,
-            image.config,
-            renderer,
-            lens=plan.group.lens,
-            scene=plan.model.scene_on_device,
-            worlds=plan.worlds,
-            times=plan.times,
+        context = PictureContext(
+            name=name,
+            source=getattr(renderer, image.output),
+            sources={output: getattr(renderer, output) for output in image.config.outputs},
+            lenses=worlds.lenses or (plan.group.lens,),
+            lens_of_world=worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
+            scenes=(scene,) if one_scene else worlds.arrays,
+            scene_of_world=first_scene if one_scene else worlds.scene_of_world,
             motions=plan.motions,
+            times=plan.times,
             stride=plan.capacity,
             seeds=plan.seeds,
-            device=device,
         )
         image.constants = image.config.constants(context)
         if (process := image.config.make_process(context)) is not None:
@@ -321,10 +322,6 @@ def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
         renderer=renderer,
         copies={source: HostCopy(array) for source, array in sources.items()} if on_host else {},
         processes=processes,
-        further={
-            name: make_further(plan.images[name].config, instant_count, body_count, device)
-            for name in processes
-        },
         p_WC=wp.zeros(rows, dtype=wp.vec3, device=device),
         q_WC=wp.zeros(rows, dtype=wp.quat, device=device),
         stamps=wp.zeros((timed_rows, 1), dtype=wp.int64, device=device),

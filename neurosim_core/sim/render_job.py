@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,6 @@ from neurosim_core.scene.bodies import (
 from neurosim_core.sensors.base import (
     PictureViews,
 )
-from neurosim_core.sim.picture_views import Further
 from neurosim_core.sim.render_group import ImageChannel, RenderGroupState
 from neurosim_core.sim.trace import Trace
 
@@ -159,7 +159,7 @@ def plan_render(
     def render() -> tuple[Any, Any]:
         if chosen is not None:
             chosen.upload()
-        mount = {"p_BC": group.p_BC, "q_BC": group.q_BC}
+        mount: dict[str, Any] = {"p_BC": group.p_BC, "q_BC": group.q_BC}
         poses = {"count": len(posed), **mount, "p_WC": p_WC, "q_WC": q_WC, "stamps": stamps}
         if group.offsets_ns is None:
             trace.camera_poses(from_slots, **poses)
@@ -170,11 +170,19 @@ def plan_render(
             count = len(slots) * rays if group.world_count == 1 else stamps.shape[0]
             pose_bodies(group.motions, stamps, group.instants, count=count, poses=bodies)
         buffers.renderer.render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=bodies, active=active)
-        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, bodies)
+
+        def look(offsets_ns: Any, **there: Any) -> None:
+            bodies_then = there.pop("bodies")
+            trace.ray_poses(from_slots, offsets_ns, count=len(posed), **mount, **there)
+            if group.motions is not None:
+                times = there["stamps"]
+                pose_bodies(group.motions, times, group.instants, count=times.shape[0], poses=bodies_then)
+
+        find_twists = partial(trace.camera_twists, from_slots, count=len(posed), **mount)
+        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, bodies, look, find_twists)
         for name in {name: None for _, _, name in pictures}:
             if name in buffers.processes:
-                seen = _look_further(group, buffers.further[name], views, trace, from_slots, count=len(posed))
-                buffers.processes[name].launch(seen)
+                buffers.processes[name].launch(views)
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:
@@ -191,26 +199,6 @@ def plan_render(
         frames=tuple(name for name in group.frames if name in wanted),
     )
     return RenderJob(group, instants, key, render)
-
-
-def _look_further(
-    group: RenderGroupState, more: Further, views: PictureViews, trace: Trace, slots: Any, *, count: int
-) -> PictureViews:
-    """Launch what a picture sensor needs to know besides, at the first `count` slots; return all of it."""
-    mount: dict[str, Any] = {"count": count, "p_BC": group.p_BC, "q_BC": group.q_BC}
-    if more.offsets_ns is not None:
-        poses = {"p_WC": more.p_WC, "q_WC": more.q_WC, "stamps": more.stamps}
-        trace.ray_poses(slots, more.offsets_ns, **mount, **poses)
-        if more.bodies is not None and group.motions is not None:
-            pose_bodies(
-                group.motions, more.stamps, group.instants, count=more.stamps.shape[0], poses=more.bodies
-            )
-        then = views._replace(p_WC=more.p_WC, q_WC=more.q_WC, stamps=more.stamps, bodies=more.bodies)
-        views = views._replace(then=then)
-    if more.twist is not None:
-        trace.camera_twists(slots, **mount, twist=more.twist)
-        views = views._replace(twist=more.twist)
-    return views
 
 
 def acquire_room(job: RenderJob) -> None:
