@@ -11,16 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
-from cortex.messages import (
-    Clock,
-    CommandRanges,
-    Events,
-    Image,
-    Odometry,
-    PointCloud,
-    Simulation,
-    Transform,
-)
+from cortex.messages import Clock, CommandRanges, Events, Image, Odometry, PointCloud, Simulation, Transform
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
 from cortex_ros2_bridge.convert import Context, ConvertError, static_transforms, transform_of
