@@ -23,7 +23,7 @@ from neurosim_core.bench.engine import (
 )
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Series, Table, panel
 
 RATES_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 TRANSPORT_MS = 0.5
@@ -112,20 +112,12 @@ def _chapter(rows: list[Row], title: str) -> Chapter:
     x = "requested [Hz]"
     periods = Series(label="one period", x=rates, y=[1e3 / rate for rate in rates], style="dashed")
     asked = Series(label="as requested", x=rates, y=rates, style="dashed")
-    whole = [{**row, "line": "command to image, lockstep"} for row in lockstep]
-    transports = [{**row, "line": f"transport, {row['mode']}"} for row in rows]
-    times = [*lines(whole, x, "command to image [ms]", by="line"), periods]
-    times += lines(transports, x, "transport [ms]", by="line")
+    timed = [{**row, "what": f"transport, {row['mode']}", "[ms]": row["transport [ms]"]} for row in rows]
+    whole = "command to image"
+    timed += [{**row, "what": f"{whole}, lockstep", "[ms]": row[f"{whole} [ms]"]} for row in lockstep]
     panels = [
-        Panel(title="latency", x_label=x, y_label="[ms]", series=times, x_scale="log", y_scale="log"),
-        Panel(
-            title="rate",
-            x_label=x,
-            y_label="received [Hz]",
-            series=[*lines(rows, x, "received [Hz]", by="mode"), asked],
-            x_scale="log",
-            y_scale="log",
-        ),
+        panel(timed, x, "[ms]", by="what", title="latency", log="xy", series=[periods]),
+        panel(rows, x, "received [Hz]", by="mode", title="rate", log="xy", series=[asked]),
     ]
     return Chapter(
         name="closed-loop",

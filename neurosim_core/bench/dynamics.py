@@ -6,20 +6,28 @@ time of one core, the best of several repetitions; ratios are of times taken in 
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from neurosim_core.bench import rotorpy_peer
-from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, MOTORS_S, Array, Flight, lagging
+from neurosim_core.bench.dynamics_flights import (
+    EXTREMES,
+    FLIGHTS,
+    HOLD_NS,
+    MOTORS_S,
+    Array,
+    Flight,
+    short_flight,
+)
 from neurosim_core.bench.dynamics_oracle import Reference, compare, make_reference
 from neurosim_core.bench.engine import DynamicsError, Multirotor
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, lines
+from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, panel
 
 RKMK4, DORMAND_PRINCE, CALLED = "RKMK4 (ours)", "Dormand-Prince (ours)", "ours, called from Python"
 STEPS_S = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
@@ -44,9 +52,11 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         references[name] = make_reference(flights[-1], cross_check=cross_check)
     samples = _sweep(flights, references, quick, progress)
     peers = _peers(flights, references, quick, progress)
-    motors = _hard(
-        {f"{tau_s:g} s": (functools.partial(lagging, tau_s), False) for tau_s in MOTORS_S}, quick, progress
-    )
+    lagging = {
+        f"{tau_s:g} s": partial(short_flight, "hummingbird", motor_time_constant_s=tau_s)
+        for tau_s in MOTORS_S
+    }
+    motors = _hard({name: (make, False) for name, make in lagging.items()}, quick, progress)
     extremes = _hard(EXTREMES, quick, progress)
     claims = [
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
@@ -272,21 +282,17 @@ def _pivot(rows: Sequence[Row]) -> list[Row]:
 
 
 def _plots(samples: list[Row], peers: list[Row], motors: list[Row]) -> list[Plot]:
-    def panel(title: str, rows: Iterable[Row], x: str, y: str, **more: Any) -> Panel:
-        series = lines(list(rows), x, y, by="method", y_floor=1e-17)
-        return Panel(title=title, x_label=x, y_label=y, series=series, x_scale="log", y_scale="log", **more)
-
     def panels(rows: list[Row], x: str, y: str) -> list[Panel]:
-        limits = {"y_min": 1e-16, "y_max": 1e2}
-        return [panel(f, (r for r in rows if r["flight"] == f), x, y, **limits) for f in list(FLIGHTS)[1:]]
+        by_flight = {name: [row for row in rows if row["flight"] == name] for name in list(FLIGHTS)[1:]}
+        limits = {"log": "xy", "y_min": 1e-16, "y_max": 1e2}
+        return [panel(r, x, y, by="method", title=f, **limits) for f, r in by_flight.items()]
 
-    tau, none_s = "motor time constant [s]", 1e-7
-    stiff = [{**row, tau: float(row["flight"].split()[0]) or none_s} for row in motors]
-    ticks = {"none": none_s, **{f"{tau_s:g}": tau_s for tau_s in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)}}
+    tau = "motor time constant [s]; 1e-7: none"
+    stiff = [{**row, tau: float(row["flight"].split()[0]) or 1e-7} for row in motors]
     timed, stepped = [row for row in (*samples, *peers) if CPU in row], [row for row in samples if row[STEP]]
     steps = [*panels(stepped, STEP, POSITION_M), *panels(stepped, STEP, ATTITUDE)]
     lost = "Stiff motors, steps of 1 ms or rtol 1e-6; no mark: not finite, or too slow"
-    motor = panel("", stiff, tau, POSITION_M, x_ticks=ticks, x_lines={"step": 1e-3})
+    motor = panel(stiff, tau, POSITION_M, by="method", log="xy", x_lines={"step": 1e-3})
     return [
         Plot("dynamics-work-precision", "Error against CPU time", panels(timed, CPU, POSITION_M), 2, True),
         Plot("dynamics-step", "Error against step size", steps, 4, True),

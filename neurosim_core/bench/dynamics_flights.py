@@ -121,75 +121,73 @@ FLIGHTS: dict[str, Callable[[], Flight]] = {
 }
 
 
-# Stiff and extreme flights, of 0.2 s
+# Stiff and extreme flights
 
 
-def _short(name: str, config: MultirotorConfig, **start: Any) -> Flight:
+def short_flight(
+    airframe: str,
+    *,
+    inertia: Any = None,
+    body_rate: Any = (0.0, 0.0, 0.0),
+    bang_bang: bool = False,
+    **changes: Any,
+) -> Flight:
+    """Return 0.2 s of a preset with changed parameters, with commands within 10 % of hover.
+
+    Args:
+        airframe: Name of the preset.
+        inertia: Matrix, or its diagonal [kg m^2]; None: the preset's.
+        body_rate: At the start [rad/s].
+        bang_bang: Rotors are commanded to stop or to full speed instead, at random.
+        **changes: Parameters of the vehicle.
+    """
+    if inertia is not None:
+        matrix = np.diag(inertia) if np.ndim(inertia) == 1 else inertia
+        changes["inertia_kg_m2"] = tuple(map(tuple, matrix.tolist()))
+    config = preset(airframe, **changes)
     commands = _commands(config, 20, share=0.1, seed=7)
-    return Flight(name=name, config=config, start=at_rest(config, **start), commands=commands)
+    if bang_bang:
+        commands = np.random.default_rng(3).choice([0.0, config.rotor_speed_max_rad_s], (20, 4))
+    start = at_rest(config, body_rate=body_rate)
+    return Flight(name=f"{airframe}, changed", config=config, start=start, commands=commands)
 
 
-def _diagonal(moments: Any) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, np.diag(moments).tolist()))
-
-
-def light(airframe: str, mass_kg: float) -> Flight:
-    """Return a vehicle of another mass in a wind of 100 m/s, with quadratic drag."""
-    drag = preset("hummingbird").parasitic_drag_kg_m
-    config = preset(airframe, mass_kg=mass_kg, wind_m_s=(100.0, 0.0, 0.0), parasitic_drag_kg_m=drag)
-    return _short(f"mass {1e3 * mass_kg:g} g, {airframe}, 100 m/s wind", config)
-
-
-def nimble(share: float) -> Flight:
-    """Return a crazyflie with a share of its inertia."""
-    inertia = np.array(preset("crazyflie").inertia_kg_m2) * share
-    config = preset("crazyflie", inertia_kg_m2=tuple(map(tuple, inertia.tolist())))
-    return _short(f"inertia x {share:g}", config)
-
-
-def slender(*moments: float) -> Flight:
-    """Return a hummingbird with principal moments in the given ratio, 1e-4 kg m^2 the least, at 200 rad/s."""
-    config = preset("hummingbird", inertia_kg_m2=_diagonal(1e-4 * np.array(moments)))
-    return _short("ratio", config, body_rate=np.full(3, 200.0 / math.sqrt(3.0)))
-
-
-def bang_bang() -> Flight:
-    """Return a crazyflie whose rotors are commanded to stop or to full speed, at random."""
-    config = preset("crazyflie")
-    choice = np.random.default_rng(3).choice([0.0, config.rotor_speed_max_rad_s], (20, 4))
-    return Flight(name="bang-bang commands", config=config, start=at_rest(config), commands=choice)
-
-
-def turning(*body_rate: float) -> Flight:
-    """Return a crazyflie that begins with body rates [rad/s]."""
-    return _short("turning", preset("crazyflie"), body_rate=body_rate)
-
-
-def lagging(time_constant_s: float) -> Flight:
-    """Return a hummingbird whose motors have the given time constant [s]."""
-    return _short("motor", preset("hummingbird", motor_time_constant_s=time_constant_s))
+def _case(airframe: str, *, stiff: bool = False, **changes: Any) -> tuple[Callable[[], Flight], bool]:
+    return functools.partial(short_flight, airframe, **changes), stiff
 
 
 MOTORS_S = (1e-1, 1e-2, 5e-3, 1e-3, 5e-4, 3e-4, 1e-4, 1e-5, 1e-6, 0.0)
 """Time constants of motors, from sluggish to none [s]."""
 
 _FAST = 200.0 / math.sqrt(3.0)
+_STORM: dict[str, Any] = {
+    "wind_m_s": (100.0, 0.0, 0.0),
+    "parasitic_drag_kg_m": preset("hummingbird").parasitic_drag_kg_m,
+}
+_INERTIA = np.array(preset("crazyflie").inertia_kg_m2)
+_MASSES_KG = {"30 g": 3e-2, "5.3 g": 5.3e-3, "3 g": 3e-3, "0.3 g": 3e-4, "30 mg": 3e-5, "3 mg": 3e-6}
+_RATIOS = {"1:10:100": (1.0, 10.0, 100.0), "1:10:10.9": (1.0, 10.0, 10.9), "1:100:100.9": (1.0, 100.0, 100.9)}
 EXTREMES: dict[str, tuple[Callable[[], Flight], bool]] = {
     **{
-        f"mass {label}, 100 m/s wind, quadratic drag": (functools.partial(light, "crazyflie", mass_kg), False)
-        for label, mass_kg in (
-            ("30 g", 3e-2), ("5.3 g", 5.3e-3), ("3 g", 3e-3), ("0.3 g", 3e-4), ("30 mg", 3e-5),
-            ("3 mg", 3e-6),
-        )
+        f"mass {label}, 100 m/s wind, quadratic drag": _case("crazyflie", mass_kg=mass_kg, **_STORM)
+        for label, mass_kg in _MASSES_KG.items()
     },
-    "mass 9.5 g, the same with a hummingbird's rotors": (lambda: light("hummingbird", 9.5e-3), False),
-    "mass 3 mg, the same with a hummingbird's rotors": (lambda: light("hummingbird", 3e-6), True),
-    **{f"inertia x {x:g}": (functools.partial(nimble, x), x < 1e-3) for x in (1.0, 1e-2, 1e-4, 1e-6)},
-    "inertia 1:10:100, 200 rad/s": (lambda: slender(1.0, 10.0, 100.0), False),
-    "inertia 1:10:10.9, 200 rad/s": (lambda: slender(1.0, 10.0, 10.9), False),
-    "inertia 1:100:100.9, 200 rad/s": (lambda: slender(1.0, 100.0, 100.9), False),
-    "bang-bang commands": (bang_bang, False),
-    "200 rad/s about three axes": (lambda: turning(_FAST, -_FAST, _FAST), False),
-    "pitch through 90 degrees at 20 rad/s": (lambda: turning(0.0, 20.0, 0.0), False),
-}  # fmt: skip
+    "mass 9.5 g, the same with a hummingbird's rotors": _case("hummingbird", mass_kg=9.5e-3, **_STORM),
+    "mass 3 mg, the same with a hummingbird's rotors": _case(
+        "hummingbird", mass_kg=3e-6, stiff=True, **_STORM
+    ),
+    **{
+        f"inertia x {share:g}": _case("crazyflie", inertia=_INERTIA * share, stiff=share < 1e-3)
+        for share in (1.0, 1e-2, 1e-4, 1e-6)
+    },
+    **{
+        f"inertia {ratio}, 200 rad/s": _case(
+            "hummingbird", inertia=1e-4 * np.array(of), body_rate=(_FAST,) * 3
+        )
+        for ratio, of in _RATIOS.items()
+    },
+    "bang-bang commands": _case("crazyflie", bang_bang=True),
+    "200 rad/s about three axes": _case("crazyflie", body_rate=(_FAST, -_FAST, _FAST)),
+    "pitch through 90 degrees at 20 rad/s": _case("crazyflie", body_rate=(0.0, 20.0, 0.0)),
+}
 """Name -> what makes the flight (a ValueError where the vehicle is refused), and whether it is stiff."""

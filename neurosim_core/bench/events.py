@@ -46,10 +46,10 @@ from neurosim_core.bench.events_space import (
     space_claims,
     space_plot,
 )
-from neurosim_core.bench.matching import align
+from neurosim_core.bench.matching import match
 from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, cell, panel
 
 FIXED_HZ = (250.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0)
 ADAPTIVE_PX = (2.0, 1.0, 0.5, 0.35, 0.2, 0.1)
@@ -206,7 +206,8 @@ def _time_renders(
 
 def _time_row(candidate: _Candidate, truth: EventArrays, flown: Flown, width: int, render_s: float) -> Row:
     events, total = join_events(candidate.parts), len(truth.t)
-    aligned = align(truth, events, width=width, window_us=1e3 * WINDOW_MS, device=flown.model.device)
+    window: dict[str, Any] = {"window_us": 1e3 * WINDOW_MS, "shift_cost": 2.0}
+    aligned = match(truth, events, width=width, device=flown.model.device, **window)
     shifts = np.abs(aligned.error_us[~np.isnan(aligned.error_us)])
     median, high = np.quantile(shifts, [0.5, 0.9]) if len(shifts) else (math.nan, math.nan)
     return {
@@ -344,14 +345,5 @@ def _span(factors: dict[float, float]) -> str:
 def _time_plot(rows: list[Row]) -> Plot:
     distance, median = "distance per event", "timing error, median [us]"
     pairs = [("renders", distance), ("both [s]", distance), ("renders", median), ("renders", "spurious [%]")]
-    panels = [
-        Panel(
-            x_label=x,
-            y_label=y,
-            series=lines(rows, x, y, by="scheme", y_floor=1e-3),
-            x_scale="log",
-            y_scale="log",
-        )
-        for x, y in (*pairs, ("renders", "missing [%]"))
-    ]
+    panels = [panel(rows, x, y, by="scheme", log="xy") for x, y in (*pairs, ("renders", "missing [%]"))]
     return Plot("events-time", "In time: error against renders and run time", panels)

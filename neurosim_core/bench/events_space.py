@@ -175,7 +175,7 @@ def space_plot(rows: list[Row]) -> Plot:
                 x_label="time of a picture [ms]",
                 y_label="share of events [%]",
                 series=series,
-                x_scale="log",
+                log="x",
                 y_min=0.0,
                 y_lines={"spurious within 20 ms of another pattern of 64 rays": floor["spurious, 20 ms [%]"]},
             )

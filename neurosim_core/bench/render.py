@@ -31,7 +31,7 @@ from neurosim_core.bench.engine import (
     upload_scene,
 )
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 from neurosim_core.bench.scenes import checkerboard_floor
 
 SAMPLES = (1, 2, 4, 8, 16)
@@ -154,17 +154,8 @@ def _chapter(rows: list[Row], device: str, size: str) -> Chapter:
             f"({best['filter']}, {best['rays per pixel']} rays) in {best[TIME_MS] / one[TIME_MS]:.1f} times "
             "the time."
         )
-        panels.append(
-            Panel(
-                title=scene,
-                x_label=TIME_MS,
-                y_label="RMS error of log radiance",
-                series=lines(mine, TIME_MS, "RMS error", by="filter"),
-                x_scale="log",
-                y_scale="log",
-                y_lines={"one event": threshold},
-            )
-        )
+        event = {"one event": threshold}
+        panels.append(panel(mine, TIME_MS, "RMS error", by="filter", title=scene, log="xy", y_lines=event))
     default, point = (errors["checkerboard", name, 1] for name in (_DEFAULT, _POINT))
     note = f"Natural logarithm; {size}; baked light; CPU time of all threads, or wall-clock time on CUDA."
     return Chapter(

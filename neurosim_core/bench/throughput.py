@@ -32,7 +32,7 @@ from neurosim_core.bench.engine import (
 )
 from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, cell, panel
 from neurosim_core.bench.step import RATE_HZ, time_steps
 
 EXACT, ADAPTIVE = "every step rendered", "at most 0.5 px between renders"
@@ -208,10 +208,7 @@ def _chapter(rows: list[Row], parts: list[Row], device: str, on_cuda: bool) -> C
             for row in known
             if row["what is varied"] == what
         ]
-        series = lines(mine, x, y, by="mode")
-        panels.append(
-            Panel(title=what, x_label=x, y_label=y, series=series, x_scale="log", y_scale="log", y_min=1.0)
-        )
+        panels.append(panel(mine, x, y, by="mode", title=what, log="xy", y_min=1.0))
     return Chapter(
         name="throughput",
         title="Whole steps a second, and where their time goes",

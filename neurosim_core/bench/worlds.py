@@ -23,7 +23,7 @@ from neurosim_core.bench.engine import (
     step,
 )
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
 RENDERS_PER_STEP = 8
 CONTROL_HZ = 100.0
@@ -128,15 +128,7 @@ def _chapter(rows: list[Row], base: Model, device: str) -> Chapter:
         for row in rows
     ]
     ratios = [row["ratio"] for row in rows if row["worlds"] >= 16]
-    panel = Panel(
-        x_label="worlds",
-        y_label="renders/s",
-        series=lines(plotted, "worlds", "renders/s", by="what"),
-        x_scale="log",
-        y_scale="log",
-        x_ticks={f"{row['worlds']:,}": row["worlds"] for row in rows},
-        y_min=1.0,
-    )
+    drawn = panel(plotted, "worlds", "renders/s", by="what", log="xy", y_min=1.0)
     note = (
         f"All rates are of all worlds together; a step is 10 ms of flight with {RENDERS_PER_STEP} renders. "
         "Best of three rounds, by turns with single simulations."
@@ -157,5 +149,5 @@ def _chapter(rows: list[Row], base: Model, device: str) -> Chapter:
             )
         ],
         tables=[Table("worlds", "Worlds that are stepped together", rows, note)],
-        plots=[Plot("worlds", "Renders a second of all worlds", [panel])],
+        plots=[Plot("worlds", "Renders a second of all worlds", [drawn])],
     )

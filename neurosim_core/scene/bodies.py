@@ -194,6 +194,15 @@ def _motion(config: MotionConfig) -> Motion:
     return motion
 
 
+@wp.func
+def velocity_on_body(
+    motion: Motion, stamp_ns: wp.int64, p_WO: wp.vec3d, q_WO: wp.quatd, p_W: wp.vec3d
+) -> wp.vec3d:
+    """Return the velocity of a point that is fixed to a body, in W [m/s]."""
+    arm = wp.quat_rotate_inv(q_WO, p_W - p_WO)
+    return body_velocity(motion, stamp_ns) + wp.quat_rotate(q_WO, wp.cross(motion.spin, arm))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BodyPoses:
     """Where bodies are at K instants, on a device."""
