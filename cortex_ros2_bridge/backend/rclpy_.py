@@ -41,6 +41,7 @@ class _Loop:
 
     Attributes:
         node: The node of rclpy.
+        endpoints: What is open.
         failure: Why it is dead for good; empty while it lives.
     """
 
@@ -50,7 +51,7 @@ class _Loop:
         self.failure = ""
         self._context = context
         self._jobs: deque[Callable[[], None]] = deque()
-        self._endpoints: dict[_Endpoint, None] = {}
+        self.endpoints: dict[_Endpoint, None] = {}
         self._closed = False
         self._wait_set: Any = None
         self.node: Any = rclpy.create_node(
@@ -105,24 +106,20 @@ class _Loop:
 
         def make() -> None:
             endpoint.handle = endpoint.make(self.node)
-            self._endpoints[endpoint] = self._wait_set = None
+            self.endpoints[endpoint] = self._wait_set = None
 
         self.call(make)
 
     def remove(self, endpoint: _Endpoint) -> None:
         """Destroy the handle of an endpoint, after the callbacks that run now."""
         handle, endpoint.handle = endpoint.handle, None
-        self._endpoints.pop(endpoint, None)
+        self.endpoints.pop(endpoint, None)
 
         def destroy() -> None:
             getattr(self.node, endpoint.destroyer)(handle)
             self._wait_set = None
 
         self.defer(destroy)
-
-    def endpoints(self) -> list[_Endpoint]:
-        """Return what is open."""
-        return list(self._endpoints)
 
     def close(self) -> None:
         """End the thread, and then the node with all that it has."""
@@ -134,7 +131,7 @@ class _Loop:
         if self._thread.is_alive():
             _log.error("a callback still runs %g s after the end: its node is left as it is", _CLOSE_S)
             return
-        for endpoint in self._endpoints:
+        for endpoint in self.endpoints:
             endpoint.handle = None
         self._wait_set = None
         self.node.destroy_node()
@@ -200,12 +197,10 @@ class RclpyBackend:
         from rclpy.context import Context
         from rclpy.signals import SignalHandlerOptions
 
-        self._names = check_node_name(node_name, namespace)
+        name, namespace = check_node_name(node_name, namespace)
         self.distro = chosen_distro() or DEFAULT_DISTRO
-        self._lock = threading.Lock()
         self._closed = False
         self._context = Context()
-        self._service_loop: _Loop | None = None
         try:
             rclpy.init(
                 args=[],
@@ -213,14 +208,15 @@ class RclpyBackend:
                 domain_id=domain,
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            self._loop = _Loop(self._context, *self._names)
+            self._loop = _Loop(self._context, name, namespace)
+            self._service_loop = _Loop(self._context, f"_{name}{_SERVICES}", namespace)
         except Exception as error:  # rclpy has many, of modules without public names
             raise BackendError(f"rclpy does not start: {error}") from error
 
     @property
     def failure(self) -> str:
         """Why nothing is received any more, for good; empty while all is well."""
-        return next((loop.failure for loop in self._loops() if loop.failure), "")
+        return self._loop.failure or self._service_loop.failure
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
@@ -234,18 +230,14 @@ class RclpyBackend:
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
         """Answer requests to a service; all services share a node and a thread of their own."""
-        with self._lock:
-            self._here()
-            if self._service_loop is None:
-                node_name, namespace = self._names
-                self._service_loop = _Loop(self._context, f"_{node_name}{_SERVICES}", namespace)
+        self._here()
         return RclpyService(self._service_loop, name, type_name, callback)
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
         if self._closed or self._loop.failure:
             return []
-        node, parts = self._loop.node, self._loop.endpoints()
+        node, parts = self._loop.node, list(self._loop.endpoints)
         me = node.get_name(), node.get_namespace()
         found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         for topic, _ in node.get_topic_names_and_types():
@@ -261,16 +253,11 @@ class RclpyBackend:
 
     def close(self) -> None:
         """End the node."""
-        with self._lock:
-            if self._closed:
-                return
+        if not self._closed:
             self._closed = True
-        for loop in self._loops():
-            loop.close()
-        self._context.try_shutdown()
-
-    def _loops(self) -> list[_Loop]:
-        return [self._loop] if self._service_loop is None else [self._loop, self._service_loop]
+            self._loop.close()
+            self._service_loop.close()
+            self._context.try_shutdown()
 
     def _here(self) -> _Loop:
         if self._closed:

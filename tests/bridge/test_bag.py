@@ -205,9 +205,9 @@ def test_a_topic_that_comes_back_goes_on(tmp_path: Path) -> None:
 
 def test_nobody_else_is_there(tmp_path: Path) -> None:
     bag = BagBackend(tmp_path / "bag")
-    with pytest.raises(BackendError, match="nobody publishes into a bag"):
+    with pytest.raises(BackendError, match="/cmd_vel: nobody else is there in a bag"):
         bag.subscription("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), print)
-    with pytest.raises(BackendError, match="nobody asks a bag"):
+    with pytest.raises(BackendError, match="nobody else is there in a bag"):
         bag.service("/reset", "std_srvs/srv/Trigger", lambda request, response: None)
     assert bag.topics() == []
     bag.close()

@@ -205,7 +205,7 @@ def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None
     assert "the service /drone/reset failed" in caplog.text
     service.close()
     service.close()
-    wait_for(lambda: [one.services for one in fake_rclpy.WORLD[0]] == [[], [], []])
+    wait_for(lambda: not any(one.services for one in fake_rclpy.WORLD[0]))
     node.close()
     other.close()
 
