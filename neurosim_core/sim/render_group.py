@@ -182,7 +182,7 @@ def make_render_group(
         )
         for _ in range(in_flight)
     ]
-    motions: Any = upload_motions(bodies, device) if bodies else None
+    motions: Any = upload_motions(bodies, device, world_count=worlds.count) if bodies else None
     one_scene = not worlds.arrays or worlds.scene_of_world is None
     first_scene = wp.zeros(worlds.count, dtype=int, device=device)
     processes = _picture_processes(
