@@ -193,7 +193,7 @@ def make_render_groups(
             capacity=capacity,
             picture_count=_picture_count(group, images, capacity) if on_host else 1,
             times=_ray_times(group, model.scene_on_device),
-            motions=upload_motions(bodies, model.device) if bodies else None,
+            motions=upload_motions(bodies, model.device, world_count=len(worlds.seeds)) if bodies else None,
             seeds=seeds,
         )
         groups.append(_make_group(plan, worlds, history, in_flight, make_room, on_host=on_host))
