@@ -243,6 +243,7 @@ def _part_shader(terms: RenderTerms) -> wp.Function:
         def shade_part(
             scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3, width_rad: float
         ) -> wp.vec3: ...
+
         return shade_part
     shade = surface_shader(terms, beyond=True)
 
