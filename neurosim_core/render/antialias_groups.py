@@ -6,9 +6,9 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block in two instants, of which each thread is a pixel: the threads prepare the faces,
-   look at the edges that cross pixels, and shade the surfaces that pixels show together. Pixels that have to be rendered by rays are
-   listed.
+2. A warp is a listed block in two instants, which see nearly the same; a thread is a pixel. The threads prepare
+   the faces, look at the edges that cross pixels, and shade the surfaces that pixels show together. Instants
+   that show many faces are taken one by one. Pixels that have to be rendered by rays are listed.
 3. A thread is a ray of such a pixel.
 """
 
@@ -44,7 +44,7 @@ _INSTANTS = wp.constant(4)
 """Instants of a pixel in a block that shows one surface, of a thread."""
 _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
-_COVER_BOUNDS = (64, 9)
+_COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
@@ -58,8 +58,8 @@ class BlockLists:
     """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
 
     uneven: wp.array[wp.vec3i]
-    """Those that show several surfaces, in two consecutive instants together: four times the tile, and which of
-    its blocks; the first instant; two bits, for the first and the second instant."""
+    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of its
+    blocks; the first instant; a bit for each of the two."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
@@ -114,6 +114,7 @@ def _cover_block(
     left: int,
     height: int,
     width: int,
+    alone: wp.bool,
     outside: wp.bool,
     origin: wp.vec3,
     center: wp.vec3,
@@ -128,6 +129,7 @@ def _cover_block(
 def _meet_pair(
     scene: SceneData,
     place: int,
+    alone: wp.bool,
     pair: int,
     own_part: int,
     spread_rad: float,
@@ -225,8 +227,8 @@ def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Fu
 def _part_shader(terms: RenderTerms) -> wp.Function:
     """Return the Warp function that finds the light of a face where a direction meets its plane.
 
-    Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked light and
-    filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
+    Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked light
+    and filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
     """
     if terms.baked and not terms.finest_level:
         code = read_native(
@@ -351,14 +353,16 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         # The threads of a warp reach the functions that they call together.
         lane = (first + wp.tid()) % 32
         entry = _next_entry(lists.count, 2)
+        waiting = int(0)  # bits of the instants of an entry that are taken one by one
         while entry < lists.count[0]:
             listed = lists.uneven[entry]
-            # 16 threads are the first instant, 16 the second: where one of them has nothing to do, it does the same
-            instant = listed[1] + wp.where(listed[2] == 3, lane // 16, listed[2] // 2)
+            bits = wp.where(waiting != 0, waiting & -waiting, listed[2])
+            alone = bits != 3
+            instant = listed[1] + wp.where(alone, bits // 2, lane // 16)
             at = locate_pixel(listed[0] // 4, instant, listed[0] % 4, lane % 16, view, worlds)
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
-            unwanted = at.outside or ((listed[2] >> (lane // 16)) & 1) == 0
+            unwanted = at.outside or (alone and lane >= 16)
             pixel = wp.where(at.outside, at.ray - (at.row - at.top) * view.width - at.col + at.left, at.ray)
             part = int(-1)
             if not at.outside:
@@ -376,18 +380,23 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 at.left,
                 view.height,
                 view.width,
+                alone,
                 unwanted,
                 origin,
                 center,
                 across,
                 down,
             )
+            if covered[0] < 0:
+                waiting = int(3)
+                continue
             total = wp.vec3(0.0)
             for step in range((covered[0] + 31) // 32):
                 pair = 32 * step + lane
                 met = _meet_pair(
                     scene,
                     covered[5],
+                    alone,
                     wp.min(pair, covered[0] - 1),
                     part,
                     rays[0, pixel][3],
@@ -417,7 +426,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             if unresolved != 0 and lane % 16 == 0:
                 block = 4 * (listed[0] // 4 * view.instant_count + instant) + listed[0] % 4
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
-            entry = _next_entry(lists.count, 2)
+            waiting = waiting & ~bits
+            if waiting == 0:
+                entry = _next_entry(lists.count, 2)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
     def cast_unresolved_pixels(

@@ -1,6 +1,7 @@
 // CUDA: the threads of a warp find together what the points of 4 x 4 pixels show in two instants, as `list_seen_faces.cuh` and
-// `cover_lanes.cuh` do on a CPU. A thread is a pixel in an instant. Leaves pairs of a thread and a surface that it shows in
-// shared memory. Returns their number; the first of the thread and how many; how many of its points show none, -1: it has to be
+// `cover_lanes.cuh` do on a CPU. A thread is a pixel in an instant; with one instant, `alone`, half of them are idle. Leaves
+// pairs of a thread and a surface that it shows in shared memory. Returns their number, -1: the instants show so many faces that
+// they have to be taken one by one; the first of the thread and how many; how many of its points show none, -1: it has to be
 // rendered by rays; whether the sky is behind; where the pairs are.
 wp::vec_t<6, int> result;
 #ifdef __CUDA_ARCH__
@@ -9,10 +10,16 @@ wp::vec_t<6, int> result;
 __shared__ Block blocks[2];
 Block& block = blocks[threadIdx.x / 32 % 2];
 constexpr unsigned ALL = 0xffffffffu;
-const int lane = threadIdx.x % 32, pixel = lane % 16, half = lane / 16;
+const int lane = threadIdx.x % 32, pixel = lane % 16, half = alone ? 0 : lane / 16;
+const bool idle = alone && lane >= 16;
 const unsigned below = (1u << lane) - 1u, ours = 0xffffu << (16 * half); // threads before; those of the instant
-int* const seen = block.seen[half];
-Quad* const plane_of = block.plane[half];
+const int room = alone ? MOST : MOST / 2, width_of_row = alone ? 16 : 32, base_of_faces = half * room;
+int *const seen = block.seen + base_of_faces, *const part_of = block.part + base_of_faces;
+unsigned char* const first_of = block.first + base_of_faces;
+Quad* const plane_of = block.plane + base_of_faces;
+unsigned* const own_shown = block.shown[0] + 16 * half + pixel; // of entry: at entry * width_of_row
+using Entries = unsigned long long; // a bit for each
+auto lowest = [](Entries entries) { return __ffsll(entries) - 1; };
 #include "edge_functions.cuh"
 auto along = [](const Quad& function, const wp::vec3& toward) {
     return fmaf(function.x, toward[0], fmaf(function.y, toward[1], function.z * toward[2]));
@@ -33,7 +40,7 @@ auto negative_at = [](float value, float slope_x, float slope_y) {
 const int upper = wp::max(wp::min(top - 1, height - 6), 0), leftmost = wp::max(wp::min(left - 1, width - 6), 0);
 const int* const first_row = faces.data + (size_t)instant * height * width;
 int count = 0, parts[3], wholes[3];
-bool sky = false, listed = true;
+bool sky = false;
 #pragma unroll
 for (int turn = 0; turn < 3; ++turn) {
     const int place = 16 * turn + pixel, y = upper + place / 6, x = leftmost + place % 6;
@@ -43,35 +50,34 @@ for (int turn = 0; turn < 3; ++turn) {
 }
 #pragma unroll
 for (int turn = 0; turn < 3; ++turn) wholes[turn] = parts[turn] >= 0 ? scene.whole_of_face.data[parts[turn]] : -1;
-#pragma unroll
+#pragma unroll 1
 for (int turn = 0; turn < 3; ++turn) {
-    const int face = wholes[turn];
+    const int face = wholes[0], part = parts[0];
+    wholes[0] = wholes[1];
+    wholes[1] = wholes[2];
+    parts[0] = parts[1];
+    parts[1] = parts[2];
     const unsigned same = __match_any_sync(ALL, face) & ours;
     bool added = face >= 0 && __ffs(same) - 1 == lane;
-    for (int entry = 0; entry < count; ++entry) added &= seen[entry] != face;
+#pragma unroll 1
+    for (int entry = 0; entry < wp::min(count, room); ++entry) added &= seen[entry] != face;
     const unsigned additions = __ballot_sync(ALL, added) & ours;
-    if (added) {
-        const int entry = count + __popc(additions & below);
+    const int entry = count + __popc(additions & below);
+    if (added && entry < room) {
         seen[entry] = face;
-        block.part[half][entry] = parts[turn];
+        part_of[entry] = part;
     }
     count += __popc(additions);
     __syncwarp();
 }
+bool full = count > room; // there are more than have room
+count = full ? 0 : count;
 sky = (__ballot_sync(ALL, sky) & ours) != 0;
-unsigned long long reaching = 0; // entries that reach the pixel
-int taken_edges = 0, edges = 0;  // edges that cross pixels: looked at, and found
-auto look_at_edges = [&](int number) { // each thread finds which points of a pixel are outside an edge
-    __syncwarp();
-    if (lane < number) {
-        const Quad edge = block.edge[(taken_edges + lane) % 64];
-        const int code = __float_as_int(edge.w);
-        atomicAnd(&block.shown[code / 32][code % 32], ~negative_at(edge.x, edge.y, edge.z));
-    }
-    taken_edges += number;
-    __syncwarp();
-};
-for (int begin = 0; __any_sync(ALL, begin < count);) {
+Entries reaching = 0; // those that reach the pixel
+int looked = 0, edges = 0; // edges that cross pixels: how many are looked at, and how many there are
+bool more = true;
+for (int begin = 0; more;) {
+    more = __any_sync(ALL, begin < count); // if not, the last edges are looked at
     const int number = wp::max(wp::min(count - begin, 16), 0), most = wp::max(number, __shfl_xor_sync(ALL, number, 16));
     const int entry = begin + pixel;
     bool solid = false;
@@ -88,42 +94,50 @@ for (int begin = 0; __any_sync(ALL, begin < count);) {
     const unsigned solids = __ballot_sync(ALL, solid);
     __syncwarp();
     unsigned crossed = 0; // of the face of this thread: edges that cross pixels; 8: it reaches one
-    for (int turn = 0; turn < most; ++turn) {
-        const int at = 16 * half + turn;
-        bool reached = (solids >> at) & 1u;
-        float value[3][3], cut_at[3];
+    for (int turn = 0; turn < wp::max(most, 1); ++turn) {
+        if (more) {
+            const int at = 16 * half + turn;
+            bool reached = !idle && (solids >> at) & 1u;
+            float value[3][3], cut_at[3];
 #pragma unroll
-        for (int side = 0; side < 3; ++side) {
-            const Quad function = block.function[side][at];
-            value[side][0] = along(function, center);
-            value[side][1] = along(function, across);
-            value[side][2] = along(function, down);
-            const float extent = 0.5f * (wp::abs(value[side][1]) + wp::abs(value[side][2]));
-            reached &= value[side][0] + extent >= 0.0f;
-            cut_at[side] = value[side][0] - extent;
+            for (int side = 0; side < 3; ++side) {
+                const Quad function = block.function[side][at];
+                value[side][0] = along(function, center);
+                value[side][1] = along(function, across);
+                value[side][2] = along(function, down);
+                const float extent = 0.5f * (wp::abs(value[side][1]) + wp::abs(value[side][2]));
+                reached &= value[side][0] + extent >= 0.0f;
+                cut_at[side] = value[side][0] - extent;
+            }
+            if (reached) {
+                reaching |= (Entries)1 << (begin + turn);
+                own_shown[(begin + turn) * width_of_row] = ALL_POINTS;
+            }
+            const unsigned reaches = __ballot_sync(ALL, reached);
+            if (pixel == turn && reaches & ours) crossed |= 8u;
+            float near[3];
+#pragma unroll
+            for (int term = 0; term < 3; ++term) near[term] = OVERLAP * (value[0][term] + value[1][term] + value[2][term]);
+#pragma unroll
+            for (int side = 0; side < 3; ++side) {
+                const bool cut = reached && cut_at[side] < 0.0f;
+                const unsigned cuts = __ballot_sync(ALL, cut);
+                if (pixel == turn && cuts & ours) crossed |= 1u << side;
+                if (cut)
+                    block.edge[(edges + __popc(cuts & below)) % 128] = {value[side][0] + near[0], value[side][1] + near[1],
+                                                                       value[side][2] + near[2],
+                                                                       __int_as_float((begin + turn) * width_of_row + 16 * half + pixel)};
+                edges += __popc(cuts);
+            }
         }
-        if (reached) {
-            reaching |= 1ull << (begin + turn);
-            block.shown[begin + turn][lane] = ALL_POINTS;
-        }
-        const unsigned reaches = __ballot_sync(ALL, reached);
-        if (pixel == turn && reaches & ours) crossed |= 8u;
-        if (!reaches) continue;
-        float near[3];
-#pragma unroll
-        for (int term = 0; term < 3; ++term) near[term] = OVERLAP * (value[0][term] + value[1][term] + value[2][term]);
-#pragma unroll
-        for (int side = 0; side < 3; ++side) {
-            const bool cut = reached && cut_at[side] < 0.0f;
-            const unsigned cuts = __ballot_sync(ALL, cut);
-            if (!cuts) continue;
-            if (pixel == turn && cuts & ours) crossed |= 1u << side;
-            if (cut)
-                block.edge[(edges + __popc(cuts & below)) % 64] = {value[side][0] + near[0], value[side][1] + near[1],
-                                                                  value[side][2] + near[2],
-                                                                  __int_as_float(32 * (begin + turn) + lane)};
-            edges += __popc(cuts);
-            if (edges - taken_edges >= 32) look_at_edges(32);
+        while (edges - looked >= (more ? 32 : 1)) { // each thread finds which points of a pixel are outside an edge
+            __syncwarp();
+            if (looked + lane < edges) {
+                const Quad edge = block.edge[(looked + lane) % 128];
+                atomicAnd(&block.shown[0][__float_as_int(edge.w)], ~negative_at(edge.x, edge.y, edge.z));
+            }
+            looked = wp::min(looked + 32, edges);
+            __syncwarp();
         }
     }
     if (pixel < number && crossed == 0) plane_of[entry].w = __int_as_float(-1); // no pixel shows it
@@ -131,16 +145,18 @@ for (int begin = 0; __any_sync(ALL, begin < count);) {
     if (pixel < number) {
         const float surface = plane_of[entry].w;
         int first = entry;
+#pragma unroll 1
         for (int other = entry - 1; other >= 0; --other)
             if (__float_as_int(plane_of[other].w) == __float_as_int(surface)) first = other;
-        block.first[half][entry] = (unsigned char)first;
+        first_of[entry] = (unsigned char)first;
     }
     for (int base = 0; base < 3 * most; base += 16) { // each thread looks beyond an edge
         const int at = wp::min((base + pixel) / 3, 15), side = (base + pixel) % 3;
         const unsigned crossings = __shfl_sync(ALL, crossed, at, 16);
         int beyond = -1;
-        if (listed && base + pixel < 3 * number && (crossings >> side) & 1u)
+        if (!full && base + pixel < 3 * number && (crossings >> side) & 1u)
             beyond = scene.whole_neighbor.data[3 * (size_t)seen[begin + at] + side];
+#pragma unroll 1
         for (int other = 0; beyond >= 0 && other < count; ++other)
             if (seen[other] == beyond) beyond = -1;
         if (beyond >= 0) {
@@ -150,60 +166,60 @@ for (int begin = 0; __any_sync(ALL, begin < count);) {
         }
         for (unsigned waiting; (waiting = __ballot_sync(ALL, beyond >= 0)) != 0u;) {
             const int next = __ffs(waiting & ours) - 1, face = __shfl_sync(ALL, beyond, next & 31);
-            if (next >= 0) {
-                listed &= count < MOST;
-                if (listed && lane == next) {
-                    seen[count] = face;
-                    block.part[half][count] = -1 - face;
-                }
-                count += listed;
-                if (beyond == face || !listed) beyond = -1;
+            if (next < 0) continue;
+            full |= count == room;
+            if (lane == next && !full) {
+                seen[count] = face;
+                part_of[count] = -1 - face;
             }
+            count += !full;
+            if (beyond == face || full) beyond = -1;
         }
         __syncwarp();
     }
     begin += number;
-    if (!listed) count = begin = 0;
+    if (full) count = begin = 0;
 }
-if (edges > taken_edges) look_at_edges(edges - taken_edges);
+if (!alone && __any_sync(ALL, full)) {
+    result[0] = -1;
+    return result;
+}
 unsigned taken = 0; // points that show a face
-unsigned long long surfaces = 0, holding = 0; // first entries of the surfaces that the pixel shows; entries that hold points
-if (listed) {
-    for (unsigned long long rest = reaching; rest; rest &= rest - 1) { // which of several shows where they are
-        const int entry = __ffsll(rest) - 1;
-        unsigned inside = block.shown[entry][lane], overlap = inside & taken;
-        const Quad own = plane_of[entry];
-        for (unsigned long long others = holding; overlap && others; others &= others - 1) {
-            const int other = __ffsll(others) - 1;
-            const unsigned contested = block.shown[other][lane] & overlap;
-            if (!contested) continue;
-            overlap &= ~contested; // no two hold a point
-            const Quad against = plane_of[other];
-            unsigned won = 0;
-            if (__float_as_int(against.w) != __float_as_int(own.w)) {
-                const Quad behind = {fmaf(NEARER, against.x, -own.x), fmaf(NEARER, against.y, -own.y), fmaf(NEARER, against.z, -own.z), 0.0f};
-                const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
-                const float extent = 0.5f * (wp::abs(slope_x) + wp::abs(slope_y));
-                won = middle < -extent ? contested : 0u;
-                if (wp::abs(middle) <= extent) won = contested & negative_at(middle, slope_x, slope_y);
-            }
-            block.shown[other][lane] &= ~won;
-            inside &= ~(contested & ~won);
+Entries surfaces = 0, holding = 0; // first entries of the surfaces that the pixel shows; entries that hold points
+for (Entries rest = reaching; rest; rest &= rest - 1) { // which of several shows where they are
+    const int entry = lowest(rest);
+    unsigned inside = own_shown[entry * width_of_row], overlap = inside & taken;
+    const Quad own = plane_of[entry];
+    for (Entries others = holding; overlap && others; others &= others - 1) {
+        const int other = lowest(others);
+        const unsigned contested = own_shown[other * width_of_row] & overlap;
+        if (!contested) continue;
+        overlap &= ~contested; // no two hold a point
+        const Quad against = plane_of[other];
+        unsigned won = 0;
+        if (__float_as_int(against.w) != __float_as_int(own.w)) {
+            const Quad behind = {fmaf(NEARER, against.x, -own.x), fmaf(NEARER, against.y, -own.y), fmaf(NEARER, against.z, -own.z), 0.0f};
+            const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
+            const float extent = 0.5f * (wp::abs(slope_x) + wp::abs(slope_y));
+            won = middle < -extent ? contested : 0u;
+            if (wp::abs(middle) <= extent) won = contested & negative_at(middle, slope_x, slope_y);
         }
-        block.shown[entry][lane] = inside;
-        if (inside) holding |= 1ull << entry;
-        taken |= inside;
+        own_shown[other * width_of_row] &= ~won;
+        inside &= ~(contested & ~won);
     }
-    for (unsigned long long rest = holding; rest; rest &= rest - 1) { // faces of one surface are taken together
-        const int entry = __ffsll(rest) - 1, first = block.first[half][entry];
-        const unsigned shown = block.shown[entry][lane];
-        if (!shown) continue;
-        if (first < entry) block.shown[first][lane] = shown | ((surfaces >> first) & 1 ? block.shown[first][lane] : 0u);
-        surfaces |= 1ull << first;
-    }
+    own_shown[entry * width_of_row] = inside;
+    if (inside) holding |= (Entries)1 << entry;
+    taken |= inside;
+}
+for (Entries rest = holding; rest; rest &= rest - 1) { // faces of one surface are taken together
+    const int entry = lowest(rest), first = first_of[entry];
+    const unsigned shown = own_shown[entry * width_of_row];
+    if (!shown) continue;
+    if (first < entry) own_shown[first * width_of_row] = shown | ((surfaces >> first) & 1 ? own_shown[first * width_of_row] : 0u);
+    surfaces |= (Entries)1 << first;
 }
 const int bare = SAMPLES - __popc(taken);
-const bool resolved = listed && (sky || 2 * bare <= SAMPLES);
+const bool resolved = !full && (sky || 2 * bare <= SAMPLES);
 if (outside || !resolved) surfaces = 0;
 const int pairs = __popcll(surfaces);
 int before = pairs;
@@ -214,7 +230,7 @@ for (int step = 1; step < 32; step *= 2) {
 }
 result[0] = __shfl_sync(ALL, before, 31);
 before -= pairs;
-for (int pair = before; surfaces; surfaces &= surfaces - 1) block.pair[pair++] = (unsigned short)(lane | (__ffsll(surfaces) - 1) << 5);
+for (int pair = before; surfaces; surfaces &= surfaces - 1) block.pair[pair++] = (unsigned short)(lane | lowest(surfaces) << 5);
 __syncwarp();
 result[1] = before;
 result[2] = pairs;

@@ -6,23 +6,23 @@ wp::vec_t<9, float> met;
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
 #include "sample_points.cuh"
-const int code = block.pair[pair], owner = code % 32, first = code / 32, half = owner / 16;
+const int code = block.pair[pair], owner = code % 32, first = code / 32, face = alone ? first : first + owner / 16 * (MOST / 2);
 auto of_owner = [&](const wp::vec3& value) {
     wp::vec3 theirs;
     for (int axis = 0; axis < 3; ++axis) theirs[axis] = __shfl_sync(0xffffffffu, value[axis], owner);
     return theirs;
 };
 float x, y;
-met[0] = mean_of(block.shown[first][owner], x, y);
+met[0] = mean_of(block.shown[0][first * (alone ? 16 : 32) + owner], x, y);
 met[1] = __shfl_sync(0xffffffffu, spread_rad, owner);
 const wp::vec3 middle = of_owner(center), sideways = of_owner(across), downwards = of_owner(down), origin = of_owner(position);
 wp::vec3 toward;
 for (int axis = 0; axis < 3; ++axis) toward[axis] = fmaf(y, downwards[axis], fmaf(x, sideways[axis], middle[axis]));
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 #include "nearest_part.cuh"
-const int own = __shfl_sync(0xffffffffu, own_part, owner), hit = block.part[half][first];
+const int own = __shfl_sync(0xffffffffu, own_part, owner), hit = block.part[face];
 int part = own;
-if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[half][first].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
+if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[face].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
 met[2] = __int_as_float(part);
 for (int axis = 0; axis < 3; ++axis) {
     met[3 + axis] = toward[axis];
