@@ -6,9 +6,9 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block in two instants, which see nearly the same; a thread is a pixel. The threads prepare
-   the faces, look at the edges that cross pixels, and shade the surfaces that pixels show together. Instants
-   that show many faces are taken one by one. Pixels that have to be rendered by rays are listed.
+2. A warp is a listed block in two instants, which see nearly the same; a thread is a pixel. The threads
+   prepare the faces, look at the edges that cross pixels, and shade the surfaces that pixels show together.
+   Instants that show many faces are taken one by one. Pixels that have to be rendered by rays are listed.
 3. A thread is a ray of such a pixel.
 """
 
@@ -58,8 +58,8 @@ class BlockLists:
     """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
 
     uneven: wp.array[wp.vec3i]
-    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of its
-    blocks; the first instant; a bit for each of the two."""
+    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
+    its blocks; the first instant; a bit for each of the two."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
@@ -227,8 +227,8 @@ def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Fu
 def _part_shader(terms: RenderTerms) -> wp.Function:
     """Return the Warp function that finds the light of a face where a direction meets its plane.
 
-    Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked light
-    and filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
+    Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked
+    light and filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
     """
     if terms.baked and not terms.finest_level:
         code = read_native(
