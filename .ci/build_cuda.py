@@ -102,8 +102,7 @@ def make_kernels() -> None:
         make_noisy_scan(frozenset(pixel))
     for errors in ((), IMU_TERMS):
         make_imu(frozenset(errors))
-    for adaptive in (False, True):
-        make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
+    make_flight(frozenset(VEHICLE_TERMS))
     mode_kernel("path", frozenset(AIR_TERMS))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")

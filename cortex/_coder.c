@@ -17,7 +17,6 @@
 #error "only little-endian machines"
 #endif
 
-enum { GATHER_MAX = 256 };
 
 /* Writing */
 
@@ -218,65 +217,6 @@ static PyObject *coder_drain(Coder *coder, PyObject *const *arguments, Py_ssize_
     return Py_BuildValue("LnN", (long long)source.expected, read, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
-PyDoc_STRVAR(gather_doc,
-"gather($self, receive, again, expected, limit, latency, clock_offset_ns, /)\n--\n\n"
-"Read plain frames that follow one another, for types of fixed size, and join their bodies.\n\n"
-"Returns:\n"
-"    The sequence expected next, the bodies one after the other, how many they are, and what ended it, as `drain`.\n");
-
-/* Whether a frame is the expected one of a type of fixed size. */
-static int is_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
-    const Py_ssize_t size = coder->block.size;
-    if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) return 0;
-    uint64_t rest[5];
-    memcpy(rest, PyBytes_AS_STRING(frame) + HEAD_SIZE, sizeof rest);
-    *publish_ns = (int64_t)rest[2];
-    return !memcmp(PyBytes_AS_STRING(frame), coder->head, HEAD_SIZE) && rest[0] == expected && rest[3] == (uint64_t)size;
-}
-
-/* Take frames until something ends it, and return how many there are; `ended_by` as for `drain_source`. */
-static Py_ssize_t gather_source(const Coder *coder, Source *source, PyObject **frames, PyObject **ended_by) {
-    Py_ssize_t found = 0;
-    while (found < source->limit && found < GATHER_MAX) {
-        *ended_by = take_frame(source->receive, source->again, 0);
-        int64_t publish_ns;
-        if (*ended_by == NULL || !is_expected(coder, *ended_by, (uint64_t)source->expected, &publish_ns)) break;
-        frames[found] = *ended_by;
-        *ended_by = NULL;
-        source->expected += 1;
-        if (found++ % 8 == 0 && !note_arrival(source, publish_ns)) break;
-    }
-    return found;
-}
-
-/* The bodies of frames of fixed size one after the other; lets the frames go. */
-static PyObject *join_bodies(PyObject **frames, Py_ssize_t count, Py_ssize_t size) {
-    PyObject *bodies = PyErr_Occurred() ? NULL : PyBytes_FromStringAndSize(NULL, count * size);
-    for (Py_ssize_t index = 0; index < count; ++index) {
-        const char *body = PyBytes_AS_STRING(frames[index]) + HEADER_SIZE;
-        if (bodies != NULL) memcpy(PyBytes_AS_STRING(bodies) + index * size, body, (size_t)size);
-        Py_DECREF(frames[index]);
-    }
-    return bodies;
-}
-
-static PyObject *coder_gather(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    Source source;
-    if (!arguments_are(count, 6) || !take_source(&source, arguments, arguments + 2)) return NULL;
-    if (coder->block.has_tail || !coder->has_head) {
-        PyErr_SetString(PyExc_ValueError, "only bodies of fixed size are gathered");
-        return NULL;
-    }
-    PyObject *frames[GATHER_MAX], *frame = NULL;
-    const Py_ssize_t found = gather_source(coder, &source, frames, &frame);
-    PyObject *bodies = join_bodies(frames, found, coder->block.size);
-    if (bodies == NULL) {
-        Py_XDECREF(frame);
-        return NULL;
-    }
-    return Py_BuildValue("LNnN", (long long)source.expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
-}
-
 PyDoc_STRVAR(decode_doc,
 "decode($self, buffer, offset, size, /)\n--\n\n"
 "The message of `size` bytes of a bytes object, or of an array of bytes, from an offset on; None if they are not as\n"
@@ -363,7 +303,6 @@ static PyMethodDef coder_methods[] = {
     {"encode", (PyCFunction)(void (*)(void))coder_encode, METH_FASTCALL, encode_doc},
     {"read", (PyCFunction)coder_read, METH_O, read_doc},
     {"drain", (PyCFunction)(void (*)(void))coder_drain, METH_FASTCALL, drain_doc},
-    {"gather", (PyCFunction)(void (*)(void))coder_gather, METH_FASTCALL, gather_doc},
     {"decode", (PyCFunction)(void (*)(void))coder_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };

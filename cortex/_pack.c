@@ -5,6 +5,7 @@
    runs within a walk. */
 
 #include "_coder.h"
+#include "cpp/include/cortex/broadcast.h"
 
 #include <string.h>
 
@@ -311,7 +312,7 @@ int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_
 void copy_deferred(const Pack *pack) {
     for (int index = 0; index < pack->deferred_count; ++index) {
         const Deferred *deferred = &pack->deferred[index];
-        memcpy(pack->out + deferred->start, deferred->data, (size_t)deferred->size);
+        cortex_copy(pack->out + deferred->start, deferred->data, (size_t)deferred->size);
     }
 }
 

@@ -11,11 +11,10 @@ from functools import partial
 import zmq
 
 from cortex.codec import MalformedMessage
-from cortex.control import control_types, sender_of
+from cortex.control import control_types
 from cortex.records import StatsReply, StatsRequest
-from cortex.schema import schema_of
 from cortex.service import Server
-from cortex.wire import CONTROL, REQUEST, control_frame, parse_control, unpack_header
+from cortex.wire import REQUEST, control_frame, parse_control, unpack_header
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +25,6 @@ class Answers:
     Args:
         name: The node's, for what is logged.
         server: Handles requests of services.
-        registry: Answers what nodes ask a registry, given a frame and its sender; None: there is no answer.
         stats: Says what the node has counted.
         wake: Called when there is a reply to be sent.
     """
@@ -36,13 +34,11 @@ class Answers:
         name: str,
         server: Server,
         *,
-        registry: Callable[[bytes, str], bytes | None],
         stats: Callable[[], StatsReply],
         wake: Callable[[], None],
     ) -> None:
         self._name = name
         self._server = server
-        self._registry = registry
         self._stats = stats
         self._wake = wake
         self._replies: deque[tuple[zmq.Socket[bytes], bytes, bytes]] = deque()
@@ -53,29 +49,25 @@ class Answers:
         """Take in what has come to a ROUTER."""
         for _ in range(256):
             try:
-                parts = router.recv_multipart(zmq.DONTWAIT, copy=False)
+                parts = router.recv_multipart(zmq.DONTWAIT)
             except zmq.Again:
                 return
             try:
                 if len(parts) != 2:
                     raise MalformedMessage(f"a control message of {len(parts)} frames")
-                self._answer(router, parts[0].bytes, parts[1].bytes, sender_of(parts[1]))
+                self._answer(router, parts[0], parts[1])
             except MalformedMessage as error:
                 self.rejected += 1
                 if self.rejected == 1:
                     logger.warning("%s: rejected a control frame: %s", self._name, error)
 
-    def _answer(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes, sender: str) -> None:
+    def _answer(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
         header = unpack_header(frame)
         if header.kind == REQUEST:
             self._server.handle(frame, partial(self._reply, router, identity))
-        elif header.kind == CONTROL and header.fingerprint == schema_of(StatsRequest).fingerprint:
-            parse_control(frame, control_types(StatsRequest))
-            self._reply(router, identity, control_frame(self._stats(), header.sequence))
         else:
-            answer = self._registry(frame, sender)
-            if answer is not None:
-                self._reply(router, identity, answer)
+            _, header = parse_control(frame, control_types(StatsRequest))
+            self._reply(router, identity, control_frame(self._stats(), header.sequence))
 
     def _reply(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
         self._replies.append((router, identity, frame))

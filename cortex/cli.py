@@ -160,14 +160,10 @@ def _add(
         group = parser.add_argument_group("where to look")
         group.add_argument("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
         group.add_argument(
-            "--registry", metavar="ADDRESS", help='"auto" (this host, the default), "off", or tcp://host:port'
-        )
-        group.add_argument(
-            "--peer",
-            action="append",
-            default=[],
+            "--registry",
+            default="auto",
             metavar="ADDRESS",
-            help="control address of a node, to do without a registry; may be repeated",
+            help='"auto" (this host, the default), "off", or tcp://host:port',
         )
         group.add_argument("--listen", metavar="IP", help="let other hosts reach us, e.g. 192.168.1.5")
         group.add_argument("--keys", type=_directory, metavar="DIR", help="key directory, for tcp")

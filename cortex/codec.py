@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cortex.body import Body, MalformedMessage
 from cortex.draft import Draft, Drafter
-from cortex.layout import has_tail, record_dtype
+from cortex.layout import has_tail
 from cortex.native import make_coder
 from cortex.schema import schema_of
 
@@ -60,7 +60,7 @@ class Codec:
         is_fixed = not has_tail(self.schema)
         self.fixed_size: int | None = block if is_fixed else None
         """Bytes of every body, if they are always the same."""
-        self.record_dtype: np.dtype[Any] | None = record_dtype(self.schema, block) if is_fixed else None
+
         """Structured dtype of a body of fixed size."""
         self.stamp_of: Callable[[Any], int] | None = None
         """Gets the stamp of a message, if the type has an integer field `stamp_ns`."""

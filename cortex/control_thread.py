@@ -104,9 +104,9 @@ class ControlThread:
         poller = zmq.Poller()
         poller.register(self._wakeup.fd, zmq.POLLIN)
         routers = self._places.routers
-        sockets = self._directory.sockets()
-        for socket in (*routers, *sockets):
-            poller.register(socket, zmq.POLLIN)
+        for socket in (*routers, self._directory.socket):
+            if socket is not None:
+                poller.register(socket, zmq.POLLIN)
         busy = time.monotonic_ns() < self._busy_until_ns
         ready = dict(poller.poll(TICK_BUSY_MS if busy else TICK_MS))
         if self._wakeup.fd in ready:
@@ -114,9 +114,8 @@ class ControlThread:
         for socket in routers:
             if socket in ready:
                 self._answers.handle(socket)
-        for socket in sockets:
-            if socket in ready:
-                self._directory.handle(socket)
+        if self._directory.socket in ready:
+            self._directory.handle()
         self._answers.send()
         self._tick()
 

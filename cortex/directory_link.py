@@ -1,4 +1,4 @@
-"""A node's connection to the registry or to a static peer."""
+"""A node's connection to the registry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ class DirectoryLink:
 
     address: str
     socket: zmq.Socket[Any]
-    is_registry: bool
     next_ns: int
     """When to send the next heartbeat or `Hello`."""
     heard_ns: int
@@ -31,8 +30,6 @@ class DirectoryLink:
     welcomed: bool = False
     epoch: int = 0
     version: int = 0
-    nodes: set[int] = field(default_factory=set)
-    """Nodes that are known through this link."""
     missing: dict[int, int] = field(default_factory=dict)
     """Revisions that `Welcome` named and that have not arrived yet, by node."""
     doubted: dict[int, int] = field(default_factory=dict)

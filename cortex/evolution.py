@@ -54,7 +54,6 @@ class EvolvedCodec:
     """
 
     fixed_size = None
-    record_dtype = None
 
     def __init__(self, theirs: Schema, ours: type) -> None:
         self.type = ours

@@ -244,7 +244,7 @@ class Evt3Decoder:
             raise EventCodecError(f"evt3 has no words that begin with {odd}")
 
         where, x, polarity = self._columns(code, value, used)
-        y, self._y = _hold(code == _ADDR_Y, value & 0x7FF, self._y, where)
+        y, self._y = hold_value(code == _ADDR_Y, value & 0x7FF, self._y, where)
         t, begin = self._times(code, value, where)
         usable = (where >= begin) & (x < width) & (y < height)
         columns = EventColumns(t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.uint8))
@@ -269,8 +269,8 @@ class Evt3Decoder:
                     if self._start_us is not None:
                         seen = int(highs[np.count_nonzero(is_high[:begin]) - 1] << 12 | value[begin])
                         highs += (self._start_us - seen + (1 << 23) >> _EPOCH_BITS) << 12
-        high, self._high = _hold(is_high, highs, self._high, where, selected=True)
-        low, self._low = _hold(is_low, value, self._low, where)
+        high, self._high = hold_value(is_high, highs, self._high, where, selected=True)
+        low, self._low = hold_value(is_low, value, self._low, where)
         return high << 12 | low, begin
 
     def _columns(
@@ -285,8 +285,8 @@ class Evt3Decoder:
         length = np.where(code == _VECT_12, 12, 0) + np.where(code == _VECT_8, 8, 0)
         passed = np.cumsum(length) - length  # columns that vectors before this word have stepped over
         vectors = np.flatnonzero(length)
-        base, last_base = _hold(is_base, (value & 0x7FF) - passed, self._base_x, vectors)
-        sign, self._base_polarity = _hold(is_base, value >> 11, self._base_polarity, vectors)
+        base, last_base = hold_value(is_base, (value & 0x7FF) - passed, self._base_x, vectors)
+        sign, self._base_polarity = hold_value(is_base, value >> 11, self._base_polarity, vectors)
         self._base_x = last_base + int(length.sum())
         bits = np.where(length[vectors] == 8, value[vectors] & 0xFF, value[vectors])
         row, bit = np.nonzero(bits[:, None] >> np.arange(12) & 1)
@@ -396,7 +396,7 @@ def read_words(data: Any, dtype: str, encoding: str) -> NDArray[Any]:
     return np.frombuffer(view, dtype)
 
 
-def _hold(
+def hold_value(
     mask: NDArray[np.bool_],
     values: NDArray[Any],
     initial: int,

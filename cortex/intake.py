@@ -6,10 +6,9 @@ import time
 from collections import deque
 from typing import Any
 
-import numpy as np
 import zmq
 
-from cortex.codec import Codec, MalformedMessage
+from cortex.codec import MalformedMessage
 from cortex.inlet import make_inlet
 from cortex.link import Item, Link, make
 from cortex.policy import Policy
@@ -219,42 +218,6 @@ class Intake:
             del self.leaving[link]
         return bool(overdue)
 
-    def gather(self, codec: Codec) -> np.ndarray | None:
-        """The plain messages of a type that wait in the sockets, as one array; None if there are none."""
-        for link in self._rotated():
-            if link.coder is None or link.codec is not codec:
-                continue
-            link.expected, bodies, count, frame = link.coder.gather(
-                link.receive,
-                zmq.Again,
-                link.expected,
-                self._policy.depth,
-                self._counters.latency,
-                link.clock_offset_ns,
-            )
-            if frame is not None:
-                self.inlet.exhausted = False
-                self.accept(link, frame, timed=True)
-            if count:
-                self._counters.received += count
-                return np.frombuffer(bodies, codec.record_dtype)
-            if frame is not None:
-                return None
-        return None
-
-    def join(self, codec: Codec, item: Item) -> np.ndarray:
-        """All messages that wait, this one first, as one array. The lock is not held."""
-        bodies = [_record(codec, item)]
-        with self._turn:
-            if self._policy.reliable:  # else that was done for the first
-                self.drain()
-            while self.queue:
-                bodies.append(_record(codec, self.queue.popleft()))
-                self._counters.received += 1
-        if any(len(body) != codec.fixed_size for body in bodies):
-            raise MalformedMessage(f"a body that has not the {codec.fixed_size} bytes of its type")
-        return np.frombuffer(b"".join(bodies), codec.record_dtype)
-
     def accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
         """Put the message of a frame into the queue."""
         if frame[:HEAD_SIZE] != link.message_head or len(frame) < HEADER_SIZE:
@@ -296,11 +259,3 @@ class Intake:
         if not self._policy.reliable and len(queue) > depth:
             queue.popleft()
             self._counters.overtaken += 1
-
-
-def _record(codec: Codec, item: Item) -> Any:
-    """The body of a message, as one of this type."""
-    if item.link.codec is codec:
-        return item.buffer[item.offset : item.offset + item.size]
-    message = item.link.codec.decode(item.buffer, item.offset, item.size)
-    return codec.encode(message, codec.fixed_size or 0)

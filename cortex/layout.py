@@ -136,26 +136,3 @@ def has_tail(kind: FieldType) -> bool:
     if isinstance(kind, Schema):
         return any(has_tail(field.type) for field in kind.fields)
     return isinstance(kind, ListType)
-
-
-def record_dtype(kind: FieldType, size: int | None = None) -> np.dtype[Any]:
-    """Return the NumPy dtype of a type without tail, for bodies as an array of structures.
-
-    An optional becomes a structure of `present` and `value`; an enum is its int32.
-    """
-    if isinstance(kind, str):
-        return DTYPES[DTYPE_CODES[kind]]
-    if isinstance(kind, EnumType):
-        return np.dtype("<i4")
-    if isinstance(kind, ArrayType):
-        return np.dtype((array_dtype(kind), kind.shape))
-    if isinstance(kind, OptionalType):
-        total, alignment = measure(kind)
-        names, kinds, offsets = ["present", "value"], [np.dtype("?"), record_dtype(kind.item)], [0, alignment]
-    elif isinstance(kind, Schema):
-        field_offsets, total, _ = measure_fields(kind)
-        names, offsets = [field.name for field in kind.fields], list(field_offsets)
-        kinds = [record_dtype(field.type) for field in kind.fields]
-    else:
-        raise AssertionError("a list has no fixed size")
-    return np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size or total})

@@ -10,7 +10,7 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from types import TracebackType
 from typing import Any, TypeVar, cast
@@ -67,7 +67,6 @@ class Node:
         registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port".
         listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None: this host only.
             Without `keys` also "127.0.0.1" lets every user of this host read and call this node.
-        peers: Control addresses of nodes to talk to without a registry.
         keys: CURVE keys for tcp, from `cortex.security.load_keys`.
         insecure: Allow plain tcp beyond this host.
 
@@ -83,7 +82,6 @@ class Node:
         domain: int | None = None,
         registry: str = "auto",
         listen: str | None = None,
-        peers: Sequence[str] = (),
         keys: Keys | None = None,
         insecure: bool = False,
     ) -> None:
@@ -112,7 +110,6 @@ class Node:
                 domain=self.domain,
                 record=self._record,
                 registry=registry,
-                peers=peers,
                 keys=keys,
                 insecure=insecure,
                 on_change=self._on_change,
@@ -121,9 +118,7 @@ class Node:
             self._pub_sockets.close()
             self._places.close()
             raise
-        self._answers = Answers(
-            name, self._server, registry=self._directory.answer, stats=self._stats, wake=self._control.wake
-        )
+        self._answers = Answers(name, self._server, stats=self._stats, wake=self._control.wake)
         self._control.start(
             self._places,
             self._directory,
@@ -333,7 +328,7 @@ class Node:
         raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
 
     def wait_for_registry(self, timeout_s: float = 5.0) -> bool:
-        """Wait until the registry, or all peers, have answered; False if they have not in time."""
+        """Wait until the registry has told of all nodes; False if it has not in time."""
         deadline_s = time.monotonic() + timeout_s
         while not self._directory.connected:
             if time.monotonic() >= deadline_s:

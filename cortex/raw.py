@@ -34,7 +34,6 @@ class RawCodec:
 
     type = RawMessage
     fixed_size = None
-    record_dtype = None
 
     def __init__(self, schema: Schema) -> None:
         self.schema = schema

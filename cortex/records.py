@@ -89,10 +89,7 @@ class Hello:
 
 @message(name="cortex/Heartbeat")
 class Heartbeat:
-    """A node lives: the revision of its record, and what it has of the other side (0: nothing).
-
-    `held` is the revision of the answering node's record; a registry has none and ignores it.
-    """
+    """A node lives, with this revision of its record; `held` is 0."""
 
     node: UInt64
     revision: UInt64
@@ -103,7 +100,7 @@ class Heartbeat:
 class Alive:
     """Answer to a heartbeat.
 
-    `epoch` says who answers (a registry's random number, or a node), `version` is the last change that it has
+    `epoch` is the registry's random number, `version` is the last change that it has
     announced, `held` the revision that it holds of the asker's record (0: none).
     """
 
@@ -153,13 +150,6 @@ class Refused:
 @message(name="cortex/Leave")
 class Leave:
     """A node closes."""
-
-    node: UInt64
-
-
-@message(name="cortex/Describe")
-class Describe:
-    """Asks a node for its record, which comes as `Changed`; `node` is the asker, 0 for a tool."""
 
     node: UInt64
 

@@ -13,7 +13,6 @@ import select
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -149,25 +148,6 @@ class Subscriber(Generic[T]):
 
         found: tuple[Info, bytes | np.ndarray, Schema] = self._receive(timeout_s, raw)
         return found
-
-    def recv_batch(self, timeout_s: float | None = None) -> np.ndarray:
-        """Take all messages that are there, at least one, as a structured array; for types of a fixed size.
-
-        Returns:
-            A read-only array with the type's fields.
-
-        Raises:
-            TypeError: The type's size is not fixed.
-            TimeoutError, TypeMismatch, Closed: As `recv`.
-        """
-        if self.codec is None or self.codec.record_dtype is None:
-            raise TypeError(f"{self.topic}: only a type of fixed size can be received as an array")
-        with self._turn:
-            simple = not (self._queue or self._closed or self._problems) and self.policy.reliable
-            records = self._intake.gather(self.codec) if simple else None
-        if records is None:
-            records = self._receive(timeout_s, partial(self._intake.join, self.codec))
-        return records
 
     def __iter__(self) -> Iterator[T]:
         """Messages as they come, until the subscriber is closed. An error ends it not: iterate again."""

@@ -1,9 +1,10 @@
-"""Events as bytes: mono of event_camera_msgs/EventPacket, and the records of dvs_msgs/EventArray.
+"""Events as bytes: encodings of event_camera_msgs/EventPacket, and the records of dvs_msgs/EventArray.
 
-mono is one word of 64 bits for each event, with a time of its own in nanoseconds; `cortex.evt3` is the other
-encoding of EventPacket. Nothing here loops over events in Python.
+mono is one word of 64 bits for each event, with a time of its own in nanoseconds. libcaer and libcaer_cmp
+come from the driver of iniVation's cameras, and are only read. `cortex.evt3` is the other encoding. Nothing
+here loops over events in Python.
 
-Reference: the README of event_camera_msgs.
+Reference: the README of event_camera_msgs; polarity.h of libcaer; event_camera_codecs, for libcaer_cmp.
 """
 
 from __future__ import annotations
@@ -14,14 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortex.evt3 import (
-    Buffer,
-    Bytes,
-    EventCodecError,
-    EventColumns,
-    check_events,
-    read_words,
-)
+from cortex.evt3 import Buffer, Bytes, EventCodecError, EventColumns, check_events, hold_value, read_words
 
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
 
@@ -66,6 +60,58 @@ def decode_mono(data: Buffer | Bytes, *, base_ns: int) -> EventColumns:
     t = (words & 0xFFFFFFFF).astype(np.int64) + base_ns
     row = quarters[:, 3]
     return EventColumns(t, quarters[:, 2].copy(), row & np.uint16(0x7FFF), (row >> 15).astype(np.uint8))
+
+
+def decode_libcaer(data: Buffer | Bytes, *, base_ns: int) -> EventColumns:
+    """Return the events of a packet with a `time_base`, with times in nanoseconds.
+
+    A word is a column (15 bits), a row (15), a polarity, a flag, and a time of 31 bits [us] that may wrap.
+
+    Raises:
+        EventCodecError: It does not consist of words of 8 bytes.
+    """
+    pixel, time_us = read_words(data, "<u8", "libcaer").view("<u4").reshape(-1, 2).T
+    t_us = time_us.astype(np.int64)
+    t_us[1:] += np.cumsum(t_us[1:] < t_us[:-1]) << 31
+    x, y = (pixel >> 17).astype(np.uint16), (pixel >> 2 & 0x7FFF).astype(np.uint16)
+    return EventColumns(t_us * 1000 + base_ns, x, y, (pixel >> 1 & 1).astype(np.uint8))
+
+
+_TIME_HIGH, _TIME_LOW, _ADDR_X, _ADDR_Y, _BASE_Y, _VECT_8 = range(6)
+
+
+def decode_libcaer_cmp(data: Buffer | Bytes, *, base_ns: int, width: int, height: int) -> EventColumns:
+    """Return the events of a packet with a `time_base` that are on the sensor, with times in nanoseconds.
+
+    The upper 4 bits of a word of 16 say what the others are: the high or the low half of a time of 24 bits
+    since `time_base` [us], a column, a row and a polarity, which make an event; or a first row and a
+    polarity, and then bits that tell which of the next eight rows have an event.
+
+    Raises:
+        EventCodecError: It is half a word too long, has a word that is none of these, or an event without a
+            column.
+    """
+    words = read_words(data, "<u2", "libcaer_cmp")
+    code, value = words >> 12, words & 0xFFF
+    if (code > _VECT_8).any():
+        raise EventCodecError(f"libcaer_cmp has no words that begin with 0x{code.max():X}")
+    where = np.flatnonzero((code == _ADDR_Y) | (code == _VECT_8))
+    is_vector, own = code[where] == _VECT_8, value[where]
+    passed = np.cumsum(8 * (code == _VECT_8))  # rows that vectors up to this word have stepped over
+    base, _ = hold_value(code == _BASE_Y, (value & 0x7FF) - passed, 0, where)
+    sign, _ = hold_value(code == _BASE_Y, value >> 11, 0, where)
+    high, _ = hold_value(code == _TIME_HIGH, value, 0, where)
+    low, _ = hold_value(code == _TIME_LOW, value, 0, where)
+    x, _ = hold_value(code == _ADDR_X, value & 0x7FF, -1, where)
+    if (x < 0).any():
+        raise EventCodecError("a packet of libcaer_cmp has an event before its first column")
+    row, bit = np.nonzero(np.where(is_vector, own & 0xFF, 1)[:, None] >> np.arange(8) & 1)
+    y = np.where(is_vector, base + passed[where] - 8, own & 0x7FF)[row] + bit
+    polarity = np.where(is_vector, sign, own >> 11)[row].astype(np.uint8)
+    t = ((high << 12 | low) * 1000 + base_ns)[row]
+    inside = (x[row] < width) & (y < height)
+    places = x[row][inside].astype(np.uint16), y[inside].astype(np.uint16)
+    return EventColumns(t[inside], *places, polarity[inside])
 
 
 DVS_RECORD = np.dtype(

@@ -1,14 +1,14 @@
 """An anemometer in a gust: a sensor of your own that is one kernel, with errors. It prints what it read."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 import neurosim_core as ns
-from neurosim_core.sensors import ErrorConfig, Errors, Motion, StateSampler, error_adder, make_errors
+from neurosim_core.sensors import ErrorConfig, Motion, StateSampler, make_reader
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -19,31 +19,11 @@ class Airflow(ns.Packet):
     """Velocity of the air against the vehicle, in B [m/s]."""
 
 
-def _make_kernel(terms: tuple[str, ...]) -> Any:
-    add_errors = error_adder(terms)
-
-    # annotations must be objects: a file with such a kernel has no `from __future__ import annotations`
-    @wp.kernel(module="unique", enable_backward=False)
-    def measure(
-        model: Errors, motion: Motion, seeds: wp.array[wp.uint64], active: wp.array[wp.int32],
-        sample: wp.array[wp.int64], memory: wp.array2d[wp.vec3d], slot: int, air_out: wp.array2d[wp.vec3d],
-    ):  # fmt: skip
-        world = wp.tid()
-        if active[world] != 0:
-            against = motion.air_velocity[world] - motion.velocity[world]
-            value = wp.quat_rotate_inv(motion.orientation[world], against)
-            air_out[slot, world] = add_errors(model, seeds[world], sample[world], value, memory, world, 0)
-            sample[world] += wp.int64(1)
-
-    return measure
-
-
-class Anemometer(StateSampler):
-    """The anemometers of all worlds."""
-
-    def packet(self, rows: Any, **header: Any) -> Airflow:
-        """Return one sample as a packet."""
-        return Airflow(air=np.array(rows["air"]), **header)
+# annotations must be objects: a file with such a function has no `from __future__ import annotations`
+@wp.func
+def _read_air(scale: wp.float64, motion: Motion, world: int, output: int) -> wp.vec3d:
+    against = motion.air_velocity[world] - motion.velocity[world]
+    return scale * wp.quat_rotate_inv(motion.orientation[world], against)
 
 
 @ns.register("sensor", "anemometer")
@@ -56,13 +36,15 @@ class AnemometerConfig(ns.sensors.StateSensorConfig):
     errors: ErrorConfig = ErrorConfig(white=0.05, markov=0.1)
     """In m/s."""
 
+    scale: float = 1.0
+    """Factor of all readings."""
+
     packet_type = Airflow
 
-    def make(self, context: ns.sensors.SamplerContext) -> Anemometer:
+    def make(self, context: ns.sensors.SamplerContext) -> StateSampler:
         """Return the sensor at work."""
-        terms = self.errors.terms()
-        model = make_errors(self.errors, rate_hz=self.rate_hz, name=f"{context.name}/air")
-        return Anemometer(context, _make_kernel(terms), model, outputs={"air": wp.vec3d}, terms=terms)
+        scale, errors = wp.float64(self.scale), {"air": self.errors}
+        return make_reader(context, _read_air, scale, errors, Airflow, rate_hz=self.rate_hz)
 
 
 def main() -> float:

@@ -137,6 +137,7 @@ def fly(
     sees_events = any(isinstance(sensor, EventSensorConfig) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
+    threading.Thread(target=_load_matplotlib, daemon=True).start()  # for the overview, beside the flight
     with stop_at_signals(stop), _Files(model, folder, rerun=rerun, console=console) as files:
         try:
             with _progress(console) as progress:
@@ -382,18 +383,20 @@ class _Files:
             )
 
 
-def _load(model: Model, *, rerun: bool) -> None:
-    """Load what is used later, while the scene is lit: kernels, and the libraries of `_LIBRARIES`."""
+def _load(model: Model, is_lit: Callable[[], bool], *, rerun: bool) -> None:
+    """Load what is used later while the scene is lit: kernels, then libraries as long as there is time."""
     warm_flight(model)
-    imports: list[Callable[[], object]] = [
-        import_h5py,
-        functools.partial(importlib.import_module, "matplotlib.figure"),
-    ]
-    if rerun:
-        imports.append(import_rerun)
+    imports: list[Callable[[], object]] = [import_h5py, *([import_rerun] if rerun else []), _load_matplotlib]
     for load in imports:
+        if is_lit():
+            break
         with contextlib.suppress(ImportError):  # what is left out for want of it is told by `_has`
             load()
+
+
+def _load_matplotlib() -> None:
+    with contextlib.suppress(ImportError):
+        importlib.import_module("matplotlib.figure")
 
 
 def _planned_track(model: Model, end_ns: int) -> Track:

@@ -133,12 +133,6 @@ def _small(size: str, bound: float) -> Case:
     return Case(f"typed-{size}", title, FLOATS[size], contestants, (_over(0.85, _RAW1),), bound=bound)
 
 
-def _batch(size: str, bound: float) -> Case:
-    title = f"{_LABELS[size]}, type of fixed size, recv_batch as an array of structures"
-    contestants = (_cortex(fixed=True, how="batch"), _raw(1))
-    return Case(f"batch-{size}", title, FLOATS[size], contestants, (_over(bound, _RAW1),))
-
-
 def _tcp(size: str) -> Case:
     frames = {"40": (1,), "4k": (1,), "23.7M": (2,)}.get(size, (1, 2))
     raw = [_raw(number, tcp="127.0.0.1") for number in frames]
@@ -186,8 +180,6 @@ def _threshold(kib: int) -> Case:
 CASES: tuple[Case, ...] = (
     _small("40", 2.0),
     _small("4k", 1.8),
-    _batch("40", 1.25),
-    _batch("4k", 1.5),
     Case("medium", "39 kB through shared memory, callback", FLOATS["39k"],
          (_cortex(), _raw(1), _raw(2), _ZENOH, *_ROS), (_over(2.0, _RAW1, _RAW2),)),
     Case("large", "0.9 MB through shared memory, callback", FLOATS["900k"],

@@ -1,6 +1,6 @@
 """Cortex itself, used as its documentation says: typed messages, decoded to objects.
 
-Options: ``fixed``, ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`` (an address).
+Options: ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`` (an address).
 """
 
 from __future__ import annotations
@@ -25,25 +25,6 @@ class Sample:
     data: Array["float32", "n"]
 
 
-@message(name="bench/Sample10")
-class Sample10:
-    """The same with 40 bytes of array, known beforehand."""
-
-    stamp_ns: int
-    data: Array["float32", 10]
-
-
-@message(name="bench/Sample1000")
-class Sample1000:
-    """The same with 4 kB of array, known beforehand."""
-
-    stamp_ns: int
-    data: Array["float32", 1000]
-
-
-_FIXED = {10: Sample10, 1000: Sample1000}
-
-
 _NODES: list[Node] = []
 """This process's node, once it is made."""
 
@@ -64,18 +45,14 @@ def _topic(job: Job, topic: str) -> str:
     return f"/bench/{job.folder.name}/{topic}"
 
 
-def _type(job: Job, topic: str) -> Any:
-    return _FIXED[job.floats] if job.options.get("fixed") and topic != "pong" else Sample
-
-
 def _publisher(job: Job, topic: str) -> Send:
-    kind, floats = _type(job, topic), job.floats
+    floats = job.floats
     options = {key: job.options[key] for key in ("inline_max", "max_wait_s") if key in job.options}
-    publisher = _node(job, listens=topic != "pong").publisher(_topic(job, topic), kind, **options)
+    publisher = _node(job, listens=topic != "pong").publisher(_topic(job, topic), Sample, **options)
     publish, loan = publisher.publish, publisher.loan
 
     def send(sequence: int, data: Floats) -> None:
-        publish(kind(sequence, data))
+        publish(Sample(sequence, data))
 
     def send_loan(sequence: int, data: Floats) -> None:
         """Write the stamp and the three items that are checked, as a producer would that fills the slot."""
@@ -90,7 +67,7 @@ def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
     # Large messages wait in the publisher's ring, which bounds their memory.
     patient = reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
     policy = latest() if job.options.get("latest") else patient
-    subscribe, kind = _node(job, listens=False).subscriber, _type(job, topic)
+    subscribe = _node(job, listens=False).subscriber
     done = threading.Event()
 
     def on_message(sample: Any) -> None:
@@ -100,10 +77,10 @@ def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
             done.set()
 
     if how == "callback":
-        subscribe(_topic(job, topic), kind, on_message, policy=policy)
+        subscribe(_topic(job, topic), Sample, on_message, policy=policy)
         done.wait()  # the runner kills a child that waits for ever
     else:
-        _BY[how](subscribe(_topic(job, topic), kind, policy=policy), handle)
+        _BY[how](subscribe(_topic(job, topic), Sample, policy=policy), handle)
 
 
 def _by_recv(subscriber: Any, handle: Handler) -> None:
@@ -118,12 +95,6 @@ def _by_iterator(subscriber: Any, handle: Handler) -> None:
         handle(sample.stamp_ns, sample.data)
 
 
-def _by_batch(subscriber: Any, handle: Handler) -> None:
-    while True:
-        records = subscriber.recv_batch(timeout_s=PATIENCE_S)
-        handle(records["stamp_ns"], records["data"])
-
-
 def _by_async(subscriber: Any, handle: Handler) -> None:
     async def loop() -> None:
         async for sample in subscriber:
@@ -132,7 +103,7 @@ def _by_async(subscriber: Any, handle: Handler) -> None:
     asyncio.run(loop())
 
 
-_BY = {"recv": _by_recv, "iterator": _by_iterator, "batch": _by_batch, "async": _by_async}
+_BY = {"recv": _by_recv, "iterator": _by_iterator, "async": _by_async}
 
 
 def tell_death(job: Job, callback: Any) -> None:

@@ -72,7 +72,7 @@ def receive(pipe: Any, job: Job) -> None:
     else:
         counts = tally = Tally(job.floats, connected, settle_at=job.count // 10)
         consume = bool(job.options.get("consume"))
-        handle = tally.batch_handler() if how == "batch" else tally.handler(consume=consume)
+        handle = tally.handler(consume=consume)
     _receive(peer, job, "flood", handle, how)
     pipe.send({"cpu_s": time.process_time() - cpu_s, **counts.report})
     peer.close()

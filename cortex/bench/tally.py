@@ -84,27 +84,6 @@ class Tally:
 
         return copy_and_handle if consume else handle
 
-    def batch_handler(self) -> Handler:
-        """Return the function to call with the arrays of sequences and payloads of each batch."""
-        expected = 0
-
-        def handle(sequences: NDArray[np.int64], payloads: NDArray[np.float32]) -> None:
-            nonlocal expected
-            count = len(sequences)
-            if sequences[0] == expected and sequences[-1] == expected + count - 1:
-                if count > 2 and not (sequences[1:] > sequences[:-1]).all():
-                    self.report["misordered"] += 1
-                expected += count
-                self._check(expected - count, payloads[0])
-            else:  # a marker or a gap within the batch
-                for sequence, data in zip(sequences.tolist(), payloads, strict=True):
-                    if sequence == expected:
-                        expected += 1
-                    else:
-                        expected = self._jump(sequence, expected, data)
-
-        return handle
-
     def _check(self, sequence: int, data: Floats) -> None:
         tag = 1.0 + (sequence & 1)
         if len(data) != self._floats or not (data[0] == tag == data[-1] == data[self._floats // 2]):

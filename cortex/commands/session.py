@@ -33,9 +33,8 @@ def open_node(options: argparse.Namespace) -> Node:
     return Node(
         f"cortex {options.command}",
         domain=options.domain,
-        registry=_registry(options),
+        registry=options.registry,
         listen=options.listen,
-        peers=options.peer,
         keys=read_keys(options.keys),
         insecure=options.insecure,
     )
@@ -51,27 +50,21 @@ def read_keys(directory: Path | None) -> Keys | None:
         raise CommandError(f"{error.filename} does not exist: make keys with `cortex keys new`") from error
 
 
-def _registry(options: argparse.Namespace) -> str:
-    return options.registry or ("off" if options.peer else "auto")
-
-
 def look_around(options: argparse.Namespace) -> Node | None:
     """Open a node that knows the others; None, after telling why, if nobody is there.
 
     Raises:
-        CommandError: A registry or peer does not answer.
+        CommandError: The registry does not answer.
     """
     read_keys(options.keys)  # wrong ones are worth an error even if nobody is there
-    if _registry(options) == "auto" and not _is_registry_there(options.domain):
+    if options.registry == "auto" and not _is_registry_there(options.domain):
         # Opening a node would start a registry, only to hear from it that there is nobody.
         say_empty(options)
         return None
     node = open_node(options)
     try:
         if not node.wait_for_registry(_ANSWER_S):
-            raise CommandError(
-                f"no answer from {options.registry or ', '.join(options.peer) or 'the registry'}"
-            )
+            raise CommandError(f"no answer from the registry ({options.registry})")
     except BaseException:
         node.close()
         raise

@@ -3,9 +3,7 @@
 Conventions: SI units and radians; world frame x east, y north, z up; body frame x forward, y left, z up;
 camera frame x right, y down, z forward; quaternions xyzw. `q_WB` takes vectors of the body to the world,
 `v_W` is expressed in the world. Stamps are integer nanoseconds of simulation time or of the robot's clock;
-events are stamped in microseconds. `sequence` counts what one sensor or controller sends from 0. Messages
-without text or arrays of variable length have a fixed size, and so can be received as NumPy records
-(`recv_batch`).
+events are stamped in microseconds. `sequence` counts what one sensor or controller sends from 0.
 """
 
 from cortex.messages.commands import (

@@ -12,7 +12,7 @@ from cortex_ros2_bridge.convert.commands import recorded_rates, unit, xyz
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
 from cortex_ros2_bridge.convert.records import stamp_ns_of
 from cortex_ros2_bridge.convert.registry import NEWEST, PACKETS, standard
-from cortex_ros2_bridge.event_codec import decode_mono
+from cortex_ros2_bridge.event_codec import decode_libcaer, decode_libcaer_cmp, decode_mono
 
 
 @standard(messages.Odometry, "nav_msgs/Odometry", "{topic}", PACKETS, direction="in", robot=True)
@@ -42,7 +42,7 @@ def odometry(message: Any, context: Context) -> messages.Odometry:
     robot=True,
 )
 def events(message: Any, context: Context) -> messages.Events:
-    """Convert event_camera_msgs/EventPacket, in evt3 or mono.
+    """Convert event_camera_msgs/EventPacket, in evt3, mono, libcaer or libcaer_cmp.
 
     A packet tells the time of its first event. Its stamp in Cortex is the end of the window in which its last
     one lies, where the option `packet_rate_hz` tells how windows follow each other; else the time of that.
@@ -54,11 +54,9 @@ def events(message: Any, context: Context) -> messages.Events:
     try:
         if message.encoding == "evt3":
             columns = _decode_evt3(message, stamp_ns // 1000, context)
-        elif message.encoding == "mono":
-            columns = decode_mono(message.events, base_ns=message.time_base)
-            columns = columns._replace(t=columns.t // 1000)
         else:
-            raise ConvertError(f"EventPacket.encoding must be evt3 or mono, got {message.encoding!r}")
+            columns = _decode_timed(message)
+            columns = columns._replace(t=columns.t // 1000)
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
     end_ns = int(columns.t[-1]) * 1000 if len(columns.t) else stamp_ns
@@ -90,6 +88,21 @@ def _decode_evt3(message: Any, stamp_us: int, context: Context) -> EventColumns:
         context.memory["is_stamped"] = False
     decoder: Evt3Decoder = context.memory.setdefault("evt3", Evt3Decoder())
     return decoder.decode(message.events, **size)
+
+
+def _decode_timed(message: Any) -> EventColumns:
+    """Return the events of a packet that tells its time, in nanoseconds."""
+    data, base_ns = message.events, message.time_base
+    match message.encoding:
+        case "mono":
+            return decode_mono(data, base_ns=base_ns)
+        case "libcaer":
+            return decode_libcaer(data, base_ns=base_ns)
+        case "libcaer_cmp":
+            return decode_libcaer_cmp(data, base_ns=base_ns, width=message.width, height=message.height)
+    raise ConvertError(
+        f"EventPacket.encoding must be evt3, mono, libcaer or libcaer_cmp, got {message.encoding!r}"
+    )
 
 
 standard(

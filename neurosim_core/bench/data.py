@@ -68,10 +68,10 @@ def _there_and_back(path: Path, name: str, seconds: float) -> Row:
             count += len(block.t)
         begin = time.process_time()
     write_s += time.process_time() - begin
+    begin = time.process_time()
     with closing(open_events(path, size=(WIDTH, HEIGHT))) as reader:
-        begin = time.process_time()
         found = [*reader.blocks()]
-        read_s = time.process_time() - begin
+    read_s = time.process_time() - begin
     for index in range(4):
         ours = np.concatenate([block[index] for block in _blocks(seconds)])
         same = same and np.array_equal(np.concatenate([block[index] for block in found]), ours)
@@ -130,7 +130,8 @@ def _windows(path: Path, progress: Progress) -> list[Row]:
 
 def _chapter(formats: list[Row], windows: list[Row], seconds: float) -> Chapter:
     by_name = {row["what"]: row for row in windows}
-    ratio, voxels = by_name["events"]["of the plain read"], by_name["voxels, 5 bins"]["windows/s"]
+    voxels = by_name["voxels, 5 bins"]["windows/s"]
+    ratio, with_voxels = (by_name[name]["of the plain read"] for name in ("events", "voxels, 5 bins"))
     exact = [row["format"] for row in formats if row["identical"] == "yes"]
     note = (
         f"CPU time of one core; {seconds * EVENTS_HZ / 1e6:.0f} M events at {EVENTS_HZ / 1e6:g} M/s, 346x260."
@@ -139,13 +140,13 @@ def _chapter(formats: list[Row], windows: list[Row], seconds: float) -> Chapter:
         name="data",
         title="Data for learning",
         summary=f"One core cuts {voxels:,.0f} windows of 50 ms a second into voxels of 5 bins, where 346x260 "
-        f"pixels send {EVENTS_HZ / 1e6:g} M events/s; events alone come at {ratio:.2f} of the speed of a "
-        "plain read of the file.",
+        f"pixels send {EVENTS_HZ / 1e6:g} M events/s; with voxels they come at {with_voxels:.2f}, alone at "
+        f"{ratio:.2f} of the speed of a plain read of the file by h5py.",
         claims=[
             Claim("60 windows of 50 ms a second with 5-bin voxels, on two cores", "one core is measured here",
                   f"{voxels:,.0f} windows/s", voxels >= 60.0),
-            Claim("events come at 0.8 of the speed of a plain HDF5 read", "h5py on the same file, by turns",
-                  f"{ratio:.2f}", ratio >= 0.8),
+            Claim("voxels come at 0.8 of the speed of a plain HDF5 read", "h5py on the same file, by turns",
+                  f"{with_voxels:.2f}", with_voxels >= 0.8),
             Claim("all formats give back the same events", "the events that were written",
                   f"{len(exact)} of {len(formats)}: {', '.join(exact)}", len(exact) == len(formats)),
         ],

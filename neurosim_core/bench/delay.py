@@ -19,7 +19,7 @@ import numpy as np
 from neurosim_core.bench.engine import Recording, SimulationConfig, load_config, set_options
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, lines
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
 TRANSPORT_S = 5e-4
 """What a command and its odometry are on their way, and a sleep takes longer than it should [wall-clock s].
@@ -134,8 +134,6 @@ def _chapter(rows: list[Row], mode: str) -> Chapter:
         for row in rows
         for kind in ("predicted", "measured")
     ]
-    series = lines(errors, "delay [ms]", "error [cm]", by="what")
-    panel = Panel(x_label="delay [ms]", y_label="error [cm]", series=series, y_min=0.0)
     note = (
         "Where commands come far less often than the delay says, the machine is too slow: time was held back."
     )
@@ -153,5 +151,5 @@ def _chapter(rows: list[Row], mode: str) -> Chapter:
             )
         ],
         tables=[Table("delay", title, rows, note)],
-        plots=[Plot("delay", title, [panel])],
+        plots=[Plot("delay", title, [panel(errors, "delay [ms]", "error [cm]", by="what", y_min=0.0)])],
     )

@@ -10,12 +10,12 @@ aerodynamic effects.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from neurosim_core.bench.dynamics_flights import HOLD_NS, Flight
 from neurosim_core.bench.engine import MultirotorConfig
@@ -122,8 +122,7 @@ def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
     return np.array(states)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Errors:
+class Errors(NamedTuple):
     """The largest differences of two flights over the ends of all holds."""
 
     position_m: float
@@ -133,41 +132,26 @@ class Errors:
     @property
     def finite(self) -> bool:
         """Whether the flight stayed finite, and within 1000 km."""
-        return (
-            math.isfinite(self.position_m + self.attitude_rad + self.body_rate_rad_s)
-            and self.position_m < 1e6
-        )
+        return math.isfinite(sum(self)) and self.position_m < 1e6
 
 
 def compare(flown: Array, exact: Array) -> Errors:
     """Compare two flights, states of shape [K, 13 + R]; not finite where one is not."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = flown - exact
-        return Errors(
-            position_m=float(np.linalg.norm(difference[:, POSITION], axis=1).max()),
-            attitude_rad=float(attitude_error(flown[:, ORIENTATION], exact[:, ORIENTATION]).max()),
-            body_rate_rad_s=float(np.linalg.norm(difference[:, BODY_RATE], axis=1).max()),
-        )
+    difference = flown - exact
+    if not np.isfinite(difference).all():
+        return Errors(math.nan, math.nan, math.nan)
+    turns = (Rotation.from_quat(states[:, ORIENTATION]) for states in (flown, exact))
+    largest = (np.linalg.norm(difference[:, part], axis=1).max() for part in (POSITION, BODY_RATE))
+    (first, second), (position_m, body_rate_rad_s) = turns, largest
+    attitude_rad = (first.inv() * second).magnitude().max()
+    return Errors(float(position_m), float(attitude_rad), float(body_rate_rad_s))
 
 
-def attitude_error(first: Array, second: Array) -> Array:
-    """Return the angles between unit quaternions [rad], shape [..., 4], exact for small ones.
-
-    The relative rotation is conj(first) * second; its angle is 2 atan2(|vector part|, |scalar part|).
-    """
-    v, s, u, t = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    vector = np.linalg.norm(s * u - t * v - np.cross(v, u), axis=-1)
-    scalar = np.abs(s * t + (v * u).sum(axis=-1, keepdims=True))[..., 0]
-    return np.asarray(2.0 * np.arctan2(vector, scalar))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reference:
+class Reference(NamedTuple):
     """A solution, and how well it is known."""
 
     states: Array
     """At the end of each hold, shape [K, 13 + R]."""
-    solver: Solver
     uncertainty: Errors
     """Difference of a solution at 10/3 of the tolerance, or of the other solver."""
 
@@ -184,4 +168,4 @@ def make_reference(flight: Flight, *, stiff: bool = False, cross_check: bool = F
     rtol = 1e-11 if stiff else 3e-14
     states = solve(flight, solver, rtol)
     again = solve(flight, "Radau", 1e-12) if cross_check else solve(flight, solver, rtol * 10.0 / 3.0)
-    return Reference(states=states, solver=solver, uncertainty=compare(again, states))
+    return Reference(states, compare(again, states))

@@ -62,6 +62,17 @@ def load_scene(file: Path | None, *, rooms: int | None = None) -> Scene:
     return make_apartment(ApartmentConfig() if rooms is None else ApartmentConfig(rooms=rooms))
 
 
+def option_names(camera: str, **more: str) -> dict[str, str]:
+    """Return what the command line calls settings, for error messages: setting -> option.
+
+    Args:
+        camera: Name of the camera that the options are about.
+        more: Options of further settings of it.
+    """
+    names = {"lens.width": "--width", "lens.height": "--height", **more}
+    return {"device": "--device", **{f"sensors.{camera}.{key}": name for key, name in names.items()}}
+
+
 def free_views(scene: Scene, count: int, *, device: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points with room around them [m], [n, 3], and yaws [rad], [n]; n is `count` at most."""
     low, high = scene.bounds_m

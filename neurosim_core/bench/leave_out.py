@@ -18,7 +18,7 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.bench.options import Options, Progress, silent
-from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table, cell
+from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
 _SCENE_LIBRARIES = ("trimesh", "PIL", "networkx", "embreex", "pyrender", "OpenGL")
 LIBRARIES = (*_SCENE_LIBRARIES, "h5py", "mcap", "matplotlib", "rerun", "zmq", "cortex", "scipy", "torch")
@@ -142,13 +142,10 @@ def _chapter(rows: list[Row]) -> Chapter:
     least, most = rows[0], rows[-1]
     imported = [name for name in _SCENE_LIBRARIES if name in least["libraries"].split(", ")]
     cpu, setup = "CPU per simulated s [ms]", "set-up [s of CPU]"
-    places = list(range(len(rows)))
-    panels = []
-    for heading in (cpu, "modules of kernels", "their size [MiB]"):
-        values = [row[heading] for row in rows]
-        series = Series(label="runs", x=values, y=places, style="points", names=list(map(cell, values)))
-        ticks = {row["run"]: place for place, row in enumerate(rows)}
-        panels.append(Panel(x_label=heading, series=[series], x_scale="log", y_ticks=ticks))
+    drawn = [
+        panel([{**row, "": heading} for row in rows], "run", heading, by="", y_min=0.0)
+        for heading in (cpu, "modules of kernels", "their size [MiB]")
+    ]
     return Chapter(
         name="leave-out",
         title="What a scene does not need is left out",
@@ -172,7 +169,7 @@ def _chapter(rows: list[Row]) -> Chapter:
         tables=[
             Table("leave-out", "Kernels, memory, libraries and time", rows, "On the CPU, each in a process."),
         ],
-        plots=[Plot("leave-out", "What runs take, few parts to many", panels)],
+        plots=[Plot("leave-out", "What runs take, few parts to many", drawn, 1)],
     )
 
 

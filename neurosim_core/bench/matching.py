@@ -1,17 +1,14 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-untyped-call,call-overload"
 # mypy: disable-error-code="untyped-decorator,assignment"
-"""How two streams of events differ: by the alignment of Victor and Purpura, or by what has a partner in time.
+"""How two streams of events differ: by the cheapest way to turn one into the other.
 
-The events of one pixel and polarity are a spike train. The distance of two trains is the least cost of
-turning one into the other: to delete or insert an event costs 1, to shift one by dt costs q |dt|. An event
-is shifted rather than deleted and inserted again if that is cheaper, so 2 / q is the window within which
-events of two trains can be the same event. What is deleted is missing, what is inserted is spurious. With
-G(i, j) the distance of the first i events a of one train and the first j events b of the other,
+The events of one pixel and polarity are a spike train. To delete or insert an event costs 1, to shift one
+within a window costs in proportion to the time. What is deleted is missing, what is inserted is spurious.
+With G(i, j) the distance of the first i events a of one train and the first j events b of the other,
 
     G(i, j) = min(G(i-1, j) + 1, G(i, j-1) + 1, G(i-1, j-1) + q |a_i - b_j|).
 
-`match` makes as many pairs within a window as possible instead, and gives no distance. Where no event of
-either train falls into a window the two sides are independent: trains are cut there.
+Where no event of either train falls into a window the two sides are independent: trains are cut there.
 
 Reference: Victor, Purpura (1996), Nature and precision of temporal coding in visual cortex, J. Neurophysiol.
     76.
@@ -37,6 +34,7 @@ _CELLS_MAX = 1 << 24
 @wp.kernel(enable_backward=False)
 def _align(
     # Model:
+    window_us: wp.int64,
     cost_per_us: wp.float64,
     # In:
     first: int,
@@ -65,16 +63,19 @@ def _align(
         at = base + row * width
         cells[at] = wp.float64(row)
         for column in range(1, width):
-            shift = cost_per_us * wp.float64(wp.abs(a_us[a + row - 1] - b_us[b + column - 1]))
+            shift_us = wp.abs(a_us[a + row - 1] - b_us[b + column - 1])
             best = wp.min(cells[at + column - width], cells[at + column - 1]) + one
-            cells[at + column] = wp.min(best, cells[at + column - width - 1] + shift)
+            if shift_us <= window_us:
+                best = wp.min(best, cells[at + column - width - 1] + cost_per_us * wp.float64(shift_us))
+            cells[at + column] = best
     distance_out[group] = cells[base + rows * width + columns]
     row = rows
     column = columns
     while row > 0 and column > 0:
         at = base + row * width + column
         error_us = b_us[b + column - 1] - a_us[a + row - 1]
-        if cells[at] == cells[at - width - 1] + cost_per_us * wp.float64(wp.abs(error_us)):
+        shifted = cells[at - width - 1] + cost_per_us * wp.float64(wp.abs(error_us))
+        if wp.abs(error_us) <= window_us and cells[at] == shifted:
             error_us_out[a + row - 1] = float(error_us)
             row -= 1
             column -= 1
@@ -82,33 +83,6 @@ def _align(
             row -= 1
         else:
             column -= 1
-
-
-@wp.kernel(enable_backward=False)
-def _pair(
-    # Model:
-    window_us: wp.int64,
-    # In:
-    begin: wp.array2d[wp.int64],
-    count: wp.array2d[wp.int64],
-    a_us: wp.array[wp.int64],
-    b_us: wp.array[wp.int64],
-    # Out:
-    error_us_out: wp.array[float],
-) -> None:
-    group = wp.tid()
-    row = begin[0, group]
-    column = begin[1, group]
-    while row < begin[0, group] + count[0, group] and column < begin[1, group] + count[1, group]:
-        late_us = b_us[column] - a_us[row]
-        if late_us > window_us:
-            row += wp.int64(1)
-        elif late_us < -window_us:
-            column += wp.int64(1)
-        else:
-            error_us_out[row] = float(late_us)
-            row += wp.int64(1)
-            column += wp.int64(1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,8 +102,14 @@ class Alignment:
         return int(np.isnan(self.error_us).sum())
 
 
-def align(
-    reference: EventArrays, other: EventArrays, *, width: int, window_us: float, device: str = "cpu"
+def match(
+    reference: EventArrays,
+    other: EventArrays,
+    *,
+    width: int,
+    window_us: float,
+    shift_cost: float = 1e-6,
+    device: str = "cpu",
 ) -> Alignment:
     """Find the cheapest way to turn a reference into another stream of events.
 
@@ -137,16 +117,16 @@ def align(
         reference: What is right.
         other: What is compared with it.
         width: Columns of the sensor [px]; it has fewer than 2^22 pixels.
-        window_us: 2 / q: events further apart are not the same [us].
+        window_us: Events further apart are not the same [us].
+        shift_cost: What a shift by the window costs. 2 gives the distance of Victor and Purpura, and next to
+            nothing as many pairs as possible.
         device: Where to compute.
     """
     a, b = _sorted_keys(reference, width), _sorted_keys(other, width)
     begin, count = _groups(a, b, window_us)
     mixed = (count > 0).all(axis=0)
-    distance, error_us = (
-        float(count[:, ~mixed].sum()),
-        wp.full(len(a), value=math.nan, dtype=float, device=device),
-    )
+    alone = float(count[:, ~mixed].sum())
+    error_us = wp.full(len(a), value=math.nan, dtype=float, device=device)
     begin, count = begin[:, mixed], count[:, mixed]
     sizes = (count + 1).prod(axis=0)
     cell = np.concatenate([[0], np.cumsum(sizes)])
@@ -157,28 +137,15 @@ def align(
     first = 0
     while first < len(sizes):
         last = max(first + 1, int(np.searchsorted(cell, cell[first] + _CELLS_MAX, side="right")) - 1)
-        inputs = [2.0 / window_us, first, *uploaded, cells]
+        inputs = [int(window_us), shift_cost / window_us, first, *uploaded, cells]
         wp.launch(_align, dim=last - first, inputs=inputs, outputs=[distances, error_us], device=device)
         first = last
-    return _alignment(distance + float(distances.numpy().sum()), error_us.numpy(), len(b))
-
-
-def match(
-    reference: EventArrays, other: EventArrays, *, width: int, window_us: float, device: str = "cpu"
-) -> Alignment:
-    """Pair events of one pixel and polarity that are at most a window apart, as many as possible.
-
-    The earlier of two unpaired events is given up if the other is out of its reach, else they are paired: for
-    windows of one width no other choice makes more pairs. Arguments as for `align`; the distance is nan.
-    """
-    a, b = _sorted_keys(reference, width), _sorted_keys(other, width)
-    uploaded: list[Any] = [
-        wp.array(v, dtype=wp.int64, device=device) for v in (*_groups(a, b, window_us), a, b)
-    ]
-    error_us = wp.full(len(a), value=math.nan, dtype=float, device=device)
-    group_count = uploaded[0].shape[1]
-    wp.launch(_pair, dim=group_count, inputs=[int(window_us), *uploaded], outputs=[error_us], device=device)
-    return _alignment(math.nan, error_us.numpy(), len(b))
+    found_us = error_us.numpy()
+    return Alignment(
+        distance=alone + float(distances.numpy().sum()),
+        error_us=found_us,
+        spurious_count=len(b) - int((~np.isnan(found_us)).sum()),
+    )
 
 
 def _sorted_keys(events: EventArrays, width: int) -> NDArray[np.int64]:
@@ -201,8 +168,3 @@ def _groups(
     b_count = np.add.reduceat(both & 1, starts) if len(starts) else starts
     count = np.stack([np.diff(np.append(starts, len(both))) - b_count, b_count])
     return np.cumsum(count, axis=1) - count, count
-
-
-def _alignment(distance: float, error_us: NDArray[np.float32], other_count: int) -> Alignment:
-    matched = int((~np.isnan(error_us)).sum())
-    return Alignment(distance=distance, error_us=error_us, spurious_count=other_count - matched)

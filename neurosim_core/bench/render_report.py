@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+import numpy as np
 import rich.table
 from rich.console import Console
 from rich.text import Text
@@ -23,7 +24,6 @@ from neurosim_core.bench.report import (
     Chapter,
     Panel,
     Plot,
-    Series,
     Table,
     cell,
     is_numeric,
@@ -33,8 +33,6 @@ from neurosim_core.bench.report import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
 
 VERDICTS = {True: "met", False: "missed", None: "not measured here"}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -46,7 +44,7 @@ MARKERS = "os^DvPX"
 """Of series, in turn: no difference is shown by colour alone."""
 
 _FOLDED_ROWS = 24
-_PANEL_IN = {1: (8.0, 4.6), 2: (4.6, 3.8), 3: (3.6, 3.3)}
+_PANEL_IN = {1: (8.0, 4.8), 2: (4.6, 4.0), 3: (3.6, 3.6)}
 """Width and height of a panel by the number of panels in a row [inch]."""
 _LOOK: dict[str, Any] = {
     "axes.axisbelow": True,
@@ -56,9 +54,11 @@ _LOOK: dict[str, Any] = {
     "axes.titlesize": 10,
     "font.size": 9,
     "grid.alpha": 0.25,
-    "legend.fontsize": 8,
+    "legend.fontsize": 7,
+    "legend.framealpha": 0.6,
     "lines.markersize": 5,
 }
+_LINES = {"line": "-", "dashed": "--", "points": "none", "law": "-"}
 
 
 def print_chapter(chapter: Chapter, console: Console) -> None:
@@ -139,95 +139,43 @@ def html_page(chapters: Sequence[Chapter], pictures: Mapping[str, str]) -> str:
 
 
 def draw_plot(plot: Plot) -> bytes:
-    """Return a plot as PNG. One legend below all panels names each series once."""
+    """Return a plot as PNG."""
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(plot.columns, len(plot.panels))
     rows = math.ceil(len(plot.panels) / columns)
-    labels = list(dict.fromkeys(s.label for p in plot.panels for s in p.series))
-    alone = len(labels) > len(COLOURS)  # then each panel has colours and a legend of its own
     width, height = _PANEL_IN[min(columns, 3)]
     with matplotlib.rc_context(cast(Any, {**matplotlib.rcParamsDefault, **_LOOK})):
-        legend_in = 0.22 * math.ceil(len(labels) / (2 * columns)) + 0.4
-        figure = Figure(figsize=(width * columns, height * rows + legend_in), dpi=130, layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = Figure(figsize=(width * columns, height * rows + 0.3), dpi=130, layout="constrained")
         figure.suptitle(plot.title, x=0.01, ha="left", fontsize=11)
-        places = figure.subplots(
-            rows, columns, squeeze=False, sharex=plot.shared_axes, sharey=plot.shared_axes
-        ).ravel()
+        share = plot.shared_axes
+        places = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share).ravel()
         for axes, panel in zip(places, plot.panels, strict=False):
-            own = list(dict.fromkeys(series.label for series in panel.series if series.style != "law"))
-            _draw_panel(axes, panel, own if alone else labels)
-            if alone:
-                axes.legend()
-            if plot.shared_axes:
-                axes.tick_params(labelbottom=True, labelleft=True)
+            _draw_panel(axes, panel)
+            axes.tick_params(labelbottom=True, labelleft=True)  # of shared axes, too
         for axes in places[len(plot.panels) :]:
             axes.axis("off")
-        if not alone:
-            _draw_legend(figure, list(places), columns)
         data = io.BytesIO()
         figure.savefig(data, format="png")
     return data.getvalue()
 
 
-def _draw_panel(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    number = -1
     for series in panel.series:
-        number = labels.index(series.colour_of or series.label)
-        look: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)], "label": series.label}
-        x, y = _finite(series.x), _finite(series.y)
-        line = {"line": "-", "dashed": "--", "points": "none", "law": "-"}[series.style]
-        if series.style == "law":
-            look |= {"label": "_", "linewidth": 1.0}
-        marker = "" if series.style == "law" else MARKERS[number % len(MARKERS)]
-        axes.plot(x, y, linestyle=line, marker=marker, **look)
-        _name_points(axes, series, x, y)
-    for draw, lines in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
-        for label, place in lines.items():
-            draw(place, color="0.45", linestyle=":", linewidth=1.2, label=label)
+        law = series.style == "law"
+        number += not law
+        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+        look: dict[str, Any] = {"color": colour, "linestyle": _LINES[series.style]}
+        look |= {"linewidth": 1.0} if law else {"label": series.label, "marker": marker}
+        x, y = (np.array([math.nan if v is None else v for v in values]) for values in (series.x, series.y))
+        axes.plot(x, y, **look)
+    for draw, marks in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
+        for label, at in marks.items():
+            draw(at, color="0.45", linestyle=":", linewidth=1.2, label=label)
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
-    axes.set(xscale=panel.x_scale, yscale=panel.y_scale)
-    if panel.x_ticks is not None:
-        axes.set_xticks(list(panel.x_ticks.values()), list(panel.x_ticks), minor=False)
-        axes.minorticks_off()
-    if panel.y_ticks is not None:
-        axes.set_yticks(list(panel.y_ticks.values()), list(panel.y_ticks))
-    for axis, ticks in ((axes.xaxis, panel.x_ticks), (axes.yaxis, panel.y_ticks)):
-        if axis.get_scale() == "log" and ticks is None:
-            _plain_ticks(axis)
-    axes.set_ylim(panel.y_min, panel.y_max)
-
-
-def _plain_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis of one or two decades at 1, 2 and 5, and one of more at decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    low, high = sorted(axis.get_view_interval())
-    if low > 0.0 and high < 100.0 * low:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def _name_points(axes: Axes, series: Series, x: Sequence[float], y: Sequence[float]) -> None:
-    for name, place in zip(series.names, zip(x, y, strict=True), strict=False):
-        axes.annotate(name, place, (4, 4), textcoords="offset points", fontsize=7)
-
-
-def _finite(values: Sequence[float | None]) -> list[float]:
-    return [math.nan if value is None or not math.isfinite(value) else float(value) for value in values]
-
-
-def _draw_legend(figure: Figure, places: Sequence[Axes], columns: int) -> None:
-    entries = {
-        label: handle
-        for axes in places
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-        if not label.startswith("_")
-    }
-    if entries:
-        figure.legend(
-            entries.values(), entries.keys(), loc="outside lower center", ncols=2 * columns, frameon=False
-        )
+    axes.set(xscale="log" if "x" in panel.log else axes.get_xscale())
+    axes.set(yscale="log" if "y" in panel.log else "linear", ylim=(panel.y_min, panel.y_max))
+    if len(axes.get_legend_handles_labels()[1]) > 1:
+        axes.legend()

@@ -20,9 +20,8 @@ from pydantic import TypeAdapter
 
 Row: TypeAlias = dict[str, Any]
 """Values of a table by heading, which says the unit."""
-Numbers: TypeAlias = Sequence[float | None]
-"""None stands for a value that is unknown or not finite."""
-Scale = Literal["linear", "log"]
+Values: TypeAlias = Sequence[float | str | None]
+"""Numbers or names of categories; None stands for a value that is unknown or not finite."""
 Style = Literal["line", "dashed", "points", "law"]
 
 _NAME = re.compile(r"[a-z0-9]([a-z0-9_-]*[a-z0-9])?")
@@ -51,17 +50,13 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """One line of a panel; series of one label share colour and marker in all panels of a plot."""
+    """One line of a panel."""
 
     label: str
-    x: Numbers
-    y: Numbers
+    x: Values
+    y: Values
     style: Style = "line"
-    """`law`: a thin line without marks, which the legend does not name."""
-    colour_of: str = ""
-    """Label of the series whose colour this one shares; empty: its own."""
-    names: Sequence[str] = ()
-    """Text beside each point; empty: none."""
+    """`law`: a thin line in the colour of the series before it, which the legend does not name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +67,8 @@ class Panel:
     x_label: str = ""
     y_label: str = ""
     series: Sequence[Series] = ()
-    x_scale: Scale = "linear"
-    y_scale: Scale = "linear"
-    x_ticks: Mapping[str, float] | None = None
-    """Text -> place, where numbers would say little; None: as the library chooses."""
-    y_ticks: Mapping[str, float] | None = None
+    log: Literal["", "x", "y", "xy"] = ""
+    """Axes that are logarithmic."""
     x_lines: Mapping[str, float] = field(default_factory=dict)
     """Vertical lines: label -> x."""
     y_lines: Mapping[str, float] = field(default_factory=dict)
@@ -169,25 +161,22 @@ def table_to_csv(table: Table) -> str:
     return out.getvalue()
 
 
-def lines(
-    rows: Sequence[Mapping[str, Any]], x: str, y: str, *, by: str, style: Style = "line", y_floor: float = 0.0
-) -> list[Series]:
-    """Return a line through the rows of each value of a column.
+def panel(rows: Sequence[Mapping[str, Any]], x: str, y: str, *, by: str, **more: Any) -> Panel:
+    """Return a panel with a line through the rows of each value of a column.
 
     Args:
         rows: Of a table.
         x: Heading of what stands on the horizontal axis.
         y: Heading of what stands on the vertical axis; what is no number leaves a gap.
         by: Heading of the column whose values name the lines.
-        style: Of all lines.
-        y_floor: Smaller values are drawn there, as a logarithmic axis has no zero.
+        more: Fields of `Panel`; `series` are added to those of the rows.
     """
     found = []
     for name in dict.fromkeys(row[by] for row in rows):
-        mine = [row for row in rows if row[by] == name and isinstance(row.get(x), float | int)]
-        ys = [max(v, y_floor) if isinstance(v := row.get(y), float | int) else None for row in mine]
-        found.append(Series(label=str(name), x=[row[x] for row in mine], y=ys, style=style))
-    return found
+        mine = [row for row in rows if row[by] == name and row.get(x) is not None]
+        ys = [value if isinstance(value := row.get(y), float | int) else None for row in mine]
+        found.append(Series(label=str(name), x=[row[x] for row in mine], y=ys))
+    return Panel(**{"x_label": x, "y_label": y, **more, "series": [*found, *more.get("series", ())]})
 
 
 def cell(value: object) -> str:

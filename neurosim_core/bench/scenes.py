@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.bench.engine import Ambient, Material, Scene, Texture
+from neurosim_core.scene.solids import box
 
 _EVEN = Ambient(up=(1.0, 1.0, 1.0), down=(1.0, 1.0, 1.0))
-_BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+_COLOURS = {
+    "wall": (0.75, 0.73, 0.7),
+    "slat": (0.2, 0.2, 0.22),
+    "bar": (0.05, 0.05, 0.05),
+    "leaf": (0.1, 0.3, 0.08),
+}
 
 
 def checkerboard_floor(check_m: float, *, half_m: float = 40.0) -> Scene:
@@ -36,38 +41,25 @@ def thin_structures(*, seed: int = 0) -> Scene:
     pixel is 11 mm wide.
     """
     rng = np.random.default_rng(seed)
-    boxes = [((0.0, 0.0, 0.0), (8.0, 8.0, 3.0), 0.0, 0)]  # centre, size, turn about z, material
+    boxes = [(box((8.0, 8.0, 3.0)), 0)]  # and material
     for side, angle in enumerate(np.arange(4) * np.pi / 2):
         along, ahead = np.array([-np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
         if side % 2 == 0:  # blinds
-            boxes += [((*(3.0 * ahead), z), (0.02, 2.5, 0.025), angle, 1) for z in np.arange(-1.2, 1.2, 0.05)]
+            slat = box((0.02, 2.5, 0.025))
+            places = [(*(3.0 * ahead), z) for z in np.arange(-1.2, 1.2, 0.05)]
         else:  # railings
-            places = [2.0 * ahead + shift * along for shift in np.arange(-2.0, 2.0, 0.1)]
-            boxes += [((*place, -0.5), (0.012, 0.012, 1.6), angle, 2) for place in places]
-    triangles = [_box(np.array(centre), np.array(size), turn) for centre, size, turn, _ in boxes]
-    materials = [np.full(12, material) for *_, material in boxes]
-    for angle in (np.pi / 4, 3 * np.pi / 4, 5 * np.pi / 4, 7 * np.pi / 4):  # plants
+            slat = box((0.012, 0.012, 1.6))
+            places = [(*(2.0 * ahead + shift * along), -0.5) for shift in np.arange(-2.0, 2.0, 0.1)]
+        boxes += [(slat.moved(place, yaw_rad=float(angle)), 1 + side % 2) for place in places]
+    triangles = [part.vertices[part.faces] for part, _ in boxes]
+    materials = [np.full(len(part.faces), material) for part, material in boxes]
+    for angle in np.pi / 4 * np.array([1, 3, 5, 7]):  # plants
         base = np.array([1.5 * np.cos(angle), 1.5 * np.sin(angle), -0.3])
         tips = base + rng.normal(0.0, 0.25, (150, 1, 3))
-        triangles.append(tips + rng.normal(0.0, 1.0, (150, 3, 3)) * np.array([0.02, 0.02, 0.02]))
+        triangles.append(tips + rng.normal(0.0, 0.02, (150, 3, 3)))
         materials.append(np.full(150, 3))
-    colours = {
-        "wall": (0.75, 0.73, 0.7),
-        "slat": (0.2, 0.2, 0.22),
-        "bar": (0.05, 0.05, 0.05),
-        "leaf": (0.1, 0.3, 0.08),
-    }
-    painted = [Material(name=name, base_color=colour) for name, colour in colours.items()]
+    painted = [Material(name=name, base_color=colour) for name, colour in _COLOURS.items()]
     return _scene("thin structures", np.concatenate(triangles), np.concatenate(materials), painted)
-
-
-def _box(centre: NDArray[np.float64], size: NDArray[np.float64], turn_rad: float) -> NDArray[np.float64]:
-    """Return the triangles of a box that is turned about z, shape [12, 3, 3]."""
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
-    corners = (_BOX * size) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + centre
-    return np.array(
-        [corners[[a, b, c]] for q in _BOX_QUADS for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
-    )
 
 
 def _scene(

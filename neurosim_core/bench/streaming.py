@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.bench.engine import ProbeError, StreamProbe, load_config, scene_settings, set_options
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table
@@ -24,13 +24,6 @@ _SAMPLING_RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 25.0, 20.0, 10.0
 _IMU, _CAMERA, _IMU_RATE_HZ = "imu", "events", 1000.0
 _GROWTH_MAX_MIB = 4.0
 _SETTLED_S = 10.0
-_NAMES = {
-    f"sensors.{_CAMERA}.lens.width": "--width",
-    f"sensors.{_CAMERA}.lens.height": "--height",
-    "device": "--device",
-    f"sensors.{_CAMERA}.sampling_rate_hz": "--sampling-rate",
-}
-"""What the command line calls settings, for error messages."""
 
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
@@ -55,15 +48,17 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             _CAMERA: {"kind": "event_camera", "lens": lens, "sampling_rate_hz": rate_hz},
         },
         "live": {"mode": "streaming", "real_time_factor": 1.0},
-        **scene_settings(options.scene),
+        **engine.scene_settings(options.scene),
     }
-    config = load_config(base, overrides=options.settings, options=_NAMES | set_options(options.settings))
+    names = engine.option_names(_CAMERA, sampling_rate_hz="--sampling-rate")
+    names |= engine.set_options(options.settings)
+    config = engine.load_config(base, overrides=options.settings, options=names)
     progress(f"streaming for {seconds:g} s, {rate_hz:g} renders a second")
     vehicle = next(iter(config.vehicles))
     with (
         own_runtime() as folder,
         NeurosimProcess("serve", config, log=folder / "serve.log") as simulator,
-        StreamProbe(vehicle=vehicle, imu=_IMU, camera=_CAMERA) as probe,
+        engine.StreamProbe(vehicle=vehicle, imu=_IMU, camera=_CAMERA) as probe,
         NeurosimProcess("fly", config, log=folder / "fly.log") as controller,
     ):
         processes = (simulator, controller)
@@ -76,8 +71,8 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             trace = probe.listen(
                 seconds, resident=lambda: [p.resident_bytes() for p in processes], check=check
             )
-        except ProbeError as error:
-            raise ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
+        except engine.ProbeError as error:
+            raise engine.ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
     return summarise(trace, rate_hz, f"{view.width}x{view.height}")
 
 
@@ -87,7 +82,7 @@ def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
     late_ms = late_ms - np.median(late_ms)  # against a clock that is set so that half of the samples are late
     jitter_ms = np.abs(late_ms)
     elapsed_s = 1e-9 * float(np.ptp(trace.imu_received_ns))
-    settled = int(np.searchsorted(trace.resident_s, min(_SETTLED_S, 0.5 * float(trace.resident_s[-1]))))
+    settled = int(np.searchsorted(trace.resident_s, min(_SETTLED_S, 0.5 * trace.resident_s[-1])))
     grown_mib = (trace.resident_bytes[-1] - trace.resident_bytes[settled]) / 2**20
     status = trace.status
     left_out = sum(sensor.dropped_count for sensor in status.sensors if sensor.name == _CAMERA)
@@ -110,35 +105,23 @@ def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
     }
     since_s = 1e-9 * (trace.imu_received_ns - trace.imu_received_ns[0])
     some = slice(None, None, max(1, len(late_ms) // 5000))
-    above = np.sort(jitter_ms)[::-1][some]
     period_ms, late = 1e3 / _IMU_RATE_HZ, figures["jitter, 99 % [ms]"]
-    shares = np.arange(1, len(jitter_ms) + 1)[some] / len(jitter_ms)
-    memory = zip(("simulator", "controller"), trace.resident_bytes.T / 2**20, strict=True)
+    above, shares = np.sort(jitter_ms)[::-1][some], np.arange(1, len(jitter_ms) + 1)[some] / len(jitter_ms)
+
+    def drawn(title: str, x_label: str, y_label: str, lines: dict[str, Any], **more: Any) -> Panel:
+        series = [Series(label=name, x=x.tolist(), y=y.tolist()) for name, (x, y) in lines.items()]
+        return Panel(title=title, x_label=x_label, y_label=y_label, series=series, **more)
+
+    memory = {"simulator": 0, "controller": 1}
+    wall, period = "wall-clock time [s]", {"period of the IMU": period_ms}
     panels = [
-        Panel(
-            title="each sample",
-            x_label="wall-clock time [s]",
-            y_label="lateness [ms]",
-            series=[
-                Series(label="lateness", x=since_s[some].tolist(), y=late_ms[some].tolist(), style="points")
-            ],
-        ),
-        Panel(
-            title="jitter",
-            x_label="jitter [ms]",
-            y_label="share above",
-            series=[Series(label="jitter", x=above.tolist(), y=shares.tolist())],
-            x_scale="log",
-            y_scale="log",
-            x_lines={"period of the IMU": period_ms},
-        ),
-        Panel(
-            title="memory",
-            x_label="wall-clock time [s]",
-            y_label="resident [MiB]",
-            series=[
-                Series(label=name, x=trace.resident_s.tolist(), y=values.tolist()) for name, values in memory
-            ],
+        drawn("each sample", wall, "lateness [ms]", {"lateness": (since_s[some], late_ms[some])}),
+        drawn("jitter", "jitter [ms]", "share above", {"jitter": (above, shares)}, log="xy", x_lines=period),
+        drawn(
+            "memory",
+            wall,
+            "resident [MiB]",
+            {name: (trace.resident_s, trace.resident_bytes[:, k] / 2**20) for name, k in memory.items()},
             y_min=0.0,
         ),
     ]

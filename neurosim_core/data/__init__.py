@@ -2,50 +2,28 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from neurosim_core.data.batch import Batch, EventBatch, Sample, collate
-    from neurosim_core.data.live import LiveSource
-    from neurosim_core.data.ray_source import RaySource
-    from neurosim_core.data.shards import write_shards
-    from neurosim_core.data.stream import Dataset, Stream
-    from neurosim_core.data.tonic import TonicDataset
-    from neurosim_core.data.torch_loader import Loader, as_tensors
+from neurosim_core.lazy import lazy_names
 
-_HOME = {
-    "Batch": "batch",
-    "Dataset": "stream",
-    "EventBatch": "batch",
-    "LiveSource": "live",
-    "Loader": "torch_loader",
-    "RaySource": "ray_source",
-    "Sample": "batch",
-    "Stream": "stream",
-    "TonicDataset": "tonic",
-    "as_tensors": "torch_loader",
-    "collate": "batch",
-    "write_shards": "shards",
-}
+if TYPE_CHECKING:  # isort: off
+    from neurosim_core.data.batch import (
+        Batch as Batch,
+        EventBatch as EventBatch,
+        Sample as Sample,
+        collate as collate,
+    )
+    from neurosim_core.data.live import LiveSource as LiveSource
+    from neurosim_core.data.ray_source import RaySource as RaySource
+    from neurosim_core.data.shards import write_shards as write_shards
+    from neurosim_core.data.stream import (
+        Dataset as Dataset,
+        Stream as Stream,
+    )
+    from neurosim_core.data.tonic import TonicDataset as TonicDataset
+    from neurosim_core.data.torch_loader import (
+        Loader as Loader,
+        as_tensors as as_tensors,
+    )
 
-__all__ = [
-    "Batch",
-    "Dataset",
-    "EventBatch",
-    "LiveSource",
-    "Loader",
-    "RaySource",
-    "Sample",
-    "Stream",
-    "TonicDataset",
-    "as_tensors",
-    "collate",
-    "write_shards",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'neurosim_core.data' has no attribute {name!r}, known: {__all__}")
-    return getattr(importlib.import_module(f"neurosim_core.data.{_HOME[name]}"), name)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurosim_core.data.batch import FIELDS, Sample
 from neurosim_core.data.windows import AT_STAMP, ENCODINGS, WindowConfig, choose_sensors
 from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
+from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import DSEC_NAMES, FORMAT, import_h5py
 
 _BATCH_WINDOWS_MAX = 64
@@ -127,7 +128,7 @@ class RecordedFlight:
         if low >= high:
             return [NO_EVENTS] * len(starts_us)
         names = (DSEC_NAMES[name] for name in EventArrays._fields)
-        events = EventArrays(*(group[name][low:high] for name in names))
+        events = EventArrays(*(read_rows(group[name], low, high) for name in names))
         begin, end = (np.searchsorted(events.t, us, side="right") for us in (starts_us, ends_us))
         return [events.rows(slice(a, b)) for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
 

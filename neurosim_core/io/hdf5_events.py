@@ -22,9 +22,11 @@ from neurosim_core.io.event_file import (
     PACKET_US,
     EventFileError,
     PacketCutter,
+    events_of,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
 
@@ -112,15 +114,10 @@ class Hdf5Source:
         for begin in range(0, self._count, BLOCK_EVENTS):
             end = min(begin + BLOCK_EVENTS, self._count)
             with damage_of(self._path):
-                t, x, y, p = (column[begin:end] for column in self._columns)
+                t, x, y, p = (read_rows(column, begin, end) for column in self._columns)
             if len(t) != end - begin:
                 raise EventFileError(f"{self._path}: fewer events than its index says")
-            yield EventArrays(
-                t.astype(np.int64) + self._offset_us,
-                x.astype(np.uint16),
-                y.astype(np.uint16),
-                p.astype(np.uint8),
-            )
+            yield events_of(t + np.int64(self._offset_us), x, y, p)
 
 
 class RecordingSink:

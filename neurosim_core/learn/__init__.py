@@ -9,33 +9,27 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from neurosim_core.install import install_hint
+from neurosim_core.lazy import lazy_names
 
-if TYPE_CHECKING:
-    from neurosim_core.learn.env import Env, make_env
-    from neurosim_core.learn.episodes import Randomisation, StartConfig
-    from neurosim_core.learn.surfaces import Counts, LeakySurface, TimeSurface, VoxelGrid
-    from neurosim_core.learn.task import Task, View
-
-_HOMES = {
-    "neurosim_core.learn.env": ("Env", "make_env"),
-    "neurosim_core.learn.episodes": ("Randomisation", "StartConfig"),
-    "neurosim_core.learn.surfaces": ("Counts", "LeakySurface", "TimeSurface", "VoxelGrid"),
-    "neurosim_core.learn.task": ("Task", "View"),
-}
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
-
-__all__ = [
-    "Counts",
-    "Env",
-    "LeakySurface",
-    "Randomisation",
-    "StartConfig",
-    "Task",
-    "TimeSurface",
-    "View",
-    "VoxelGrid",
-    "make_env",
-]
+if TYPE_CHECKING:  # isort: off
+    from neurosim_core.learn.env import (
+        Env as Env,
+        make_env as make_env,
+    )
+    from neurosim_core.learn.episodes import (
+        Randomisation as Randomisation,
+        StartConfig as StartConfig,
+    )
+    from neurosim_core.learn.surfaces import (
+        Counts as Counts,
+        LeakySurface as LeakySurface,
+        TimeSurface as TimeSurface,
+        VoxelGrid as VoxelGrid,
+    )
+    from neurosim_core.learn.task import (
+        Task as Task,
+        View as View,
+    )
 
 
 def need(*modules: str) -> Any:
@@ -51,8 +45,4 @@ def need(*modules: str) -> Any:
         raise ImportError(f"{error}: learning needs {', '.join(modules)}; {install_hint('learn')}") from None
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}, known: {', '.join(__all__)}")
-    need("torch")
-    return getattr(importlib.import_module(_HOME[name]), name)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__, lambda: need("torch"))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.packets import EventArrays, Events, GenericPacket, Packet, PacketSchema, packet_class
+from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import (
     DSEC_NAMES,
     FORMAT,
@@ -154,7 +155,7 @@ class Recording:
 
         low = first_at(max(start_us // 1000, 0))
         high = first_at(max(end_us // 1000 + 1, 0))
-        columns = [stream.group[DSEC_NAMES[name]][low:high] for name in EventArrays._fields]
+        columns = [read_rows(stream.group[DSEC_NAMES[name]], low, high) for name in EventArrays._fields]
         begin, end = np.searchsorted(columns[0], [start_us, end_us])
         return EventArrays(*(values[begin : max(begin, end)] for values in columns))
 

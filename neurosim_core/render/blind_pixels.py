@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.launch import launch_split
@@ -82,19 +81,17 @@ class BlindPixels:
             dark_floor: Radiance before the logarithm where there is no light.
             device: Where pictures are.
         """
-        found: list[NDArray[Any]] = []
-        for lens in lenses:
-            mask = lens.blind_pixels()
-            found.append(np.zeros((0, 2), int) if mask is None else np.argwhere(mask))
+        masks = [lens.blind_pixels() for lens in lenses]
+        found = [np.zeros((0, 2), int) if mask is None else np.argwhere(mask) for mask in masks]
         self.count = max(map(len, found))
         """The most of one lens."""
         rows = np.full((len(found), self.count, 2), -1, dtype=np.int32)
         for row, pixels in zip(rows, found, strict=True):
             row[: len(pixels)] = pixels
-        self._device, self._stride, self._log_dark = device, stride, float(np.log(dark_floor))
-        self._world_count = len(lens_of_world)
-        self._pixels: Any = wp.array(rows, dtype=wp.vec2i, device=device)
+        self._device = device
         self._lens_of_world: Any = wp.array(list(lens_of_world), dtype=int, device=device)
+        places: Any = wp.array(rows, dtype=wp.vec2i, device=device)
+        self._model = [places, self._lens_of_world, stride, float(np.log(dark_floor))]
 
     def darken(self, image_slot: Any, out: RenderOutputs, *, instant_count: int) -> None:
         """Write what a pixel is that sees nothing: black, infinitely far, no surface.
@@ -105,17 +102,6 @@ class BlindPixels:
             instant_count: How many of the K instants of each world.
         """
         if self.count:
-            launch_split(
-                _darken_pixels,
-                dim=self._world_count * instant_count * self.count,
-                inputs=[
-                    self._pixels,
-                    self._lens_of_world,
-                    self._stride,
-                    self._log_dark,
-                    instant_count,
-                    image_slot,
-                ],
-                outputs=[out],
-                device=self._device,
-            )
+            dim = self._lens_of_world.shape[0] * instant_count * self.count
+            inputs = [*self._model, instant_count, image_slot]
+            launch_split(_darken_pixels, dim=dim, inputs=inputs, outputs=[out], device=self._device)

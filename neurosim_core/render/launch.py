@@ -7,7 +7,7 @@ runs slices of one launch. The first parameter of such a kernel is the index of 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
@@ -36,6 +36,13 @@ def limit_cores(count: int) -> None:
 def _pool(thread_count: int) -> ThreadPoolExecutor:
     """Return the threads that share a launch."""
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
+
+
+def kernel_variant(name: str, *terms: str) -> Callable[[Callable[..., Any]], Any]:
+    """Return the decorator of a kernel with a module of its own: `name`, and what is compiled in."""
+    module = wp.get_module(f"{name}." + ("_".join(terms).replace(" ", "_") or "exact"))
+    decorator: Callable[[Callable[..., Any]], Any] = wp.kernel(module=module, enable_backward=False)
+    return decorator
 
 
 def launch_split(

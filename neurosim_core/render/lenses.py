@@ -46,6 +46,11 @@ class _Lens(Settings):
     distortion_model: ClassVar[str]
     """Name of the model in sensor_msgs/CameraInfo, which has none for double spheres and tables."""
 
+    @property
+    def distortion_coefficients(self) -> tuple[float, ...]:
+        """Parameters of the model, in the order of sensor_msgs/CameraInfo."""
+        return getattr(self, "distortion", ())
+
     def rays(self, u: Vectors, v: Vectors) -> Vectors:
         """Return the unit rays of points of the picture [px], shape [..., 3]; nan where there is none."""
         raise NotImplementedError
@@ -91,11 +96,6 @@ class _ModelLens(_Lens):
     """Column of the optical axis [px]; the centre of the first pixel is at 0.5."""
     cy: float
     """Row of the optical axis [px]; the centre of the first pixel is at 0.5."""
-
-    @property
-    def distortion_coefficients(self) -> tuple[float, ...]:
-        """Parameters of the model, in the order of sensor_msgs/CameraInfo."""
-        raise NotImplementedError
 
     def intrinsics(self) -> Intrinsics:
         """Return fx, fy, cx, cy [px]."""
@@ -212,22 +212,12 @@ class RationalConfig(_PolynomialLens):
     distortion: Annotated[tuple[float, ...], Field(min_length=8, max_length=8)]
     """Coefficients k1, k2, p1, p2, k3, k4, k5, k6."""
 
-    @property
-    def distortion_coefficients(self) -> tuple[float, ...]:
-        """Return k1, k2, p1, p2, k3, k4, k5, k6."""
-        return self.distortion
-
 
 class _WideLens(_ModelLens):
     """A lens that may see more than a half-space."""
 
     angle_max_rad: float = Field(default=math.pi, gt=0.0, le=math.pi)
     """Angle from the optical axis beyond which nothing is seen: the border of the image circle [rad]."""
-
-    def _within(self, rays: Vectors) -> Vectors:
-        """Return unit rays, nan beyond the image circle."""
-        angle = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
-        return np.where((angle <= self.angle_max_rad)[..., None], rays, np.nan)
 
 
 class EquidistantConfig(_WideLens):
@@ -240,11 +230,6 @@ class EquidistantConfig(_WideLens):
     distortion_model: ClassVar[str] = "equidistant"
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """Coefficients k1, k2, k3, k4; zeros are the ideal equidistant projection."""
-
-    @property
-    def distortion_coefficients(self) -> tuple[float, ...]:
-        """Return k1, k2, k3, k4."""
-        return self.distortion
 
     def _radius(self, angle: Vectors) -> tuple[Vectors, Vectors]:
         """Return r_d and its derivative."""
@@ -305,7 +290,8 @@ class DoubleSphereConfig(_WideLens):
             mz = (1.0 - alpha * alpha * r2) / (alpha * np.sqrt(1.0 - (2.0 * alpha - 1.0) * r2) + 1.0 - alpha)
             scale = (mz * xi + np.sqrt(mz * mz + (1.0 - xi * xi) * r2)) / (mz * mz + r2)
         rays = np.stack([scale * x, scale * y, scale * mz - xi], axis=-1)
-        return self._within(rays)
+        angle = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+        return np.where((angle <= self.angle_max_rad)[..., None], rays, np.nan)
 
 
 class RayTableConfig(_Lens):
@@ -326,11 +312,6 @@ class RayTableConfig(_Lens):
     def directions(self) -> Vectors:
         """Return the unit rays of the file, nan where there is none, shape [H, W, 3]."""
         return _read_rays(self.file, self.width, self.height)
-
-    @property
-    def distortion_coefficients(self) -> tuple[float, ...]:
-        """There are none."""
-        return ()
 
     def intrinsics(self) -> Intrinsics:
         """Return the pinhole that is like the lens around the centre of the picture."""

@@ -15,17 +15,21 @@ view: `bake_light` computes it once, with shadows and ambient occlusion, and a r
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.config import LightingConfig
-from neurosim_core.render.embree import EmbreeTree, embree_distance
+from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_width
 from neurosim_core.render.launch import launch_split
+from neurosim_core.render.light_cache import cached_arrays
 from neurosim_core.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
@@ -35,6 +39,8 @@ log = logging.getLogger(__name__)
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BURIED = 0.1  # occluders at 5 % of the ambient radius all around
 _OFFSET_M = wp.constant(1.0e-3)
+_KEPT_FACES_MIN = 10_000
+"""Scenes of fewer triangles are lit as fast as their light is read."""
 
 
 @wp.func
@@ -408,6 +414,7 @@ def bake_light(
     give back `interreflection`, and so on: open / (1 - interreflection (1 - open)). Emitting faces cast no
     shadow, so a light may sit inside its lamp. Buried points take the light of their neighbours. Directions
     are fixed: the same scene gives the same light. Rays stop early where a well spread part of them agrees.
+    The light of a large scene is kept on disk (`light_cache`).
 
     Args:
         scene: Materials, lights and the triangles that cast shadows.
@@ -419,8 +426,38 @@ def bake_light(
     Returns:
         Linear light, shape [2, F, 3, 3]: front and back, face, corner, RGB.
     """
-    normals = corner_normals(mesh)
-    group, example = _group_corners(mesh, normals)
+
+    def compute() -> dict[str, NDArray[Any]]:
+        normals = corner_normals(mesh)
+        group, example = _group_corners(mesh, normals)
+        light, openness = _light_groups(scene, mesh, config, normals, group, example, device, embree)
+        _unbury(light, openness, group.reshape(-1, 3))
+        return {"light": light, "group": group.astype(np.int32)}
+
+    caster = wp.get_device(device).name, embree and packet_width()
+    inputs = scene.vertices, _shading_faces(scene), mesh.vertices, mesh.faces, mesh.normals
+    rest = scene.lights, scene.ambient, config, caster, wp.__version__, _source()
+    found = cached_arrays((*inputs, *rest), compute) if len(mesh.faces) >= _KEPT_FACES_MIN else compute()
+    per_corner = found["light"][found["group"]]
+    return np.ascontiguousarray(np.moveaxis(per_corner, 1, 0)).reshape(2, -1, 3, 3)
+
+
+@functools.cache
+def _source() -> bytes:
+    return Path(__file__).read_bytes()
+
+
+def _light_groups(
+    scene: Scene,
+    mesh: RefinedMesh,
+    config: LightingConfig,
+    normals: NDArray[np.float32],
+    group: NDArray[np.int64],
+    example: NDArray[np.int64],
+    device: str,
+    embree: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return light, shape [G, 2, 3], and openness, [G, 2], of each group of corners on both sides."""
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
     tree = EmbreeTree(scene.vertices, _shading_faces(scene)) if embree else None
@@ -453,6 +490,4 @@ def bake_light(
         outputs=[light, openness],
         device=device,
     )
-    per_group = light.numpy().reshape(-1, 2, 3)
-    _unbury(per_group, openness.numpy().reshape(-1, 2), group.reshape(-1, 3))
-    return np.ascontiguousarray(np.moveaxis(per_group[group], 1, 0)).reshape(2, -1, 3, 3)
+    return light.numpy().reshape(-1, 2, 3), openness.numpy().reshape(-1, 2)

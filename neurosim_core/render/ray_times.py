@@ -1,7 +1,7 @@
 """When rays are cast: rolling shutters, exposures and scanners are rays with times of their own.
 
 A picture has a few instants, offsets from its stamp, and each of its rays belongs to one of them. The poses
-of the camera and of bodies at these instants come from the history of the flight (`sim.ray_poses`); a kernel
+of the camera and of bodies at these instants come from the history of the flight (`sim.trace`); a kernel
 looks up which one a ray has. Offsets are never positive: a stamp is when the last ray is cast, so that a
 controller that has the picture sees nothing of the future.
 """

@@ -12,9 +12,9 @@ class RenderTerms(NamedTuple):
     """The terms of a kernel."""
 
     textured: bool
-    """Some material has a texture."""
+    """Some material has a texture; always on a CPU, where to look takes less than to compile both."""
     emissive: bool
-    """Some material emits light; always on a CPU, where to add nothing takes less than to compile both."""
+    """Some material emits light; always on a CPU, likewise."""
     baked: bool
     """Light is baked: interpolated between corners instead of evaluated for each pixel."""
     supersampled: bool

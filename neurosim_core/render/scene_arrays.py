@@ -160,17 +160,17 @@ def _terms_of(
     bodies: bool,
 ) -> RenderTerms:
     """Return what a scene of these materials and its settings need of the ray caster."""
-    textured = bool((packed.material_texture[:, 1] > 0).any())
+    textured, on_cpu = len(packed.levels) > 0, wp.get_device(device).is_cpu
     return RenderTerms(
-        textured=textured,
-        emissive=wp.get_device(device).is_cpu or any(max(m.emission) > 0.0 for m in materials),
+        textured=on_cpu or textured,
+        emissive=on_cpu or any(max(m.emission) > 0.0 for m in materials),
         baked=config.lighting.mode == "baked",
         supersampled=config.samples_per_pixel not in (1, "adaptive"),
         embree=embree,
         finest_level=textured and config.texture_filter != "trilinear",
         nearest_texel=textured and config.texture_filter == "nearest",
         bodies=bodies,
-        by_tile=wp.get_device(device).is_cpu,
+        by_tile=on_cpu,
     )
 
 
@@ -192,12 +192,13 @@ def _upload_surfaces(
     data.base_color = wp.array(_rows([m.base_color for m in materials]), dtype=wp.vec3, device=device)
     data.emission = wp.array(_rows([m.emission for m in materials]), dtype=wp.vec3, device=device)
     if terms.textured:
+        data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
+    if len(packed.levels):
         surfaces = ((mesh, material), (joined.mesh, joined.material))
         density = np.concatenate([_texel_density(m, owner, packed) for m, owner in surfaces])
         uv = np.concatenate([m.uv[m.faces].reshape(-1, 2) for m, _ in surfaces])
         data.face_lod = wp.array(density, dtype=float, device=device)
         data.corner_uv = wp.array(uv, dtype=wp.vec2, device=device)
-        data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
         data.levels = wp.array(packed.levels, dtype=wp.vec3i, device=device)
         data.texels = wp.array(packed.texels, dtype=wp.uint32, device=device)
 

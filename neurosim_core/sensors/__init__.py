@@ -2,64 +2,29 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
+from neurosim_core.lazy import lazy_names
+
+if TYPE_CHECKING:  # isort: off
     from neurosim_core.sensors.base import (
-        FrameSensorConfig,
-        ImageSensorConfig,
-        RateHz,
-        Sampler,
-        SamplerContext,
-        StateSensorConfig,
+        FrameSensorConfig as FrameSensorConfig,
+        ImageSensorConfig as ImageSensorConfig,
+        RateHz as RateHz,
+        Sampler as Sampler,
+        SamplerContext as SamplerContext,
+        StateSensorConfig as StateSensorConfig,
     )
     from neurosim_core.sensors.state_sampler import (
-        ErrorConfig,
-        Errors,
-        Motion,
-        StateSampler,
-        error_adder,
-        make_errors,
+        ErrorConfig as ErrorConfig,
+        Errors as Errors,
+        LateConfig as LateConfig,
+        Motion as Motion,
+        Sampling as Sampling,
+        StateSampler as StateSampler,
+        error_adder as error_adder,
+        make_errors as make_errors,
+        make_reader as make_reader,
     )
 
-_HOMES = {
-    "neurosim_core.sensors.base": (
-        "StateSensorConfig",
-        "SamplerContext",
-        "Sampler",
-        "ImageSensorConfig",
-        "FrameSensorConfig",
-        "RateHz",
-    ),
-    "neurosim_core.sensors.state_sampler": (
-        "StateSampler",
-        "Motion",
-        "ErrorConfig",
-        "Errors",
-        "make_errors",
-        "error_adder",
-    ),
-}
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
-
-__all__ = [
-    "ErrorConfig",
-    "Errors",
-    "FrameSensorConfig",
-    "ImageSensorConfig",
-    "Motion",
-    "RateHz",
-    "Sampler",
-    "SamplerContext",
-    "StateSampler",
-    "StateSensorConfig",
-    "error_adder",
-    "make_errors",
-]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'neurosim_core.sensors' has no attribute {name!r}, known: {__all__}")
-    return getattr(importlib.import_module(_HOME[name]), name)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -5,27 +5,17 @@
 Reference: ICAO Doc 7488 (1993), Manual of the standard atmosphere, eq. (8) to (13); ISO 2533.
 """
 
-import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import warp as wp
-from numpy.typing import NDArray
 from pydantic import Field
 
 from neurosim_core.frames import Mount
 from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
 from neurosim_core.sensors.base import RateHz, SamplerContext, StateSensorConfig
-from neurosim_core.sensors.state_sampler import (
-    ErrorConfig,
-    Errors,
-    Motion,
-    StateSampler,
-    error_adder,
-    make_errors,
-)
+from neurosim_core.sensors.state_sampler import ErrorConfig, Motion, StateSampler, make_reader
 
 _EARTH_RADIUS_M = wp.constant(wp.float64(6_356_766.0))
 _LAPSE_K_M = wp.constant(wp.float64(0.0065))
@@ -61,9 +51,17 @@ class BarometerConfig(StateSensorConfig):
 
     packet_type = Pressure
 
-    def make(self, context: SamplerContext) -> "Barometer":
+    def make(self, context: SamplerContext) -> StateSampler:
         """Return the sensor at work."""
-        return Barometer(self, context)
+        model = _Model()
+        model.position, model.altitude = wp.vec3d(*self.mount.position_m), wp.float64(self.altitude_m)
+        model.sea_level, model.temperature = wp.float64(self.sea_level_pa), wp.float64(self.sea_level_k)
+        errors = {"pressure": self.errors}
+        made = make_reader(
+            context, _read_pressure, model, errors, Pressure, rate_hz=self.rate_hz, is_scalar=True
+        )
+        made.arrays = {"pressure_pa": made.arrays["pressure"]}
+        return made
 
 
 @wp.struct
@@ -72,7 +70,6 @@ class _Model:
     altitude: wp.float64
     sea_level: wp.float64
     temperature: wp.float64
-    errors: Errors
 
 
 @wp.func
@@ -85,50 +82,8 @@ def standard_pressure(altitude: wp.float64, sea_level: wp.float64, temperature: 
     return sea_level * ratio * wp.exp(-_G_OVER_R * above / (temperature - _LAPSE_K_M * _TROPOPAUSE_M))
 
 
-@functools.cache
-def make_kernel(terms: tuple[str, ...]) -> Any:
-    """Return the kernel with the given errors."""
-    add_errors = error_adder(terms)
-
-    @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.barometer." + ("_".join(terms) or "exact")),
-        enable_backward=False,
-    )
-    def measure(
-        model: _Model,
-        motion: Motion,
-        seeds: wp.array[wp.uint64],
-        active: wp.array[wp.int32],
-        sample: wp.array[wp.int64],
-        memory: wp.array2d[wp.vec3d],
-        slot: int,
-        pressure_out: wp.array2d[wp.float64],
-    ):
-        world = wp.tid()
-        if active[world] == 0:
-            return
-        p = motion.position[world] + wp.quat_rotate(motion.orientation[world], model.position)
-        pressure = standard_pressure(model.altitude + p[2], model.sea_level, model.temperature)
-        value = wp.vec3d(pressure, wp.float64(0.0), wp.float64(0.0))
-        k = sample[world]
-        value = add_errors(model.errors, seeds[world], k, value, memory, world, 0)
-        sample[world] = k + wp.int64(1)
-        pressure_out[slot, world] = value[0]
-
-    return measure
-
-
-class Barometer(StateSampler):
-    """The barometers of all worlds."""
-
-    def __init__(self, config: BarometerConfig, context: SamplerContext) -> None:
-        model, terms = _Model(), config.errors.terms()
-        model.position = wp.vec3d(*config.mount.position_m)
-        model.altitude, model.sea_level = wp.float64(config.altitude_m), wp.float64(config.sea_level_pa)
-        model.temperature = wp.float64(config.sea_level_k)
-        model.errors = make_errors(config.errors, rate_hz=config.rate_hz, name=f"{context.name}/pressure")
-        super().__init__(context, make_kernel(terms), model, outputs={"pressure_pa": wp.float64}, terms=terms)
-
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Pressure:
-        """Return one sample as a packet."""
-        return Pressure(pressure_pa=float(rows["pressure_pa"]), **header)
+@wp.func
+def _read_pressure(model: _Model, motion: Motion, world: int, output: int) -> wp.vec3d:
+    p = motion.position[world] + wp.quat_rotate(motion.orientation[world], model.position)
+    pressure = standard_pressure(model.altitude + p[2], model.sea_level, model.temperature)
+    return wp.vec3d(pressure, wp.float64(0.0), wp.float64(0.0))

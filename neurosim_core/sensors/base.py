@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -256,11 +256,12 @@ class PictureViews(NamedTuple):
     """0 where a world is not rendered, int32, shape [N]; None: all are."""
     bodies: Any
     """Where bodies are at these times, `scene.bodies.BodyPoses`; None: there are none."""
-    then: PictureViews | None = None
-    """The same at the further time that the sensor asks for (`PictureSensorConfig.pose_offset_ns`)."""
-    twist: Any = None
-    """Velocity of the camera in W [m/s] and its angular velocity in C [rad/s] at the stamps, spatial_vectord,
-    shape [N K], where the sensor asks for it (`PictureSensorConfig.needs_twist`)."""
+    look: Callable[..., None]
+    """Writes these poses at other times: of the offsets from the stamp [ns], int64, shape [J], not before
+    `RenderedConfig.look_back_ns`; `p_WC`, `q_WC`, `stamps` and `bodies` are overwritten."""
+    find_twists: Callable[[Any], None]
+    """Writes velocities of the camera in W [m/s] and angular in C [rad/s] at the stamps, to an array of
+    spatial_vectord, shape [N K]."""
 
 
 class PictureProcess(Protocol):
@@ -291,21 +292,6 @@ class PictureSensorConfig(RenderedConfig):
     def outputs(self) -> frozenset[str]:
         """All outputs that its pictures are made of."""
         return frozenset([self.output])
-
-    @property
-    def pose_offset_ns(self) -> int | None:
-        """From the stamp to a further time at which its processing needs poses [ns], <= 0; None: none."""
-        return None
-
-    @property
-    def look_back_ns(self) -> int:
-        """To that time."""
-        return -(self.pose_offset_ns or 0)
-
-    @property
-    def needs_twist(self) -> bool:
-        """Whether its processing needs the velocity of the camera."""
-        return False
 
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
@@ -351,8 +337,9 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         return self.shutter if self.shutter.window_ns else None
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet."""
-        return Image(data=picture, encoding=self.encoding, **header)
+        """Return a picture as a packet, whose class has `data` and `encoding`."""
+        packet: Packet = self.packet_type(data=picture, encoding=self.encoding, **header)  # type: ignore[call-arg]
+        return packet
 
 
 class FrameSensor(Protocol):

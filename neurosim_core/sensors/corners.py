@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-# ruff: noqa: SIM102, UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
+# ruff: noqa: UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
 """Corners of the geometry as a list: where they are in the picture, exactly, under numbers that stay.
 
 The corners are those of the meshes of the scene and of moving bodies (`scene.corners`), found once. Each is
@@ -22,13 +22,13 @@ from pydantic import Field
 
 from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
-from neurosim_core.render.launch import launch_split
-from neurosim_core.render.projection import LensData, make_lens_data, projector
+from neurosim_core.render.launch import kernel_variant
+from neurosim_core.render.projection import projector
 from neurosim_core.scene.corners import find_corners
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
-from neurosim_core.sensors.edges import EdgeLimits, EdgesProcess
-from neurosim_core.sensors.occlusion import NEAR_RATIO, Views, is_hidden_by_bodies, views_at
-from neurosim_core.sensors.optical_flow import lens_kind
+from neurosim_core.sensors.edges import EdgeLimits, make_edge_finder
+from neurosim_core.sensors.occlusion import NEAR_RATIO, Surroundings, is_hidden_by_bodies, make_surroundings
+from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 
 _COLUMNS = 6
 """Numbers of a corner: column, row, position in C, edge."""
@@ -79,14 +79,7 @@ class CornersConfig(EdgeLimits, CameraConfig, PictureSensorConfig):
 
 @wp.struct
 class _Model:
-    width: int
-    height: int
-    stride: int
-    lenses: wp.array[LensData]
-    lens_of_world: wp.array[int]
-    mesh: wp.array[wp.uint64]
-    scene_of_world: wp.array[int]
-    body_mesh: wp.array[wp.uint64]
+    around: Surroundings
     corners: wp.array2d[wp.vec3]  # of each scene, in W; then of all bodies, each in its O; nan: none
     first_of_bodies: int
     body: wp.array[int]  # of each corner from there on
@@ -96,57 +89,47 @@ class _Model:
 def _make_kernel(kind: str) -> Any:
     project = projector(kind)
 
-    @wp.kernel(module=wp.get_module("neurosim_core.sensors.corners." + kind), enable_backward=False)
+    @kernel_variant(__name__, kind)
     def find_seen_corners(
         first: int,
-        # Model:
         model: _Model,
-        # In:
-        instant_count: int,
-        image_slot: wp.array[int],
-        active: wp.array[int],
-        here: Views,
         edges: wp.array3d[int],
+        batch: Batch,
         # Out:
         corner_out: wp.array3d[float],
     ):
-        index = first + wp.tid()
-        corner = index % model.corners.shape[1]
-        view = index // model.corners.shape[1]
-        world = view // instant_count
-        view = world * model.stride + view % instant_count
-        slot = image_slot[view]
+        at = element_of(batch, first + wp.tid())
+        slot = at.slot
         if slot < 0:
             return
-        if active.shape[0] > 0:
-            if active[world] == 0:
-                return
+        corner = at.number
+        here = batch.here
         corner_out[slot, corner, 0] = wp.nan
-        scene = model.scene_of_world[world]
+        scene = batch.scene_of_world[at.world]
         p_W = wp.vec3d(model.corners[scene, corner])
         if corner >= model.first_of_bodies:
             body = model.body[corner - model.first_of_bodies]
-            p_W = here.p_WO[view, body] + wp.quat_rotate(here.q_WO[view, body], p_W)
-        p_WC = wp.vec3d(here.p_WC[view])
-        q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
+            p_W = here.p_WO[at.view, body] + wp.quat_rotate(here.q_WO[at.view, body], p_W)
+        p_WC = wp.vec3d(here.p_WC[at.view])
+        q_WC = wp.normalize(wp.quatd(here.q_WC[at.view]))
         way = p_W - p_WC
         p_C = wp.quat_rotate_inv(q_WC, way)
-        seen = project(model.lenses[model.lens_of_world[world]], p_C)
+        seen = project(model.around.lenses[batch.lens_of_world[at.world]], p_C)
         u = float(seen[0])
         v = float(seen[1])
-        if not (seen[2] != wp.float64(0.0) and u >= 0.0 and u < float(model.width)):
+        if not (seen[2] != wp.float64(0.0) and u >= 0.0 and u < float(edges.shape[2])):
             return  # of no corner p_C is nan
-        if not (v >= 0.0 and v < float(model.height)):
+        if not (v >= 0.0 and v < float(edges.shape[1])):
             return
         far = NEAR_RATIO * float(wp.length(way))
         way_W = wp.vec3(wp.normalize(way))
-        if wp.mesh_query_ray_anyhit(model.mesh[scene], here.p_WC[view], way_W, far):
+        if wp.mesh_query_ray_anyhit(model.around.mesh[scene], here.p_WC[at.view], way_W, far):
             return
-        if is_hidden_by_bodies(model.body_mesh, here, view, here.p_WC[view], way_W, far):
+        if is_hidden_by_bodies(model.around.body_mesh, here, at.view, here.p_WC[at.view], way_W, far):
             return
         label = int(0)
-        for row in range(wp.max(int(v) - 1, 0), wp.min(int(v) + 2, model.height)):
-            for col in range(wp.max(int(u) - 1, 0), wp.min(int(u) + 2, model.width)):
+        for row in range(wp.max(int(v) - 1, 0), wp.min(int(v) + 2, edges.shape[1])):
+            for col in range(wp.max(int(u) - 1, 0), wp.min(int(u) + 2, edges.shape[2])):
                 found = edges[slot, row, col]
                 if found > 0 and (label == 0 or found < label):
                     label = found
@@ -159,71 +142,44 @@ def _make_kernel(kind: str) -> Any:
     return find_seen_corners
 
 
-class CornersProcess:
+class CornersProcess(PixelProcess):
     """Finds which corners are seen, and where.
 
     Attributes:
         picture: Column, row, position in C and edge of each corner, float32, shape [M, C, 6]; the column is
             nan where it is not seen.
-        terms: What is computed.
     """
 
-    terms: tuple[str, ...] = ()
-
     def __init__(self, config: CornersConfig, context: PictureContext) -> None:
-        source, lenses = context.source, context.lenses
-        self._context = context
-        self._edges = EdgesProcess(config, context)
-        self._device = device = source.device
-        self._kernel = _make_kernel(lens_kind(context))
-        model = self._model = _Model()
-        model.height, model.width = source.shape[1:]
-        model.stride = context.stride
-        self._lenses = [make_lens_data(lens, device) for lens in lenses]
-        model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
-        model.lens_of_world = wp.array(list(context.lens_of_world), dtype=int, device=device)
-        mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
-        model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
-        model.scene_of_world = context.scene_of_world
-        scenes = [_corners_of(scene.scene, config.crease_rad, config.turn_rad) for scene in context.scenes]
-        moving: list[NDArray[np.float32]] = []
-        if context.motions is not None:
-            model.body_mesh = context.scenes[0].bodies.mesh
-            moving = [
-                _corners_of(body.solid, config.crease_rad, config.turn_rad)
-                for body in context.scenes[0].bodies.bodies
-            ]
+        device, scene = context.source.device, context.scenes[0]
+        self._edges = make_edge_finder(config, context)
+        model = _Model()
+        kind, model.around, self._lenses = make_surroundings(context)
+
+        def corners_of(meshes: Any) -> list[NDArray[np.float32]]:
+            return [_corners_of(mesh, config.crease_rad, config.turn_rad) for mesh in meshes]
+
+        scenes = corners_of(each.scene for each in context.scenes)
+        moving = corners_of(body.solid for body in scene.bodies.bodies) if context.motions is not None else []
         model.first_of_bodies = max(map(len, scenes))
-        model.body = wp.array(
-            np.repeat(np.arange(len(moving)), list(map(len, moving))), dtype=int, device=device
-        )
-        table = np.full((len(scenes), max(1, model.first_of_bodies + sum(map(len, moving))), 3), np.nan)
+        body = np.repeat(np.arange(len(moving)), list(map(len, moving)))
+        model.body = wp.array(body, dtype=int, device=device)
+        table = np.full((len(scenes), max(1, model.first_of_bodies + len(body)), 3), np.nan)
         for row, corners in zip(table, scenes, strict=True):
             row[: len(corners)] = corners
             if moving:
                 row[model.first_of_bodies :] = np.concatenate(moving)
         model.corners = wp.array(table, dtype=wp.vec3, device=device)
-        shape = (source.shape[0], table.shape[1], _COLUMNS)
-        self.picture: Any = wp.zeros(shape, dtype=float, device=device)
+        shape = (context.source.shape[0], table.shape[1], _COLUMNS)
+        inputs = [model, self._edges.picture]
+        super().__init__(
+            context, _make_kernel(kind), *inputs, dtype=float, shape=shape, element_count=shape[1]
+        )
 
     def launch(self, views: PictureViews) -> None:
         """Find the corners of the pictures of a batch; launches only."""
         self._edges.launch(views)
-        world_count = views.image_slot.shape[0] // self._context.stride
-        launch_split(
-            self._kernel,
-            dim=world_count * views.instant_count * self._model.corners.shape[1],
-            inputs=[
-                self._model,
-                views.instant_count,
-                views.image_slot,
-                views.active,
-                views_at(views, self._device),
-                self._edges.picture,
-            ],
-            outputs=[self.picture],
-            device=self._device,
-        )
+        super().launch(views)
 
 
 @functools.lru_cache(maxsize=16)

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,valid-type"
 # mypy: disable-error-code="untyped-decorator,operator,arg-type"
-# ruff: noqa: SIM102, UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
+# ruff: noqa: UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
 """Geometric edges: where depth jumps, another object begins, or a surface bends, whatever the light."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
@@ -11,13 +11,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 from pydantic import Field
 
 from neurosim_core.registry import register
-from neurosim_core.render.launch import launch_split
-from neurosim_core.sensors.base import ImageSensorConfig, PictureContext, PictureViews
+from neurosim_core.sensors.base import ImageSensorConfig, PictureContext
 from neurosim_core.sensors.instance import LabelImage
+from neurosim_core.sensors.pixel_process import Batch, Element, PixelProcess, element_of, make_rays
 from neurosim_core.settings import Settings
 
 wp.set_module_options({"enable_backward": False})
@@ -59,22 +58,22 @@ class EdgesConfig(EdgeLimits, ImageSensorConfig):
         """Return what labels mean."""
         return {"labels": json.dumps({"classes": KINDS})}
 
-    def make_process(self, context: PictureContext) -> "EdgesProcess":
+    def make_process(self, context: PictureContext) -> PixelProcess:
         """Return what finds edges."""
-        return EdgesProcess(self, context)
+        return make_edge_finder(self, context)
 
-    def packet(self, picture: NDArray[Any], **header: Any) -> LabelImage:
-        """Return a picture as a packet."""
-        return LabelImage(data=picture, **header)
+
+@wp.struct
+class _Model:
+    jump_ratio: float
+    crease_cosine: float
+    rays: wp.array3d[wp.vec3]
 
 
 @wp.func
 def _edge_between(
-    jump_ratio: float,
-    crease_cosine: float,
-    slot: int,
-    row: int,
-    col: int,
+    model: _Model,
+    at: Element,
     row_b: int,
     col_b: int,
     ray: wp.vec3,
@@ -84,22 +83,22 @@ def _edge_between(
     instance: wp.array3d[int],
 ) -> int:
     """Return the label of the edge between two pixels, whose rays are given in W."""
-    r = ranges[slot, row, col]
-    r_b = ranges[slot, row_b, col_b]
+    r = ranges[at.slot, at.row, at.col]
+    r_b = ranges[at.slot, row_b, col_b]
     near = wp.min(r, r_b)
     if near == wp.inf:
         return 0
     if wp.max(r, r_b) == wp.inf:
         return 1
-    n = normals[slot, row, col]
-    n_b = normals[slot, row_b, col_b]
+    n = normals[at.slot, at.row, at.col]
+    n_b = normals[at.slot, row_b, col_b]
     apart = r_b * ray_b - r * ray
     off = wp.min(wp.abs(wp.dot(n, apart)), wp.abs(wp.dot(n_b, apart)))
-    if off > jump_ratio * near:
+    if off > model.jump_ratio * near:
         return 1
-    if instance[slot, row, col] != instance[slot, row_b, col_b]:
+    if instance[at.slot, at.row, at.col] != instance[at.slot, row_b, col_b]:
         return 2
-    if wp.dot(n, n_b) < crease_cosine:
+    if wp.dot(n, n_b) < model.crease_cosine:
         return 3
     return 0
 
@@ -107,99 +106,36 @@ def _edge_between(
 @wp.kernel
 def _find_edges(
     first: int,
-    # Model:
-    jump_ratio: float,
-    crease_cosine: float,
-    stride: int,
-    part_count: int,
-    rays: wp.array3d[wp.vec3],
-    lens_of_world: wp.array[int],
-    # In:
-    instant_count: int,
-    image_slot: wp.array[int],
-    q_WC: wp.array[wp.quat],
-    active: wp.array[int],
+    model: _Model,
     ranges: wp.array3d[float],
     normals: wp.array3d[wp.vec3],
     instance: wp.array3d[int],
+    batch: Batch,
     # Out:
     edge_out: wp.array3d[int],
 ) -> None:
-    index = first + wp.tid()
-    height = ranges.shape[1]
-    width = ranges.shape[2]
-    pixel = index % (width * height)
-    view = index // (width * height)
-    world = view // instant_count
-    view = world * stride + view % instant_count
-    slot = image_slot[view]
-    if slot < 0:
+    at = element_of(batch, first + wp.tid())
+    if at.slot < 0:
         return
-    if active.shape[0] > 0:
-        if active[world] == 0:
-            return
-    row = pixel // width
-    col = pixel % width
-    q = q_WC[(view + 1) * part_count - 1]
-    lens = lens_of_world[world]
-    ray = wp.quat_rotate(q, rays[lens, row, col])
+    q = batch.here.q_WC[at.last]
+    lens = batch.lens_of_world[at.world]
+    ray = wp.quat_rotate(q, model.rays[lens, at.row, at.col])
     label = int(0)
     for side in range(2):
-        row_b = row + side
-        col_b = col + 1 - side
-        if row_b < height and col_b < width:
-            found = _edge_between(
-                jump_ratio,
-                crease_cosine,
-                slot,
-                row,
-                col,
-                row_b,
-                col_b,
-                ray,
-                wp.quat_rotate(q, rays[lens, row_b, col_b]),
-                ranges,
-                normals,
-                instance,
-            )
+        row_b = at.row + side
+        col_b = at.col + 1 - side
+        if row_b < ranges.shape[1] and col_b < ranges.shape[2]:
+            ray_b = wp.quat_rotate(q, model.rays[lens, row_b, col_b])
+            found = _edge_between(model, at, row_b, col_b, ray, ray_b, ranges, normals, instance)
             if found > 0 and (label == 0 or found < label):
                 label = found
-    edge_out[slot, row, col] = label
+    edge_out[at.slot, at.row, at.col] = label
 
 
-class EdgesProcess:
-    """Finds edges.
-
-    Attributes:
-        picture: Label of each pixel, int32, shape [M, H, W].
-        terms: What is computed.
-    """
-
-    terms: tuple[str, ...] = ()
-
-    def __init__(self, config: EdgeLimits, context: PictureContext) -> None:
-        self._context = context
-        limits = [config.jump_ratio, float(np.cos(config.crease_rad))]
-        self._device = device = context.source.device
-        parts = 1 if context.times is None else len(context.times.offsets_ns)
-        rays: Any = wp.array(
-            np.stack([lens.ray_table() for lens in context.lenses]), dtype=wp.vec3, device=device
-        )
-        lens_of_world: Any = wp.array(list(context.lens_of_world), dtype=int, device=device)
-        self._model = [*limits, context.stride, parts, rays, lens_of_world]
-        self.picture: Any = wp.zeros(context.source.shape, dtype=int, device=device)
-
-    def launch(self, views: PictureViews) -> None:
-        """Find the edges in the pictures of a batch; launches only."""
-        context = self._context
-        _, height, width = context.source.shape
-        world_count = views.image_slot.shape[0] // context.stride
-        sources = context.sources
-        seen = [views.instant_count, views.image_slot, views.q_WC, views.active]
-        launch_split(
-            _find_edges,
-            dim=world_count * views.instant_count * width * height,
-            inputs=[*self._model, *seen, sources["range"], sources["normal"], sources["instance"]],
-            outputs=[self.picture],
-            device=self._device,
-        )
+def make_edge_finder(limits: EdgeLimits, context: PictureContext) -> PixelProcess:
+    """Return what finds edges: the label of each pixel, int32, shape [M, H, W]."""
+    model = _Model()
+    model.jump_ratio, model.crease_cosine = limits.jump_ratio, float(np.cos(limits.crease_rad))
+    model.rays = make_rays(context)
+    sources = [context.sources[name] for name in ("range", "normal", "instance")]
+    return PixelProcess(context, _find_edges, model, *sources, dtype=int)

@@ -28,7 +28,7 @@ from neurosim_core.packets import Events, FieldSpec, as_numpy
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
 from neurosim_core.runtime.cuda import BufferPool, PooledBuffer, size_class
-from neurosim_core.scene.bodies import Motion, body_orientation, body_position, body_velocity
+from neurosim_core.scene.bodies import Motion, body_orientation, body_position, velocity_on_body
 from neurosim_core.scene.labels import label_scenes
 from neurosim_core.sensors.base import FrameContext
 from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
@@ -60,13 +60,12 @@ class LabelledEvents(Events):
 
 @wp.struct
 class _Labels:
-    """Where labels go: one block of memory, given as three types; the columns in it one after the other."""
+    """Where labels go: parts of one block of memory, in this order."""
 
-    pairs: wp.array[wp.vec2]
-    numbers: wp.array[float]
-    labels: wp.array[int]
-    room: int
-    """Events for which columns have room: flow is at 0, depth at 2, instance at 3, class at 4 times it."""
+    flow: wp.array2d[float]
+    depth: wp.array[float]
+    instance: wp.array[int]
+    semantic: wp.array[int]
 
 
 @wp.struct
@@ -138,7 +137,7 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                         r = met.t
                         body = index
         if wp.static("depth" in labels):
-            out.numbers[2 * out.room + event] = wp.where(face >= 0, r * float(ray_C[2]), wp.inf)
+            out.depth[event] = wp.where(face >= 0, r * float(ray_C[2]), wp.inf)
         if wp.static("instance" in labels or "semantic" in labels):
             number = int(-1)
             label = int(-1)
@@ -147,9 +146,9 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                 if wp.static("semantic" in labels):
                     label = model.class_of[number]
             if wp.static("instance" in labels):
-                out.labels[3 * out.room + event] = number
+                out.instance[event] = number
             if wp.static("semantic" in labels):
-                out.labels[4 * out.room + event] = label
+                out.semantic[event] = label
         if wp.static("flow" in labels):
             w_C = wp.quat_rotate_inv(model.q_BC, at.body_rate)
             p_C = ray_C
@@ -162,14 +161,12 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                     if body >= 0:
                         p_WO = body_position(model.motions[body], stamp_ns)
                         q_WO = body_orientation(model.motions[body], stamp_ns)
-                        arm_O = wp.quat_rotate_inv(q_WO, p_WC + wp.float64(r) * ray_W - p_WO)
-                        turning = wp.quat_rotate(q_WO, wp.cross(model.motions[body].spin, arm_O))
-                        v_W += body_velocity(model.motions[body], stamp_ns) + turning
+                        p_W = p_WC + wp.float64(r) * ray_W
+                        v_W += velocity_on_body(model.motions[body], stamp_ns, p_WO, q_WO, p_W)
                 v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
             rate = project_velocity(model.lens, p_C, v_C)
-            out.pairs[event] = wp.vec2(float(rate[0]), float(rate[1]))
-            if rate[2] == wp.float64(0.0):
-                out.pairs[event] = wp.vec2(wp.nan, wp.nan)
+            for axis in range(2):
+                out.flow[event, axis] = wp.where(rate[2] == wp.float64(0.0), wp.nan, float(rate[axis]))
 
     return label_events
 
@@ -202,10 +199,10 @@ class EventLabels:
             self._kernel = self._make_model(classes, context, meaning)
             self._flown: Any = wp.zeros(1, dtype=wp.int64, device=self._device)
             self._pool = BufferPool(self._device) if self._device.is_cuda else None
-            self._out = _Labels()
+            self._memory: Any = None
             self._block: PooledBuffer | None = None
         self._rows = np.zeros(0, np.float32)
-        self._room = self._taken = self._capacity = 0
+        self._count = self._taken = 0
         self._meaning = json.dumps(meaning, separators=(",", ":"))
 
     def _make_model(
@@ -252,45 +249,40 @@ class EventLabels:
             first_x: Where the columns begin.
             first_y: Where the rows begin.
         """
-        self._room, self._taken = count + count % 2, 0  # pairs and numbers begin where they may
-        if not self._geometry:
+        self._count, self._taken = count, 0
+        if not self._geometry or count == 0:
             return
-        if self._pool is None or self._capacity < self._room:
-            self._make_room(self._room if self._pool is None else size_class(2 * self._room))
-        self._out.room = self._room
+        size = _WORDS * count
+        if self._pool is None or self._memory is None or self._memory.size < size:
+            room = size if self._pool is None else size_class(2 * size)
+            self._memory = wp.empty(room, dtype=float, device=self._device)
+        out, columns = _Labels(), self._memory[:size]
+        out.flow, out.depth = columns[: 2 * count].reshape((count, 2)), columns[2 * count : 3 * count]
+        out.instance, out.semantic = (columns[k * count : (k + 1) * count].view(int) for k in (3, 4))
         launch_split(
             self._kernel,
             dim=count,
             inputs=[self._model, self._history, self._flown, t, x, first_x, y, first_y],
-            outputs=[self._out],
+            outputs=[out],
             device=self._device,
         )
-        if self._pool is not None:
-            self._block = self._pool.acquire(4 * _WORDS * self._room)
-            wp.copy(self._block.array, self._bytes, count=4 * _WORDS * self._room)
-
-    def _make_room(self, room: int) -> None:
-        block: Any = wp.empty(_WORDS * room, dtype=float, device=self._device)
-        for name, dtype, size in (("pairs", wp.vec2, 8), ("numbers", float, 4), ("labels", int, 4)):
-            shape = 4 * _WORDS * room // size
-            setattr(self._out, name, wp.array(ptr=block.ptr, dtype=dtype, shape=shape, device=self._device))
-        self._bytes: Any = wp.array(
-            ptr=block.ptr, dtype=wp.uint8, shape=4 * _WORDS * room, device=self._device
-        )
-        self._memory, self._capacity = block, room
         if self._pool is None:
-            self._rows = block.numpy()
+            self._rows = columns.numpy()
+        else:
+            self._block = self._pool.acquire(4 * size)
+            place: Any = wp.array(ptr=columns.ptr, dtype=wp.uint8, shape=4 * size, device=self._device)
+            wp.copy(self._block.array, place, count=4 * size)
 
     def add(self, events: Events) -> LabelledEvents:
         """Return the next of the events that were launched with their truth; the device has finished."""
         if self._geometry and self._block is not None and self._pool is not None:
-            self._rows = self._pool.hand_out(self._block, 4 * _WORDS * self._room).view(np.float32)
+            self._rows = self._pool.hand_out(self._block, 4 * _WORDS * self._count).view(np.float32)
             self._block = None
-        first, end, room = self._taken, self._taken + len(events), self._room
+        first, end = self._taken, self._taken + len(events)
         self._taken = end
 
         def column(name: str, place: int, dtype: Any = np.float32) -> NDArray[Any]:
-            rows = self._rows[place * room :].view(dtype)
+            rows = self._rows[place * self._count :].view(dtype)
             return rows[first:end] if name in self._labels else np.zeros(0, dtype)
 
         values = {field.name: getattr(events, field.name) for field in fields(events)}
@@ -298,7 +290,7 @@ class EventLabels:
         if self._has_cause:
             causes = (as_numpy(events.x) & ((1 << CAUSE_BITS) - 1)).astype(np.uint8)
             values["x"] = as_numpy(events.x) >> CAUSE_BITS
-        flow = self._rows[: 2 * room].reshape(-1, 2)[first:end]
+        flow = self._rows[: 2 * self._count].reshape(-1, 2)[first:end]
         return LabelledEvents(
             **values,
             depth=column("depth", 2),

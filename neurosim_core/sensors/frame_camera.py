@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-# ruff: noqa: SIM102  (nested wp.static branches, typed literals: they have a meaning)
+
 """Pictures as a camera makes them: exposure, electrons and their noise, colour filters, bits and a curve.
 
 The electrons of a pixel are full_well gain L, with L the linear radiance times the exposure of the scene, of
@@ -29,8 +29,9 @@ from pydantic import Field
 from neurosim_core.packets import Image
 from neurosim_core.random import normal4, random_bits, stream_id
 from neurosim_core.registry import register
-from neurosim_core.render.launch import launch_split
+from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import ImageSensorConfig, PictureContext, PictureViews
+from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 from neurosim_core.settings import Settings
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -102,10 +103,6 @@ class FrameCameraConfig(ImageSensorConfig):
 
 @wp.struct
 class _Model:
-    pixel_count: int
-    width: int
-    stride: int
-    part_count: int
     stream: wp.uint32
     gain: float
     target: float
@@ -120,38 +117,27 @@ class _Model:
     """Colour of the pixels of a square of 2 x 2."""
 
 
-@wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera.meter"), enable_backward=False)
+@kernel_variant(__name__, "meter")
 def _meter(
     first: int,
-    # Model:
-    model: _Model,
-    # In:
-    instant_count: int,
-    image_slot: wp.array[int],
     radiance: wp.array3d[wp.vec3],
+    batch: Batch,
     # In/out:
     total: wp.array[wp.int64],
 ) -> None:
-    index = first + wp.tid()
-    pixel = index % model.pixel_count
-    view = index // model.pixel_count
-    slot = image_slot[view // instant_count * model.stride + view % instant_count]
-    if slot >= 0:
-        light = radiance[slot, pixel // model.width, pixel % model.width]
+    at = element_of(batch, first + wp.tid())
+    if at.slot >= 0:
+        light = radiance[at.slot, at.row, at.col]
         luma = 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2]
         logarithm = wp.float64(wp.log(wp.max(luma, _DARKEST)))
-        wp.atomic_add(total, slot, wp.int64(wp.rint(logarithm * _FIXED)))
+        wp.atomic_add(total, at.slot, wp.int64(wp.rint(logarithm * _FIXED)))
 
 
-@wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera.meter"), enable_backward=False)
+@kernel_variant(__name__, "meter")
 def _expose(
-    # Model:
+    first: int,
     model: _Model,
-    # In:
-    instant_count: int,
-    image_slot: wp.array[int],
-    stamps: wp.array2d[wp.int64],
-    active: wp.array[int],
+    batch: Batch,
     # In/out:
     total: wp.array[wp.int64],
     log_gain: wp.array[float],
@@ -159,22 +145,18 @@ def _expose(
     # Out:
     gain_out: wp.array[float],
 ) -> None:
-    world = wp.tid()
-    if active.shape[0] > 0:
-        if active[world] == 0:
-            return
-    for instant in range(instant_count):
-        view = world * model.stride + instant
-        slot = image_slot[view]
-        if slot >= 0:
-            stamp_ns = stamps[(view + 1) * model.part_count - 1, 0]
-            mean = float(wp.float64(total[slot]) / _FIXED) / float(model.pixel_count)
-            total[slot] = wp.int64(0)
+    world = first + wp.tid()
+    for instant in range(batch.instant_count):
+        at = element_of(batch, (world * batch.instant_count + instant) * batch.element_count)
+        if at.slot >= 0:
+            stamp_ns = batch.here.stamps[at.last, 0]
+            mean = float(wp.float64(total[at.slot]) / _FIXED) / float(batch.element_count)
+            total[at.slot] = wp.int64(0)
             wanted = wp.clamp(wp.log(model.target) - mean, model.log_gain_min, model.log_gain_max)
             elapsed_s = float(stamp_ns - last_ns[world]) * 1.0e-9
             if last_ns[world] < wp.int64(0) or elapsed_s <= 0.0:  # the first of an episode
                 log_gain[world] = wanted
-            gain_out[slot] = wp.exp(log_gain[world])
+            gain_out[at.slot] = wp.exp(log_gain[world])
             share = 1.0 - wp.exp(-wp.max(elapsed_s, 0.0) / model.lag_s)
             log_gain[world] += share * (wanted - log_gain[world])
             last_ns[world] = stamp_ns
@@ -182,7 +164,6 @@ def _expose(
 
 @functools.cache
 def _make_kernel(terms: tuple[str, ...], color: str, curve: str) -> Any:
-    name = "_".join((*terms, color, curve)).replace(" ", "_")
     noisy = bool({"shot noise", "read noise"} & set(terms))
 
     @wp.func
@@ -204,79 +185,52 @@ def _make_kernel(terms: tuple[str, ...], color: str, curve: str) -> Any:
             share = wp.pow(share, model.gamma)
         return wp.uint16(int(model.top * share + 0.5))
 
-    @wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera." + name), enable_backward=False)
+    @kernel_variant(__name__, *terms, color, curve)
     def make_frame(
         first: int,
-        # Model:
         model: _Model,
-        seeds: wp.array[wp.uint64],
-        # In:
-        instant_count: int,
-        image_slot: wp.array[int],
-        stamps: wp.array2d[wp.int64],
-        active: wp.array[int],
-        gain: wp.array[float],
         radiance: wp.array3d[wp.vec3],
+        gain: wp.array[float],
+        batch: Batch,
         # Out:
         frame_out: wp.array4d[wp.uint16],
     ):
-        index = first + wp.tid()
-        pixel = index % model.pixel_count
-        world = index // model.pixel_count // instant_count
-        view = world * model.stride + index // model.pixel_count % instant_count
-        slot = image_slot[view]
-        if slot < 0:
+        at = element_of(batch, first + wp.tid())
+        if at.slot < 0:
             return
-        if active.shape[0] > 0:
-            if active[world] == 0:
-                return
-        row = pixel // model.width
-        col = pixel % model.width
-        light = radiance[slot, row, col]
+        light = radiance[at.slot, at.row, at.col]
         factor = model.gain
         if wp.static("auto exposure" in terms):
-            factor = gain[slot]
+            factor = gain[at.slot]
         z = wp.vec4()
         if wp.static(noisy):
-            stamp_ns = stamps[(view + 1) * model.part_count - 1, 0]
-            z = normal4(random_bits(seeds[world], model.stream, stamp_ns, pixel))
+            stamp_ns = batch.here.stamps[at.last, 0]
+            z = normal4(random_bits(batch.seeds[at.world], model.stream, stamp_ns, at.number))
         if wp.static(color == "rgb"):
             for channel in range(3):
-                frame_out[slot, row, col, channel] = develop(model, factor, light[channel], z[channel])
+                shown = develop(model, factor, light[channel], z[channel])
+                frame_out[at.slot, at.row, at.col, channel] = shown
         else:
             one = 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2]
             if wp.static(color == "bayer"):
-                one = light[model.filter[2 * (row % 2) + col % 2]]
-            frame_out[slot, row, col, 0] = develop(model, factor, one, z[0])
+                one = light[model.filter[2 * (at.row % 2) + at.col % 2]]
+            frame_out[at.slot, at.row, at.col, 0] = develop(model, factor, one, z[0])
 
     return make_frame
 
 
-class FrameProcess:
-    """Makes frames of radiance.
-
-    Attributes:
-        picture: Numbers, uint16, shape [M, H, W, 3], or [M, H, W, 1] of one colour at each pixel.
-        terms: What is computed.
-    """
+class FrameProcess(PixelProcess):
+    """Makes frames of radiance: uint16, shape [M, H, W, 3], or [M, H, W, 1] of one colour at each pixel."""
 
     def __init__(self, config: FrameCameraConfig, context: PictureContext) -> None:
-        auto = config.auto_exposure
+        auto, source = config.auto_exposure, context.source
         present = {
             "auto exposure": auto is not None,
             "shot noise": config.shot_noise,
             "read noise": config.read_noise_e > 0.0,
         }
-        self.terms = tuple(term for term, needed in present.items() if needed)
-        self._context = context
-        source = context.source
-        self._device = device = source.device
-        channels = 3 if config.color == "rgb" else 1
-        self.picture: Any = wp.zeros((*source.shape, channels), dtype=wp.uint16, device=device)
+        terms = tuple(term for term, needed in present.items() if needed)
         model = self._model = _Model()
-        model.pixel_count, model.width = source.shape[1] * source.shape[2], source.shape[2]
-        model.stride = context.stride
-        model.part_count = 1 if context.times is None else len(context.times.offsets_ns)
         model.stream = stream_id(f"{context.name}/frame")
         model.gain, model.full_well = config.gain, config.full_well_e
         model.read_noise, model.top = config.read_noise_e, float(2**config.bits - 1)
@@ -287,47 +241,31 @@ class FrameProcess:
         model.gamma = 1.0 if isinstance(config.curve, str) else 1.0 / config.curve
         color, _, pattern = config.color.partition("_")
         model.filter = wp.vec4i(*("rgb".index(letter) for letter in pattern or "rrrr"))
-        self._kernel = _make_kernel(self.terms, color, kind)
-        count = len(context.lens_of_world) if auto is not None else 0
+        self._world_count = len(context.lens_of_world) if auto is not None else 0
         slots = source.shape[0] if auto is not None else 0
-        self._log_gain: Any = wp.zeros(count, dtype=float, device=device)
-        self._last_ns: Any = wp.full(count, -1, dtype=wp.int64, device=device)
-        self._total: Any = wp.zeros(slots, dtype=wp.int64, device=device)
-        self._gain: Any = wp.zeros(slots, dtype=float, device=device)
+        self._exposure: list[Any] = [
+            wp.zeros(slots, dtype=wp.int64, device=source.device),
+            wp.zeros(self._world_count, dtype=float, device=source.device),
+            wp.full(self._world_count, -1, dtype=wp.int64, device=source.device),
+            wp.zeros(slots, dtype=float, device=source.device),
+        ]
+        """Sum of the logarithms of each picture; logarithm of the next gain and time of the last picture of
+        each world; gain of each picture."""
+        super().__init__(
+            context,
+            _make_kernel(terms, color, kind),
+            model,
+            source,
+            self._exposure[-1],
+            dtype=wp.uint16,
+            shape=(*source.shape, 3 if color == "rgb" else 1),
+            terms=terms,
+        )
 
     def launch(self, views: PictureViews) -> None:
         """Make the frames of a batch; launches only."""
-        context, device = self._context, self._device
-        world_count = views.image_slot.shape[0] // context.stride
-        dim = world_count * views.instant_count * self._model.pixel_count
-        seen = [views.instant_count, views.image_slot]
-        if "auto exposure" in self.terms:
-            launch_split(
-                _meter,
-                dim=dim,
-                inputs=[self._model, *seen, context.source],
-                outputs=[self._total],
-                device=device,
-            )
-            wp.launch(
-                _expose,
-                dim=world_count,
-                inputs=[self._model, *seen, views.stamps, views.active],
-                outputs=[self._total, self._log_gain, self._last_ns, self._gain],
-                device=device,
-            )
-        launch_split(
-            self._kernel,
-            dim=dim,
-            inputs=[
-                self._model,
-                context.seeds,
-                *seen,
-                views.stamps,
-                views.active,
-                self._gain,
-                context.source,
-            ],
-            outputs=[self.picture],
-            device=device,
-        )
+        if self._world_count:
+            _, source, _ = self._inputs
+            self.run(_meter, views, source, outputs=self._exposure[:1])
+            self.run(_expose, views, self._model, outputs=self._exposure, dim=self._world_count)
+        super().launch(views)

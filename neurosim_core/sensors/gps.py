@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def,no-any-return,no-untyped-call,untyped-decorator"
 """The GPS receiver: geodetic position and velocity, late, with errors that come and go.
 
 The world W is a tangent plane of the WGS84 ellipsoid: east, north, up at an origin.
@@ -8,35 +8,26 @@ Reference: NIMA TR8350.2 (2000), World Geodetic System 1984. Rankin (1994), An e
 simulation GPS and differential GPS: Gauss-Markov processes for what satellites and atmosphere do.
 """
 
-import functools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from neurosim_core.frames import Mount
 from neurosim_core.packets import FieldSpec, Packet
-from neurosim_core.random import stream_id
 from neurosim_core.registry import register
-from neurosim_core.sensors.base import RateHz, SamplerContext, StateSensorConfig
+from neurosim_core.sensors.base import RateHz, SamplerContext
 from neurosim_core.sensors.state_sampler import (
     ErrorConfig,
-    Errors,
+    LateConfig,
     Motion,
-    NonNegative,
-    Probability,
     StateSampler,
     axes,
-    delay_count,
-    error_adder,
-    is_lost,
-    make_errors,
-    numbers,
+    make_reader,
 )
 
 _SEMI_MAJOR_M = 6_378_137.0
@@ -61,7 +52,7 @@ class GpsFix(Packet):
 
 
 @register("sensor", "gps")
-class GpsConfig(StateSensorConfig):
+class GpsConfig(LateConfig):
     """A GPS receiver, without errors and at once by default."""
 
     kind: Literal["gps"] = "gps"
@@ -75,109 +66,45 @@ class GpsConfig(StateSensorConfig):
     """Longitude of the origin of W [rad]."""
     altitude_m: float = 450.0
     """Altitude of the origin of W above the ellipsoid [m]."""
-    delay_s: NonNegative = 0.0
-    """Age of a fix when it comes, at the stamp [s]; a multiple of 1 / rate_hz."""
     position_errors: ErrorConfig = ErrorConfig()
     """In m, east, north, up, such as {white: 0.1, markov: [1.5, 1.5, 3], markov_time_s: 100}."""
     velocity_errors: ErrorConfig = ErrorConfig()
     """In m/s, likewise."""
-    dropout_probability: Probability = 0.0
-    """Share of fixes that do not come."""
 
     packet_type = GpsFix
 
-    @model_validator(mode="after")
-    def _delay_is_whole(self) -> "GpsConfig":
-        delay_count(self.delay_s, self.rate_hz)
-        return self
-
-    def make(self, context: SamplerContext) -> "GpsReceiver":
-        """Return the sensor at work."""
-        return GpsReceiver(self, context)
-
-
-@wp.struct
-class _Model:
-    antenna: wp.vec3d
-    position: Errors
-    velocity: Errors
-    lost: wp.float64
-    stream: wp.uint32
-
-
-@functools.cache
-def make_kernel(position_terms: tuple[str, ...], velocity_terms: tuple[str, ...]) -> Any:
-    """Return the kernel with the given errors."""
-    add_to_position, add_to_velocity = error_adder(position_terms), error_adder(velocity_terms)
-    name = "_".join((*position_terms, "and", *velocity_terms))
-
-    @wp.kernel(module=wp.get_module(f"neurosim_core.sensors.gps.{name}"), enable_backward=False)
-    def measure(
-        model: _Model,
-        motion: Motion,
-        seeds: wp.array[wp.uint64],
-        active: wp.array[wp.int32],
-        sample: wp.array[wp.int64],
-        memory: wp.array2d[wp.vec3d],
-        slot: int,
-        position_out: wp.array2d[wp.vec3d],
-        velocity_out: wp.array2d[wp.vec3d],
-        came_out: wp.array2d[wp.int32],
-    ):
-        world = wp.tid()
-        if active[world] == 0:
-            return
-        seed, k = seeds[world], sample[world]
-        q = motion.orientation[world]
-        p = motion.position[world] + wp.quat_rotate(q, model.antenna)
-        v = motion.velocity[world] + wp.quat_rotate(q, wp.cross(motion.body_rate[world], model.antenna))
-        position_out[slot, world] = add_to_position(model.position, seed, k, p, memory, world, 0)
-        velocity_out[slot, world] = add_to_velocity(model.velocity, seed, k, v, memory, world, 1)
-        came_out[slot, world] = wp.where(is_lost(seed, model.stream, k, model.lost), 0, 1)
-        sample[world] = k + wp.int64(1)
-
-    return measure
-
-
-class GpsReceiver(StateSampler):
-    """The receivers of all worlds; on the device, positions are those in W [m]."""
-
-    def __init__(self, config: GpsConfig, context: SamplerContext) -> None:
-        self._config = config
-        position, velocity = config.position_errors, config.velocity_errors
-        model = _Model()
-        model.antenna = wp.vec3d(*config.mount.position_m)
-        model.position = make_errors(position, rate_hz=config.rate_hz, name=f"{context.name}/position")
-        model.velocity = make_errors(velocity, rate_hz=config.rate_hz, name=f"{context.name}/velocity")
-        model.lost = wp.float64(config.dropout_probability)
-        model.stream = wp.uint32(stream_id(f"{context.name}/lost"))
-        super().__init__(
+    def make(self, context: SamplerContext) -> StateSampler:
+        """Return the sensor at work; on the device, positions are those in W [m]."""
+        return make_reader(
             context,
-            make_kernel(position.terms(), velocity.terms()),
-            model,
-            outputs={"position": wp.vec3d, "velocity": wp.vec3d, "came": wp.int32},
-            terms=(*position.terms(), *velocity.terms()),
-            group_count=2,
-            delay_count=delay_count(config.delay_s, config.rate_hz),
+            _read_antenna,
+            wp.vec3d(*self.mount.position_m),
+            {"position": self.position_errors, "velocity": self.velocity_errors},
+            self._packet,
+            rate_hz=self.rate_hz,
+            late=self,
         )
-        self._deviation = np.hypot(axes(position.white), axes(position.markov))
 
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> GpsFix | None:
-        """Return one sample as a packet; None: it does not come."""
-        if not rows["came"]:
-            return None
-        config = self._config
+    def _packet(self, position: NDArray[np.float64], velocity: NDArray[np.float64], **header: Any) -> GpsFix:
         latitude_rad, longitude_rad, altitude_m = geodetic(
-            rows["position"], config.latitude_rad, config.longitude_rad, config.altitude_m
+            position, self.latitude_rad, self.longitude_rad, self.altitude_m
         )
         return GpsFix(
             latitude_rad=latitude_rad,
             longitude_rad=longitude_rad,
             altitude_m=altitude_m,
-            velocity=numbers(rows, "velocity"),
-            position_std=self._deviation,
+            velocity=velocity,
+            position_std=np.hypot(axes(self.position_errors.white), axes(self.position_errors.markov)),
             **header,
         )
+
+
+@wp.func
+def _read_antenna(antenna: wp.vec3d, motion: Motion, world: int, output: int) -> wp.vec3d:
+    q = motion.orientation[world]
+    if output == 0:
+        return motion.position[world] + wp.quat_rotate(q, antenna)
+    return motion.velocity[world] + wp.quat_rotate(q, wp.cross(motion.body_rate[world], antenna))
 
 
 def geodetic(

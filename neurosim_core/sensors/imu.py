@@ -17,20 +17,19 @@ Reference: IEEE Std 952-1997, annex C, for the Allan variances: N^2 / T (white),
 
 import functools
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import warp as wp
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from neurosim_core.frames import Mount
 from neurosim_core.packets import ImuSample
 from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.registry import register
+from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
 from neurosim_core.sensors.imu_presets import PRESETS
-from neurosim_core.sensors.state_sampler import Motion, NonNegative, StateSampler
+from neurosim_core.sensors.state_sampler import NonNegative, Sampling, StateSampler
 from neurosim_core.settings import fill_from_preset
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
@@ -128,39 +127,33 @@ def make_kernel(terms: frozenset[str]) -> Any:
     saturation = "saturation" in terms
     quantisation = "quantisation" in terms
 
-    @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.imu." + ("_".join(sorted(terms)) or "exact")),
-        enable_backward=False,
-    )
+    @kernel_variant(__name__, *sorted(terms))
     def measure(
         model: _Model,
         acceleration: wp.array[wp.vec3d],
         angular_acceleration: wp.array[wp.vec3d],
         walk_bias: wp.array[vec6d],
         processes: wp.array2d[vec6d],
-        motion: Motion,
-        seeds: wp.array[wp.uint64],
-        active: wp.array[wp.int32],
-        sample: wp.array[wp.int64],
-        memory: wp.array2d[wp.vec3d],
+        at: Sampling,
         slot: int,
+        # Out:
         specific_force_out: wp.array2d[wp.vec3d],
         angular_rate_out: wp.array2d[wp.vec3d],
     ):
         world = wp.tid()
-        if active[world] == 0:
+        if at.active[world] == 0:
             return
-        w = motion.body_rate[world]
+        w = at.motion.body_rate[world]
         up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), model.gravity)
-        force = wp.quat_rotate_inv(motion.orientation[world], acceleration[world] + up)
+        force = wp.quat_rotate_inv(at.motion.orientation[world], acceleration[world] + up)
         force += wp.cross(angular_acceleration[world], model.position)
         force += wp.cross(w, wp.cross(w, model.position))
         force = wp.quat_rotate(model.q_SB, force)
         rate = wp.quat_rotate(model.q_SB, w)
         reading = vec6d(force[0], force[1], force[2], rate[0], rate[1], rate[2])
 
-        seed = seeds[world]
-        k = sample[world]
+        seed = at.seeds[world]
+        k = at.sample[world]
         if wp.static(walk):
             bias = vec6d()
             if k > wp.int64(0):
@@ -188,7 +181,7 @@ def make_kernel(terms: frozenset[str]) -> Any:
                 if step > wp.float64(0.0):
                     reading[axis] = step * wp.rint(reading[axis] / step)
 
-        sample[world] = k + wp.int64(1)
+        at.sample[world] = k + wp.int64(1)
         specific_force_out[slot, world] = wp.vec3d(reading[0], reading[1], reading[2])
         angular_rate_out[slot, world] = wp.vec3d(reading[3], reading[4], reading[5])
 
@@ -210,25 +203,22 @@ class Imu(StateSampler):
         super().__init__(
             context,
             make_kernel(frozenset(terms)),
-            _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, name=context.name),
-            outputs={"specific_force": wp.vec3d, "angular_rate": wp.vec3d},
-            terms=terms,
-            further=(
+            (
+                _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, name=context.name),
                 vehicle.arrays.acceleration,
                 vehicle.arrays.angular_acceleration,
                 memory("walk"),
                 memory("instability", _PROCESSES),
             ),
+            ImuSample,
+            outputs={"specific_force": wp.vec3d, "angular_rate": wp.vec3d},
+            terms=terms,
         )
 
     def measure(self, slot: int) -> None:
         """Measure all vehicles at their present state, of which the accelerations are computed here."""
         self._vehicle.accelerate()
         super().measure(slot)
-
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> ImuSample:
-        """Return one sample as a packet."""
-        return ImuSample(**header, **dict[str, Any](rows))
 
 
 def _terms(config: ImuConfig) -> tuple[str, ...]:

@@ -47,7 +47,3 @@ class InstanceSensorConfig(ImageSensorConfig):
     def constants(self, context: PictureContext) -> Mapping[str, Any]:
         """Return the names and classes of instances, if all worlds are in one scene."""
         return {"labels": describe_labels(label_scenes(context.scenes, None))}
-
-    def packet(self, picture: NDArray[Any], **header: Any) -> LabelImage:
-        """Return a picture as a packet."""
-        return LabelImage(data=picture, **header)

@@ -27,10 +27,11 @@ from pydantic import Field, model_validator
 from neurosim_core.packets import PointCloud
 from neurosim_core.random import normal4, random_bits, stream_id
 from neurosim_core.registry import register
-from neurosim_core.render.launch import launch_split
-from neurosim_core.sensors.base import PictureContext, PictureSensorConfig, PictureViews
+from neurosim_core.render.launch import kernel_variant
+from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
 from neurosim_core.sensors.lidar_presets import PRESETS
 from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan, SweepTiming
+from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 from neurosim_core.settings import Settings, fill_from_preset
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -118,9 +119,34 @@ class LidarConfig(PictureSensorConfig):
         """When rays are cast; None: all at the stamp."""
         return SweepTiming(span_s=self.span_s) if self.span_s > 0.0 else None
 
-    def make_process(self, context: PictureContext) -> "LidarProcess":
-        """Return what makes points of what rays find."""
-        return LidarProcess(self, context)
+    def make_process(self, context: PictureContext) -> PixelProcess:
+        """Return what makes points of what rays find: x, y, z [m] and intensity, vec4, shape [M, H, W]."""
+        model = _Model()
+        model.stream = stream_id(f"{context.name}/lidar")
+        model.range_min, model.range_max = self.range_min_m, self.range_max_m
+        model.noise, model.noise_ratio = self.range_noise_m, self.range_noise_ratio
+        model.resolution = self.range_resolution_m
+        if self.detection is not None:
+            model.speckle = self.detection.speckle
+            model.signal_min = self.detection.reflectivity / self.detection.range_m**2
+        lost = self.dropout_probability
+        model.dropout = NormalDist().inv_cdf(lost) if lost > 0.0 else _NEVER
+        device, times, rays = context.source.device, context.times, self.scan.ray_table().reshape(-1, 3)
+        model.rays = wp.array(rays, dtype=wp.vec3, device=device)
+        part = np.zeros(len(rays), np.int32) if times is None else times.instant[0]
+        model.part = wp.array(part, dtype=int, device=device)
+        terms = self._terms(moving=times is not None)
+        return PixelProcess(context, _make_kernel(terms), model, context.source, dtype=wp.vec4, terms=terms)
+
+    def _terms(self, *, moving: bool) -> tuple[str, ...]:
+        present = {
+            "detection": self.detection is not None,
+            "dropout": self.dropout_probability > 0.0,
+            "range noise": self.range_noise_m > 0.0 or self.range_noise_ratio > 0.0,
+            "resolution": self.range_resolution_m > 0.0,
+            "deskew": self.deskew and moving,
+        }
+        return tuple(term for term, needed in present.items() if needed)
 
     def packet(self, picture: NDArray[Any], **header: Any) -> PointCloud:
         """Return the points of a sweep, in the order of time; the picture has x, y, z, intensity."""
@@ -149,10 +175,9 @@ def _rings_and_times(scan: AnyScan, span_ns: int) -> tuple[NDArray[np.uint16], N
 
 @wp.struct
 class _Model:
-    pixel_count: int
-    width: int
-    stride: int
-    part_count: int
+    rays: wp.array[wp.vec3]
+    part: wp.array[int]
+    """Which of the times of a sweep each ray has."""
     stream: wp.uint32
     range_min: float
     range_max: float
@@ -165,54 +190,31 @@ class _Model:
 
 
 @functools.cache
-def make_kernel(terms: tuple[str, ...]) -> Any:
+def _make_kernel(terms: tuple[str, ...]) -> Any:
     """Return the kernel that makes points of returns, with what is in `terms`.
 
     Places of rays that do not come back have intensity 0 and points that are nan.
     """
     draws = bool({"range noise", "detection", "dropout"} & set(terms))
 
-    @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.lidar." + ("_".join(terms).replace(" ", "_") or "exact")),
-        enable_backward=False,
-    )
+    @kernel_variant(__name__, *terms)
     def measure(
         first: int,
-        # Model:
         model: _Model,
-        rays: wp.array[wp.vec3],
-        part: wp.array[int],
-        seeds: wp.array[wp.uint64],
-        # In:
-        instant_count: int,
-        image_slot: wp.array[int],
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        stamps: wp.array2d[wp.int64],
-        active: wp.array[wp.int32],
         returns: wp.array3d[wp.vec3],
+        batch: Batch,
         # Out:
         points_out: wp.array3d[wp.vec4],
     ):
-        index = first + wp.tid()
-        pixel = index % model.pixel_count
-        view = index // model.pixel_count
-        world = view // instant_count
-        view = world * model.stride + view % instant_count
-        slot = image_slot[view]
-        if slot < 0:
+        at = element_of(batch, first + wp.tid())
+        if at.slot < 0:
             return
-        if active.shape[0] > 0:
-            if active[world] == 0:
-                return
-        row = pixel // model.width
-        col = pixel % model.width
-        found = returns[slot, row, col]
+        found = returns[at.slot, at.row, at.col]
         r = found[0]
         signal = found[2] * found[1] / (r * r)
-        last = (view + 1) * model.part_count - 1  # the pose at the stamp
         if wp.static(draws):
-            z = normal4(random_bits(seeds[world], model.stream, stamps[last, 0], pixel))
+            stamp_ns = batch.here.stamps[at.last, 0]
+            z = normal4(random_bits(batch.seeds[at.world], model.stream, stamp_ns, at.number))
             if wp.static("detection" in terms):
                 signal *= wp.exp(model.speckle * z[1])
                 if signal < model.signal_min:
@@ -225,82 +227,14 @@ def make_kernel(terms: tuple[str, ...]) -> Any:
         if wp.static("resolution" in terms):
             r = model.resolution * wp.rint(r / model.resolution)
         if not (r >= model.range_min and r <= model.range_max):
-            points_out[slot, row, col] = wp.vec4(wp.nan, wp.nan, wp.nan, 0.0)
+            points_out[at.slot, at.row, at.col] = wp.vec4(wp.nan, wp.nan, wp.nan, 0.0)
             return
-        p = r * rays[pixel]
+        p = r * model.rays[at.number]
         if wp.static("deskew" in terms):
-            then = view * model.part_count + part[pixel]
-            moved = p_WC[then] - p_WC[last] + wp.quat_rotate(q_WC[then], p)
-            p = wp.quat_rotate_inv(q_WC[last], moved)
-        points_out[slot, row, col] = wp.vec4(p[2], -p[0], -p[1], signal)
+            then = at.view * batch.part_count + model.part[at.number]
+            p_WC = batch.here.p_WC[then]
+            moved = p_WC - batch.here.p_WC[at.last] + wp.quat_rotate(batch.here.q_WC[then], p)
+            p = wp.quat_rotate_inv(batch.here.q_WC[at.last], moved)
+        points_out[at.slot, at.row, at.col] = wp.vec4(p[2], -p[0], -p[1], signal)
 
     return measure
-
-
-class LidarProcess:
-    """Makes points of what the rays of a scan find.
-
-    Attributes:
-        picture: x, y, z in S [m] and intensity, vec4, shape [M, H, W]; nan and 0 where no ray comes back.
-        terms: What is computed.
-    """
-
-    def __init__(self, config: LidarConfig, context: PictureContext) -> None:
-        self._context = context
-        self.terms = _terms(config, moving=context.times is not None)
-        source = context.source
-        self._device = device = source.device
-        self.picture = wp.zeros(source.shape, dtype=wp.vec4, device=device)
-        model = self._model = _Model()
-        model.pixel_count = source.shape[1] * source.shape[2]
-        model.width = source.shape[2]
-        model.stride = context.stride
-        model.part_count = 1 if context.times is None else len(context.times.offsets_ns)
-        model.stream = stream_id(f"{context.name}/lidar")
-        model.range_min, model.range_max = config.range_min_m, config.range_max_m
-        model.noise, model.noise_ratio = config.range_noise_m, config.range_noise_ratio
-        model.resolution = config.range_resolution_m
-        if config.detection is not None:
-            model.speckle = config.detection.speckle
-            model.signal_min = config.detection.reflectivity / config.detection.range_m**2
-        lost = config.dropout_probability
-        model.dropout = NormalDist().inv_cdf(lost) if lost > 0.0 else _NEVER
-        rays = config.scan.ray_table().reshape(-1, 3)
-        self._rays: Any = wp.array(rays, dtype=wp.vec3, device=device)
-        part = np.zeros(len(rays), np.int32) if context.times is None else context.times.instant[0]
-        self._part: Any = wp.array(part, dtype=int, device=device)
-        self._kernel = make_kernel(self.terms)
-
-    def launch(self, views: PictureViews) -> None:
-        """Make the points of the sweeps of a batch; launches only."""
-        world_count = views.image_slot.shape[0] // self._context.stride
-        launch_split(
-            self._kernel,
-            dim=world_count * views.instant_count * self._model.pixel_count,
-            inputs=[
-                self._model,
-                self._rays,
-                self._part,
-                self._context.seeds,
-                views.instant_count,
-                views.image_slot,
-                views.p_WC,
-                views.q_WC,
-                views.stamps,
-                views.active,
-                self._context.source,
-            ],
-            outputs=[self.picture],
-            device=self._device,
-        )
-
-
-def _terms(config: LidarConfig, *, moving: bool) -> tuple[str, ...]:
-    present = {
-        "detection": config.detection is not None,
-        "dropout": config.dropout_probability > 0.0,
-        "range noise": config.range_noise_m > 0.0 or config.range_noise_ratio > 0.0,
-        "resolution": config.range_resolution_m > 0.0,
-        "deskew": config.deskew and moving,
-    }
-    return tuple(term for term, needed in present.items() if needed)

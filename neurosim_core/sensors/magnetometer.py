@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def,no-any-return,no-untyped-call,untyped-decorator"
 """The magnetometer: the field of the Earth, as the settings give it, bent by the iron of the vehicle.
 
     m_S = A R_SW b_W + h + errors, with A the soft iron and h the hard iron.
@@ -8,10 +8,8 @@ Reference: Gebre-Egziabher, Elkaim, Powell, Parkinson (2006), Calibration of str
 magnetic field domain, eq. (2).
 """
 
-import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import warp as wp
@@ -21,15 +19,7 @@ from neurosim_core.frames import Mount, Vector3
 from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
 from neurosim_core.sensors.base import RateHz, SamplerContext, StateSensorConfig
-from neurosim_core.sensors.state_sampler import (
-    ErrorConfig,
-    Errors,
-    Motion,
-    StateSampler,
-    error_adder,
-    make_errors,
-    numbers,
-)
+from neurosim_core.sensors.state_sampler import ErrorConfig, Motion, StateSampler, make_reader
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,9 +52,13 @@ class MagnetometerConfig(StateSensorConfig):
 
     packet_type = MagneticField
 
-    def make(self, context: SamplerContext) -> "Magnetometer":
+    def make(self, context: SamplerContext) -> StateSampler:
         """Return the sensor at work."""
-        return Magnetometer(self, context)
+        model = _Model()
+        model.field, model.offset = wp.vec3d(*self.earth_field_t), wp.vec3d(*self.hard_iron_t)
+        model.matrix = wp.mat33d(np.array(self.soft_iron) @ self.mount.rotation().inv().as_matrix())
+        errors = {"field": self.errors}
+        return make_reader(context, _read_field, model, errors, MagneticField, rate_hz=self.rate_hz)
 
 
 @wp.struct
@@ -72,50 +66,8 @@ class _Model:
     field: wp.vec3d
     matrix: wp.mat33d  # A R_SB
     offset: wp.vec3d
-    errors: Errors
 
 
-@functools.cache
-def make_kernel(terms: tuple[str, ...]) -> Any:
-    """Return the kernel with the given errors."""
-    add_errors = error_adder(terms)
-
-    @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.magnetometer." + ("_".join(terms) or "exact")),
-        enable_backward=False,
-    )
-    def measure(
-        model: _Model,
-        motion: Motion,
-        seeds: wp.array[wp.uint64],
-        active: wp.array[wp.int32],
-        sample: wp.array[wp.int64],
-        memory: wp.array2d[wp.vec3d],
-        slot: int,
-        field_out: wp.array2d[wp.vec3d],
-    ):
-        world = wp.tid()
-        if active[world] == 0:
-            return
-        value = model.matrix * wp.quat_rotate_inv(motion.orientation[world], model.field) + model.offset
-        k = sample[world]
-        value = add_errors(model.errors, seeds[world], k, value, memory, world, 0)
-        sample[world] = k + wp.int64(1)
-        field_out[slot, world] = value
-
-    return measure
-
-
-class Magnetometer(StateSampler):
-    """The magnetometers of all worlds."""
-
-    def __init__(self, config: MagnetometerConfig, context: SamplerContext) -> None:
-        model, terms = _Model(), config.errors.terms()
-        model.field, model.offset = wp.vec3d(*config.earth_field_t), wp.vec3d(*config.hard_iron_t)
-        model.matrix = wp.mat33d(np.array(config.soft_iron) @ config.mount.rotation().inv().as_matrix())
-        model.errors = make_errors(config.errors, rate_hz=config.rate_hz, name=f"{context.name}/field")
-        super().__init__(context, make_kernel(terms), model, outputs={"field": wp.vec3d}, terms=terms)
-
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> MagneticField:
-        """Return one sample as a packet."""
-        return MagneticField(field=numbers(rows, "field"), **header)
+@wp.func
+def _read_field(model: _Model, motion: Motion, world: int, output: int) -> wp.vec3d:
+    return model.matrix * wp.quat_rotate_inv(motion.orientation[world], model.field) + model.offset

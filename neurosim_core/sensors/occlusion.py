@@ -8,14 +8,15 @@ way, and near the camera where no surface is as near. The least range around a p
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
-import functools
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from neurosim_core.render.projection import LensData
-from neurosim_core.scene.bodies import make_body_poses
-from neurosim_core.sensors.base import PictureViews
+from neurosim_core.render.projection import LensData, make_lens_data
+from neurosim_core.scene.bodies import Motion
+from neurosim_core.sensors.base import PictureContext
+from neurosim_core.sensors.pixel_process import Views
 
 NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
 """What hides a point is nearer than it by this ratio: rays and points are float32."""
@@ -34,28 +35,37 @@ _WAY_PX = wp.constant(64.0)
 
 
 @wp.struct
-class Views:
-    """`PictureViews` at one time."""
+class Surroundings:
+    """What is around cameras, and the lenses through which they see it."""
 
-    p_WC: wp.array[wp.vec3]
-    q_WC: wp.array[wp.quat]
-    stamps: wp.array2d[wp.int64]
-    p_WO: wp.array2d[wp.vec3d]
-    q_WO: wp.array2d[wp.quatd]
-
-
-def views_at(views: PictureViews, device: Any) -> Any:
-    """Return the poses of one time for a kernel."""
-    bodies = views.bodies or _no_bodies(str(device))
-    at = Views()
-    at.p_WC, at.q_WC, at.stamps = views.p_WC, views.q_WC, views.stamps
-    at.p_WO, at.q_WO = bodies.p_WO, bodies.q_WO
-    return at
+    lenses: wp.array[LensData]
+    mesh: wp.array[wp.uint64]
+    """Of each scene."""
+    scene_instances: int
+    """How many there are before those of bodies."""
+    motions: wp.array[Motion]
+    body_mesh: wp.array[wp.uint64]
 
 
-@functools.cache
-def _no_bodies(device: str) -> Any:
-    return make_body_poses(0, 0, device)
+def make_surroundings(context: PictureContext) -> tuple[str, Any, list[Any]]:
+    """Return the kind of the lenses, what is around, and what must be kept for it.
+
+    Raises:
+        ValueError: There are lenses of several kinds, or they do not project points.
+    """
+    kinds = {getattr(lens, "kind", "") for lens in context.lenses}
+    if len(kinds) > 1:
+        raise ValueError(f"{context.name}: worlds have lenses of several kinds, {sorted(kinds)}")
+    around, device = Surroundings(), context.source.device
+    lenses = [make_lens_data(lens, device) for lens in context.lenses]
+    around.lenses = wp.array(lenses, dtype=LensData, device=device)
+    mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
+    around.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
+    if context.motions is not None:
+        scene = context.scenes[0]
+        around.scene_instances = len(scene.scene.instance_names)
+        around.motions, around.body_mesh = context.motions, scene.bodies.mesh
+    return str(kinds.pop()), around, lenses
 
 
 @wp.func

@@ -26,21 +26,22 @@ from neurosim_core.clock import to_ns
 from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.launch import launch_split
-from neurosim_core.render.projection import LensData, make_lens_data, projector, velocity_projector
+from neurosim_core.render.launch import kernel_variant
+from neurosim_core.render.projection import projector, velocity_projector
 from neurosim_core.render.ray_times import RayTimes
-from neurosim_core.scene.bodies import Motion, body_velocity
+from neurosim_core.scene.bodies import make_body_poses, velocity_on_body
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
 from neurosim_core.sensors.occlusion import (
     NEAR_RATIO,
     TILE,
-    Views,
+    Surroundings,
     is_hidden_by_bodies,
     is_way_free,
+    make_surroundings,
     measure_clearance,
     measure_tiles,
-    views_at,
 )
+from neurosim_core.sensors.pixel_process import Batch, PixelProcess, Views, element_of, make_rays, make_views
 
 VISIBLE, HIDDEN, OUTSIDE = (wp.constant(value) for value in (0, 1, 2))
 """Values of the mask: seen at both times; hidden by something at the other time; outside the picture then."""
@@ -119,14 +120,9 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
         return _Before(self.window_ns) if self.direction == "forward" and self.window_ns else None
 
     @property
-    def pose_offset_ns(self) -> int | None:
-        """The other time."""
-        return None if not self.window_ns else 0 if self.timing else -self.window_ns
-
-    @property
-    def needs_twist(self) -> bool:
-        """Velocities need it."""
-        return not self.window_ns
+    def look_back_ns(self) -> int:
+        """To the earlier picture."""
+        return self.window_ns
 
     def make_process(self, context: PictureContext) -> "FlowProcess":
         """Return what makes flow of ranges."""
@@ -147,18 +143,10 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
 
 @wp.struct
 class _Model:
-    pixel_count: int
-    width: int
-    height: int
-    stride: int
-    scene_instances: int
-    rays: wp.array2d[wp.vec3]
-    lenses: wp.array[LensData]
-    lens_of_world: wp.array[int]
-    mesh: wp.array[wp.uint64]
-    scene_of_world: wp.array[int]
-    motions: wp.array[Motion]
-    body_mesh: wp.array[wp.uint64]
+    around: Surroundings
+    rays: wp.array3d[wp.vec3]
+    there: Views  # at the other time
+    twist: wp.array[wp.spatial_vectord]
     # Of each view, of C with respect to T, the camera at the other time:
     R_TC: wp.array[wp.mat33d]
     p_TC: wp.array[wp.vec3d]
@@ -172,17 +160,11 @@ class _Model:
 
 
 @wp.kernel(enable_backward=False)
-def _relate_views(
-    # Model:
-    model: _Model,
-    focal_px: float,
-    # In:
-    instant_count: int,
-    here: Views,
-    there: Views,
-):
-    world = wp.tid() // instant_count
-    view = world * model.stride + wp.tid() % instant_count
+def _relate_views(model: _Model, focal_px: float, batch: Batch):
+    world = wp.tid() // batch.instant_count
+    view = world * batch.stride + wp.tid() % batch.instant_count
+    here = batch.here
+    there = model.there
     q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
     q_WT = wp.normalize(wp.quatd(there.q_WC[view]))
     p_W = wp.vec3d(here.p_WC[view]) - wp.vec3d(there.p_WC[view])
@@ -190,58 +172,38 @@ def _relate_views(
     model.p_TC[view] = wp.quat_rotate_inv(q_WT, p_W)
     model.p_CT[view] = wp.vec3(wp.quat_rotate_inv(q_WC, -p_W))
     if focal_px > 0.0:
-        mesh = model.mesh[model.scene_of_world[world]]
+        mesh = model.around.mesh[batch.scene_of_world[world]]
         model.clearance[view] = measure_clearance(mesh, here.p_WC[view], model.p_CT[view], focal_px)
     if wp.tid() == 0:
         model.unresolved_count[0] = 0
-
-
-def lens_kind(context: PictureContext) -> str:
-    """Return the kind of the lenses of all worlds.
-
-    Raises:
-        ValueError: There are several.
-    """
-    kinds = {getattr(lens, "kind", "") for lens in context.lenses}
-    if len(kinds) > 1:
-        raise ValueError(f"{context.name}: worlds have lenses of several kinds, {sorted(kinds)}")
-    return str(kinds.pop())
 
 
 @functools.cache
 def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
     project = projector(kind)
     project_velocity = velocity_projector(kind)
-    name = "_".join((kind, *terms)).replace(" ", "_")
 
     @wp.func
     def measure_pixel(
         index: int,
         model: _Model,
-        instant_count: int,
-        image_slot: wp.array[int],
-        active: wp.array[int],
-        here: Views,
-        there: Views,
-        twist: wp.array[wp.spatial_vectord],
         ranges: wp.array3d[float],
         instance: wp.array3d[int],
+        batch: Batch,
         flow_out: wp.array3d[wp.vec3],
     ):
-        pixel = index % model.pixel_count
-        view = index // model.pixel_count
-        world = view // instant_count
-        view = world * model.stride + view % instant_count
-        slot = image_slot[view]
+        at = element_of(batch, index)
+        slot = at.slot
         if slot < 0:
             return
-        if active.shape[0] > 0:
-            if active[world] == 0:
-                return
-        row = pixel // model.width
-        col = pixel % model.width
-        lens = model.lenses[model.lens_of_world[world]]
-        ray_C = wp.vec3d(model.rays[model.lens_of_world[world], pixel])
+        row = at.row
+        col = at.col
+        view = at.view
+        here = batch.here
+        there = model.there
+        number = batch.lens_of_world[at.world]
+        lens = model.around.lenses[number]
+        ray_C = wp.vec3d(model.rays[number, row, col])
         # Rounded to float32: a step of Newton's method makes it of unit length.
         ray_C *= wp.float64(1.5) - wp.float64(0.5) * wp.dot(ray_C, ray_C)
         if wp.static("bodies" in terms or "velocity" in terms):
@@ -252,9 +214,9 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         found = ranges[slot, row, col] < _FAR_M
         body = -1
         if wp.static("bodies" in terms):
-            body = wp.max(-1, instance[slot, row, col] - model.scene_instances)
+            body = wp.max(-1, instance[slot, row, col] - model.around.scene_instances)
         if wp.static("velocity" in terms):
-            motion = twist[view]
+            motion = model.twist[view]
             w_C = wp.vec3d(motion[3], motion[4], motion[5])
             p_C = ray_C
             v_C = -wp.cross(w_C, ray_C)
@@ -263,10 +225,13 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
                 v_W = -wp.vec3d(motion[0], motion[1], motion[2])
                 if wp.static("bodies" in terms):
                     if body >= 0:
-                        q_WO = here.q_WO[view, body]
-                        p_O = wp.quat_rotate_inv(q_WO, p_WC + r * ray_W - here.p_WO[view, body])
-                        turning = wp.quat_rotate(q_WO, wp.cross(model.motions[body].spin, p_O))
-                        v_W += body_velocity(model.motions[body], here.stamps[view, 0]) + turning
+                        v_W += velocity_on_body(
+                            model.around.motions[body],
+                            here.stamps[view, 0],
+                            here.p_WO[view, body],
+                            here.q_WO[view, body],
+                            p_WC + r * ray_W,
+                        )
                 v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
             rate = project_velocity(lens, p_C, v_C)
             flow_out[slot, row, col] = wp.vec3(float(rate[0]), float(rate[1]), 0.0)
@@ -290,8 +255,8 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         u = float(seen[0] - wp.float64(col) - wp.float64(0.5))
         v = float(seen[1] - wp.float64(row) - wp.float64(0.5))
         mask = int(VISIBLE)
-        inside = seen[0] >= wp.float64(0.0) and seen[0] < wp.float64(model.width)
-        inside = inside and seen[1] >= wp.float64(0.0) and seen[1] < wp.float64(model.height)
+        inside = seen[0] >= wp.float64(0.0) and seen[0] < wp.float64(ranges.shape[2])
+        inside = inside and seen[1] >= wp.float64(0.0) and seen[1] < wp.float64(ranges.shape[1])
         if not inside:
             mask = int(OUTSIDE)
         elif wp.static("occlusion" in terms):
@@ -315,154 +280,95 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
                 if not free:
                     model.unresolved[wp.atomic_add(model.unresolved_count, 0, 1)] = index
             elif not free:
-                if wp.mesh_query_ray_anyhit(model.mesh[model.scene_of_world[world]], p_WT, way_W, far):
+                if wp.mesh_query_ray_anyhit(
+                    model.around.mesh[batch.scene_of_world[at.world]], p_WT, way_W, far
+                ):
                     mask = int(HIDDEN)
             if wp.static("bodies" in terms):
-                if is_hidden_by_bodies(model.body_mesh, there, view, p_WT, way_W, far):
+                if is_hidden_by_bodies(model.around.body_mesh, there, view, p_WT, way_W, far):
                     mask = int(HIDDEN)
         flow_out[slot, row, col] = wp.vec3(u, v, float(mask))
 
-    @wp.kernel(module=wp.get_module("neurosim_core.sensors.optical_flow." + name), enable_backward=False)
+    @kernel_variant(__name__, kind, *terms)
     def measure_flow(
         first: int,
-        # Model:
         model: _Model,
-        # In:
-        instant_count: int,
-        image_slot: wp.array[int],
-        active: wp.array[int],
-        here: Views,
-        there: Views,
-        twist: wp.array[wp.spatial_vectord],
         ranges: wp.array3d[float],
         instance: wp.array3d[int],
+        batch: Batch,
         # Out:
         flow_out: wp.array3d[wp.vec3],
     ):
         index = first + wp.tid()
         if wp.static("listed" not in terms):
-            measure_pixel(
-                index,
-                model,
-                instant_count,
-                image_slot,
-                active,
-                here,
-                there,
-                twist,
-                ranges,
-                instance,
-                flow_out,
-            )
+            measure_pixel(index, model, ranges, instance, batch, flow_out)
         else:
             while index < model.unresolved_count[0]:
-                measure_pixel(
-                    model.unresolved[index],
-                    model,
-                    instant_count,
-                    image_slot,
-                    active,
-                    here,
-                    there,
-                    twist,
-                    ranges,
-                    instance,
-                    flow_out,
-                )
+                measure_pixel(model.unresolved[index], model, ranges, instance, batch, flow_out)
                 index += model.thread_count
 
     return measure_flow
 
 
-class FlowProcess:
-    """Makes flow of what the rays of a camera hit.
-
-    Attributes:
-        picture: Flow (column, row) and the mask, vec3, shape [M, H, W].
-        terms: What is computed.
-    """
+class FlowProcess(PixelProcess):
+    """Makes flow (column, row) and the mask, vec3, shape [M, H, W], of what the rays of a camera hit."""
 
     def __init__(self, config: OpticalFlowConfig, context: PictureContext) -> None:
-        source, lenses = context.source, context.lenses
+        source = context.source
+        device = source.device
         present = {
             "bodies": context.motions is not None,
             "velocity": not config.window_ns,
             "occlusion": config.occlusion and bool(config.window_ns),
         }
-        self.terms = tuple(term for term, needed in present.items() if needed)
-        self._context = context
-        self._device = device = source.device
-        self.picture = wp.zeros(source.shape, dtype=wp.vec3, device=device)
+        terms = tuple(term for term, needed in present.items() if needed)
         model = self._model = _Model()
-        model.height, model.width = source.shape[1:]
-        model.pixel_count = model.width * model.height
-        model.stride = context.stride
-        rays = np.stack([lens.ray_table().reshape(-1, 3) for lens in lenses])
-        model.rays = wp.array(rays, dtype=wp.vec3, device=device)
-        self._lenses = [make_lens_data(lens, device) for lens in lenses]
-        model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
-        lens_rows = list(context.lens_of_world)
-        model.lens_of_world = wp.array(lens_rows, dtype=int, device=device)
-        view_count = len(lens_rows) * context.stride
+        kind, model.around, self._lenses = make_surroundings(context)
+        model.rays = make_rays(context)
+        view_count = len(context.lens_of_world) * context.stride
         for name, dtype in (("R_TC", wp.mat33d), ("p_TC", wp.vec3d), ("p_CT", wp.vec3), ("clearance", float)):
             setattr(model, name, wp.zeros(view_count, dtype=dtype, device=device))
-        mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
-        model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
-        model.scene_of_world = context.scene_of_world
-        if context.motions is not None:
-            scene = context.scenes[0]
-            model.scene_instances = len(scene.scene.instance_names)
-            model.motions, model.body_mesh = context.motions, scene.bodies.mesh
-        kind, variants = lens_kind(context), [self.terms]
-        self._focal_px = 0.0
-        if "occlusion" in self.terms and kind == "pinhole":
+        twist_count, view_count = (0, view_count) if config.window_ns else (view_count, 0)
+        model.twist = wp.zeros(twist_count, dtype=wp.spatial_vectord, device=device)
+        body_count = 0 if context.motions is None else context.motions.shape[0]
+        self._there = {
+            "p_WC": wp.zeros(view_count, dtype=wp.vec3, device=device),
+            "q_WC": wp.zeros(view_count, dtype=wp.quat, device=device),
+            "stamps": wp.zeros((view_count, 1), dtype=wp.int64, device=device),
+            "bodies": make_body_poses(view_count, body_count, device),
+        }
+        model.there = make_views(**self._there)
+        offset_ns = 0 if config.timing else -config.window_ns
+        self._offsets_ns: Any = wp.array([offset_ns], dtype=wp.int64, device=device)
+        model.unresolved_count = wp.zeros(1, dtype=int, device=device)
+        self._focal_px, self._listed = 0.0, None
+        variant = terms
+        if "occlusion" in terms and kind == "pinhole":
             self._focal_px = max(float(lens.fx) for lens in self._lenses)
             tiles = (source.shape[0], *(-(-size // TILE) for size in source.shape[1:]))
             model.nearest = wp.zeros(tiles, dtype=float, device=device)
-            variants = [(*self.terms, "way")]
+            variant = (*terms, "way")
             if wp.get_device(device).is_cuda:
                 model.unresolved = wp.zeros(source.size, dtype=int, device=device)
                 model.thread_count = _LISTED_THREADS
-                variants = [(*self.terms, "way", "list"), (*self.terms, "listed")]
-        model.unresolved_count = wp.zeros(1, dtype=int, device=device)
-        self._kernels = [_make_kernel(kind, variant) for variant in variants]
+                variant, self._listed = (*variant, "list"), _make_kernel(kind, (*terms, "listed"))
+        sources = [context.sources[name] for name in ("range", "instance")]
+        super().__init__(context, _make_kernel(kind, variant), model, *sources, dtype=wp.vec3, terms=terms)
 
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
-        view_count = views.image_slot.shape[0] // self._context.stride * views.instant_count
-        sources = self._context.sources
-        here, there = views_at(views, self._device), views_at(views.then or views, self._device)
-        if "velocity" not in self.terms:
-            wp.launch(
-                _relate_views,
-                dim=view_count,
-                inputs=[self._model, self._focal_px, views.instant_count, here, there],
-                device=self._device,
-            )
+        if "velocity" in self.terms:
+            views.find_twists(self._model.twist)
+        else:
+            views.look(self._offsets_ns, **self._there)
+            batch = self.batch_of(views)
+            view_count = views.image_slot.shape[0] // batch.stride * views.instant_count
+            inputs = [self._model, self._focal_px, batch]
+            wp.launch(_relate_views, dim=view_count, inputs=inputs, device=self.device)
         if self._focal_px:
-            nearest = self._model.nearest
-            wp.launch_tiled(
-                measure_tiles,
-                dim=nearest.shape,
-                inputs=[sources["range"], nearest],
-                block_dim=64,
-                device=self._device,
-            )
-        for number, kernel in enumerate(self._kernels):
-            launch_split(
-                kernel,
-                dim=_LISTED_THREADS if number else view_count * self._model.pixel_count,
-                inputs=[
-                    self._model,
-                    views.instant_count,
-                    views.image_slot,
-                    views.active,
-                    here,
-                    there,
-                    views.twist,
-                    sources["range"],
-                    sources["instance"],
-                ],
-                outputs=[self.picture],
-                device=self._device,
-            )
+            nearest, (_, ranges, _) = self._model.nearest, self._inputs
+            inputs = [ranges, nearest]
+            wp.launch_tiled(measure_tiles, dim=nearest.shape, inputs=inputs, block_dim=64, device=self.device)
+        super().launch(views)
+        if self._listed is not None:
+            self.run(self._listed, views, *self._inputs, outputs=[self.picture], dim=_LISTED_THREADS)

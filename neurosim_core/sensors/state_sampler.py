@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,call-overload"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-"""What small sensors share: errors of a measurement, delays, and a sampler of one kernel.
+"""What small sensors share: errors of a measurement, delays, dropouts, and a sampler of one kernel.
 
 Errors are added per axis: a random walk from 0, a first-order Gauss-Markov process that is stationary from
 the first sample on, white noise, and rounding. They are addressed by seed, name and number of the sample
@@ -15,17 +15,19 @@ N^2 dt / T (white), K^2 T / 3 (walk, T >> dt), and of a Gauss-Markov process of 
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.frames import Vector3
+from neurosim_core.packets import Packet
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
-from neurosim_core.sensors.base import Sampler, SamplerContext
+from neurosim_core.render.launch import kernel_variant
+from neurosim_core.sensors.base import RateHz, Sampler, SamplerContext, StateSensorConfig
 from neurosim_core.settings import Settings
 
 wp.set_module_options({"enable_backward": False})
@@ -35,7 +37,6 @@ Axes = NonNegative | tuple[NonNegative, NonNegative, NonNegative]
 Probability = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 _DROPOUT = 1 << 20
-_MOTION = ("position", "velocity", "orientation", "body_rate", "air_velocity")
 
 
 class ErrorConfig(Settings):
@@ -97,65 +98,29 @@ def _normal3(seed: wp.uint64, stream: wp.uint32, k: wp.int64, element: int) -> w
     return wp.vec3d(a[0], a[1], b[0])
 
 
-@functools.cache
-def error_adder(terms: tuple[str, ...]) -> Any:
-    """Return the function that adds errors to a measurement, those in `terms`.
+class LateConfig(StateSensorConfig):
+    """A state sensor whose samples come late, or not at all."""
 
-    Its parameters: the errors; the seed; the number k of the sample; the measurement; `memory`, vec3d of
-    shape [world, groups * 2], the world, and the group.
-    """
+    rate_hz: RateHz = 100.0
+    """Samples a second [Hz]."""
+    delay_s: NonNegative = 0.0
+    """Age of a sample when it comes, at the stamp [s]; a multiple of 1 / rate_hz."""
+    dropout_probability: Probability = 0.0
+    """Share of samples that do not come."""
 
-    @wp.func
-    def add_errors(
-        errors: Errors,
-        seed: wp.uint64,
-        k: wp.int64,
-        value: wp.vec3d,
-        memory: wp.array2d[wp.vec3d],
-        world: int,
-        group: int,
-    ) -> wp.vec3d:
-        if wp.static("walk" in terms):
-            bias = wp.vec3d()
-            if k > wp.int64(0):
-                bias = memory[world, 2 * group] + wp.cw_mul(errors.walk, _normal3(seed, errors.stream, k, 2))
-            memory[world, 2 * group] = bias
-            value += bias
-        if wp.static("markov" in terms):
-            drift = wp.cw_mul(errors.markov, _normal3(seed, errors.stream, k, 4))
-            if k > wp.int64(0):
-                fresh = wp.sqrt(wp.float64(1.0) - errors.decay * errors.decay)
-                drift = errors.decay * memory[world, 2 * group + 1] + fresh * drift
-            memory[world, 2 * group + 1] = drift
-            value += drift
-        if wp.static("white" in terms):
-            value += wp.cw_mul(errors.white, _normal3(seed, errors.stream, k, 0))
-        if wp.static("resolution" in terms):
-            for axis in range(3):
-                step = errors.resolution[axis]
-                if step > wp.float64(0.0):
-                    value[axis] = step * wp.rint(value[axis] / step)
-        return value
+    @property
+    def delay_count(self) -> int:
+        """The delay in samples."""
+        return round(self.delay_s * self.rate_hz)
 
-    return add_errors
-
-
-@wp.func
-def is_lost(seed: wp.uint64, stream: wp.uint32, k: wp.int64, probability: wp.float64) -> bool:
-    """Return whether a sample is lost, with a probability."""
-    return uniform2(random_bits(seed, stream, k, _DROPOUT))[0] < probability
-
-
-@wp.kernel
-def _restart(
-    # In:
-    mask: wp.array[wp.int32],
-    # Out:
-    sample_out: wp.array[wp.int64],
-) -> None:
-    world = wp.tid()
-    if mask[world] != 0:
-        sample_out[world] = wp.int64(0)
+    @model_validator(mode="after")
+    def _delay_is_whole(self) -> "LateConfig":
+        if abs(self.delay_count - self.delay_s * self.rate_hz) > 1e-6:
+            raise ValueError(
+                f"delay_s must be a multiple of 1 / rate_hz = {1 / self.rate_hz:g}, got {self.delay_s:g}: "
+                "samples are of states at ticks of the sensor"
+            )
+        return self
 
 
 @wp.struct
@@ -169,138 +134,260 @@ class Motion:
     air_velocity: wp.array[wp.vec3d]
 
 
+@wp.struct
+class Sampling:
+    """What kernels of state sensors share; arrays of shape [world]."""
+
+    motion: Motion
+    seeds: wp.array[wp.uint64]
+    active: wp.array[wp.int32]
+    """0: the world is left alone."""
+    sample: wp.array[wp.int64]
+    """Number of the sample since the reset."""
+    memory: wp.array2d[wp.vec3d]
+    """Of errors, shape [world, groups * 2]."""
+
+
+@functools.cache
+def error_adder(terms: tuple[str, ...]) -> Any:
+    """Return the function that adds errors to a measurement, those in `terms`.
+
+    Its parameters: the errors; the measurement; `Sampling`, the world, and the group of errors.
+    """
+
+    @wp.func
+    def add_errors(errors: Errors, value: wp.vec3d, at: Sampling, world: int, group: int) -> wp.vec3d:
+        seed = at.seeds[world]
+        k = at.sample[world]
+        if wp.static("walk" in terms):
+            bias = wp.vec3d()
+            if k > wp.int64(0):
+                bias = at.memory[world, 2 * group] + wp.cw_mul(
+                    errors.walk, _normal3(seed, errors.stream, k, 2)
+                )
+            at.memory[world, 2 * group] = bias
+            value += bias
+        if wp.static("markov" in terms):
+            drift = wp.cw_mul(errors.markov, _normal3(seed, errors.stream, k, 4))
+            if k > wp.int64(0):
+                fresh = wp.sqrt(wp.float64(1.0) - errors.decay * errors.decay)
+                drift = errors.decay * at.memory[world, 2 * group + 1] + fresh * drift
+            at.memory[world, 2 * group + 1] = drift
+            value += drift
+        if wp.static("white" in terms):
+            value += wp.cw_mul(errors.white, _normal3(seed, errors.stream, k, 0))
+        if wp.static("resolution" in terms):
+            for axis in range(3):
+                step = errors.resolution[axis]
+                if step > wp.float64(0.0):
+                    value[axis] = step * wp.rint(value[axis] / step)
+        return value
+
+    return add_errors
+
+
+@functools.cache
+def _reading_kernel(read: Any, terms: tuple[str, ...], is_scalar: bool) -> Any:
+    add_errors = error_adder(terms)
+    model_type = next(iter(read.input_types.values()))
+    dtype = wp.float64 if is_scalar else wp.vec3d
+
+    @kernel_variant(f"{read.module.name}.{read.key}", *terms)
+    def measure(
+        model: model_type,
+        errors: wp.array[Errors],
+        at: Sampling,
+        slot: int,
+        # Out:
+        readings_out: wp.array3d[dtype],
+    ):
+        world = wp.tid()
+        if at.active[world] == 0:
+            return
+        for group in range(errors.shape[0]):
+            value = add_errors(errors[group], read(model, at.motion, world, group), at, world, group)
+            if wp.static(is_scalar):
+                readings_out[group, slot, world] = value[0]
+            else:
+                readings_out[group, slot, world] = value
+        at.sample[world] += wp.int64(1)
+
+    return measure
+
+
 @wp.kernel
-def _delay(
-    # In:
-    motion: Motion,
-    sample: wp.array[wp.int64],
-    active: wp.array[wp.int32],
-    # In/out:
-    ring: wp.array3d[wp.float64],
-    # Out:
-    delayed: Motion,
-) -> None:
+def _lose(
+    probability: wp.float64, stream: wp.uint32, at: Sampling, slot: int, came_out: wp.array2d[wp.int32]
+):
     world = wp.tid()
-    if active[world] == 0:
+    if at.active[world] != 0:
+        draw = uniform2(random_bits(at.seeds[world], stream, at.sample[world], _DROPOUT))[0]
+        came_out[slot, world] = wp.where(draw < probability, 0, 1)
+
+
+@wp.kernel
+def _restart(mask: wp.array[wp.int32], sample_out: wp.array[wp.int64]):
+    world = wp.tid()
+    if mask[world] != 0:
+        sample_out[world] = wp.int64(0)
+
+
+@wp.kernel
+def _delay(motion: Motion, ring: Motion, length: int, at: Sampling):
+    world = wp.tid()
+    if at.active[world] == 0:
         return
-    k = sample[world]
-    length = wp.int64(ring.shape[1])
-    at = int(k % length)
-    for axis in range(3):
-        ring[world, at, axis] = motion.position[world][axis]
-        ring[world, at, 3 + axis] = motion.velocity[world][axis]
-        ring[world, at, 6 + axis] = motion.body_rate[world][axis]
-        ring[world, at, 13 + axis] = motion.air_velocity[world][axis]
-    for part in range(4):
-        ring[world, at, 9 + part] = motion.orientation[world][part]
-    at = int(wp.max(k - length + wp.int64(1), wp.int64(0)) % length)
-    delayed.position[world] = wp.vec3d(ring[world, at, 0], ring[world, at, 1], ring[world, at, 2])
-    delayed.velocity[world] = wp.vec3d(ring[world, at, 3], ring[world, at, 4], ring[world, at, 5])
-    delayed.body_rate[world] = wp.vec3d(ring[world, at, 6], ring[world, at, 7], ring[world, at, 8])
-    delayed.orientation[world] = wp.quatd(
-        ring[world, at, 9], ring[world, at, 10], ring[world, at, 11], ring[world, at, 12]
-    )
-    delayed.air_velocity[world] = wp.vec3d(ring[world, at, 13], ring[world, at, 14], ring[world, at, 15])
+    k = at.sample[world]
+    new = world * length + int(k % wp.int64(length))
+    ring.position[new] = motion.position[world]
+    ring.velocity[new] = motion.velocity[world]
+    ring.orientation[new] = motion.orientation[world]
+    ring.body_rate[new] = motion.body_rate[world]
+    ring.air_velocity[new] = motion.air_velocity[world]
+    before = wp.max(k - wp.int64(length - 1), wp.int64(0))
+    old = world * length + int(before % wp.int64(length))
+    at.motion.position[world] = ring.position[old]
+    at.motion.velocity[world] = ring.velocity[old]
+    at.motion.orientation[world] = ring.orientation[old]
+    at.motion.body_rate[world] = ring.body_rate[old]
+    at.motion.air_velocity[world] = ring.air_velocity[old]
 
 
 class StateSampler(Sampler):
     """A state sensor of one kernel.
 
-    The kernel's parameters are a model, `Motion`, then seeds, active, sample, memory, the slot, and one array
-    of shape [slot, world] for each output. It returns at once where `active` is 0; else it uses the sample's
-    number and increments it.
+    The kernel's parameters are the inputs, `Sampling`, the slot, and the arrays that it writes. It returns at
+    once where `active` is 0; else it uses the number of the sample and increments it.
     """
 
     def __init__(
         self,
         context: SamplerContext,
         kernel: Any,
-        model: Any,
+        inputs: tuple[Any, ...],
+        packet: Callable[..., Packet | None],
         *,
         outputs: Mapping[str, Any],
+        are_stacked: bool = False,
         terms: tuple[str, ...] = (),
         group_count: int = 1,
-        delay_count: int = 0,
-        further: tuple[Any, ...] = (),
+        late: LateConfig | None = None,
     ) -> None:
         """Allocate what it needs.
 
         Args:
             context: What it is made for.
             kernel: See above.
-            model: Its first parameter.
-            outputs: Names and types of what it measures.
+            inputs: Its first parameters.
+            packet: Returns a packet of header and rows: its class, if its fields are named as the outputs.
+            outputs: Names and types of what it measures: an array of shape [slot, world] each.
+            are_stacked: The kernel writes one array, of shape [output, slot, world].
             terms: What is computed.
             group_count: Groups of errors of three axes.
-            delay_count: It measures the state of so many samples before; before the first, that one.
-            further: Parameters of the kernel after `model`.
+            late: Its delay and dropouts. Before the first sample the state was that of it.
         """
-        vehicle, device = context.vehicle, context.vehicle.device
-        count = vehicle.count
-        self.terms = terms
-        self.arrays = {
-            name: wp.zeros((context.slot_count, count), dtype=dtype, device=device)
-            for name, dtype in outputs.items()
-        }
-        self._sample = wp.zeros(count, dtype=wp.int64, device=device)
-        memory = wp.zeros((count if terms else 0, 2 * group_count), dtype=wp.vec3d, device=device)
+        vehicle = context.vehicle
+        self.terms, self._packet = terms, packet
+        self._count, self._device = vehicle.count, vehicle.device
+        shape = (context.slot_count, self._count)
+        if are_stacked:
+            written = [self._zeros(next(iter(outputs.values())), len(outputs), *shape)]
+            self.arrays = {name: written[0][index] for index, name in enumerate(outputs)}
+        else:
+            self.arrays = {name: self._zeros(dtype, *shape) for name, dtype in outputs.items()}
+            written = list(self.arrays.values())
+        at = Sampling()
+        at.seeds, at.active = context.seeds, context.active
+        at.sample = self._sample = self._zeros(wp.int64, self._count)
+        at.memory = self._zeros(wp.vec3d, self._count if terms else 0, 2 * group_count)
         motion = Motion()
-        for name in _MOTION:
+        for name in Motion.vars:
             setattr(motion, name, getattr(vehicle.arrays, name))
-        self._delay: Any = None
-        if delay_count:
-            ring = wp.zeros((count, delay_count + 1, 16), dtype=wp.float64, device=device)
-            delayed = Motion()
-            for name in _MOTION:
-                setattr(delayed, name, wp.zeros_like(getattr(motion, name)))
-            self._delay = wp.launch(
-                _delay,
-                dim=count,
-                inputs=[motion, self._sample, context.active, ring, delayed],
-                device=device,
-                record_cmd=True,
-            )
-            motion = delayed
-        inputs = [model, *further, motion, context.seeds, context.active, self._sample, memory]
-        self._slot_parameter = len(inputs)
-        self._launch: Any = wp.launch(
-            kernel,
-            dim=count,
-            inputs=[*inputs, 0],
-            outputs=list(self.arrays.values()),
-            device=device,
-            record_cmd=True,
+        at.motion = motion
+        self._launches: list[tuple[Any, int | None, Any]] = []
+        if late is not None and late.delay_count:
+            length = late.delay_count + 1
+            ring, at.motion = self._motion(length), self._motion(1)
+            self._add(_delay, motion, ring, length, at)
+        if late is not None and late.dropout_probability > 0.0:
+            stream = wp.uint32(stream_id(f"{context.name}/lost"))
+            came = self._zeros(wp.int32, *shape)
+            self._add(_lose, late.dropout_probability, stream, at, 0, came, slot_at=3)
+            self.arrays |= {"came": came}
+        self._add(kernel, *inputs, at, 0, *written, slot_at=len(inputs) + 1)
+
+    def _zeros(self, dtype: Any, *shape: int) -> Any:
+        return wp.zeros(shape, dtype=dtype, device=self._device)
+
+    def _motion(self, length: int) -> Any:
+        """Return a motion of as many states of each vehicle, one after the other."""
+        motion = Motion()
+        for name, kind in Motion.vars.items():
+            setattr(motion, name, self._zeros(kind.type.dtype, self._count * length))
+        return motion
+
+    def _add(self, kernel: Any, *parameters: Any, slot_at: int | None = None) -> None:
+        """Add a launch to each measurement, of which a parameter is the slot; it keeps its parameters."""
+        launch = wp.launch(
+            kernel, dim=self._count, inputs=list(parameters), device=self._device, record_cmd=True
         )
+        self._launches.append((launch, slot_at, parameters))
 
     def measure(self, slot: int) -> None:
         """Measure all vehicles at their present state."""
-        if self._delay is not None:
-            self._delay.launch()
-        self._launch.set_param_at_index(self._slot_parameter, slot)
-        self._launch.launch()
+        for launch, slot_at, _ in self._launches:
+            if slot_at is not None:
+                launch.set_param_at_index(slot_at, slot)
+            launch.launch()
+
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
+        """Return one sample as a packet; None: it does not come."""
+        values = {name: row if np.ndim(row) else row.item() for name, row in rows.items()}
+        if not values.pop("came", True):
+            return None
+        return self._packet(**values, **header)
 
     def reset(self, mask: Any) -> None:
         """Begin again at sample 0 in some worlds: the kernel then takes nothing from its memory."""
-        wp.launch(
-            _restart, dim=mask.shape[0], inputs=[mask], outputs=[self._sample], device=self._sample.device
-        )
+        wp.launch(_restart, dim=mask.shape[0], inputs=[mask], outputs=[self._sample], device=self._device)
 
 
-def delay_count(delay_s: float, rate_hz: float) -> int:
-    """Return how many samples a delay is.
+def make_reader(
+    context: SamplerContext,
+    read: Any,
+    model: Any,
+    errors: Mapping[str, ErrorConfig],
+    packet: Callable[..., Packet | None],
+    *,
+    rate_hz: float,
+    is_scalar: bool = False,
+    late: LateConfig | None = None,
+) -> StateSampler:
+    """Return a sensor at work that reads something of each vehicle, to which errors are added.
 
-    Raises:
-        ValueError: It is no whole number of samples.
+    Args:
+        context: What it is made for.
+        read: A Warp function of the model, `Motion`, the world and the number of an output, that returns a
+            vec3d.
+        model: What it reads besides, of a type of Warp.
+        errors: Names of its outputs, of vec3d, and their errors.
+        packet: As of `StateSampler`, likewise `late`.
+        rate_hz: Samples a second [Hz].
+        is_scalar: Outputs are the first number of what is read, float64.
+        late: See above.
     """
-    count = round(delay_s * rate_hz)
-    if abs(count - delay_s * rate_hz) > 1e-6:
-        raise ValueError(
-            f"delay_s must be a multiple of 1 / rate_hz = {1 / rate_hz:g}, got {delay_s:g}: samples are of "
-            "states at ticks of the sensor"
-        )
-    return count
-
-
-def numbers(rows: Mapping[str, NDArray[Any]], name: str) -> NDArray[np.float64]:
-    """Return a vector of a sample."""
-    return np.array(rows[name], dtype=np.float64)
+    made = [
+        make_errors(each, rate_hz=rate_hz, name=f"{context.name}/{name}") for name, each in errors.items()
+    ]
+    terms = tuple(dict.fromkeys(term for each in errors.values() for term in each.terms()))
+    return StateSampler(
+        context,
+        _reading_kernel(read, terms, is_scalar),
+        (model, wp.array(made, dtype=Errors, device=context.vehicle.device)),
+        packet,
+        outputs=dict.fromkeys(errors, wp.float64 if is_scalar else wp.vec3d),
+        are_stacked=True,
+        terms=terms,
+        group_count=len(errors),
+        late=late,
+    )

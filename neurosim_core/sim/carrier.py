@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
-from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
+from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, find_place, upload_paths
 from neurosim_core.vehicle import MultirotorConfig, MultirotorState
 from neurosim_core.vehicle.arrays import allocate_arrays
 
@@ -85,32 +85,20 @@ def _turn(phi: wp.vec3d, d1: wp.vec3d, d2: wp.vec3d, knot: wp.quatd) -> _Turn:
 
 @wp.func
 def _evaluate_turn(path: PathArrays, attitude: AttitudeArrays, index: int, stamp_ns: wp.int64) -> _Turn:
-    """Return the orientation of a path at a stamp; the piece is that of `evaluate_path`."""
-    first = path.first_knot[index]
-    last = path.first_knot[index + 1] - 1
-    low = first
-    high = last
-    while high - low > 1:
-        middle = (low + high) // 2
-        if path.knots_ns[middle] <= stamp_ns:
-            low = middle
-        else:
-            high = middle
-    length_ns = path.knots_ns[low + 1] - path.knots_ns[low]
-    u = wp.float64(wp.clamp(stamp_ns - path.knots_ns[low], wp.int64(0), length_ns)) / wp.float64(length_ns)
-    piece = low - index
+    """Return the orientation of a path at a stamp."""
+    place = find_place(path, index, stamp_ns)
+    u = place.u
+    rate = place.rate
+    piece = place.knot - index
     c1 = attitude.rotation_vectors[piece, 1]
     c2 = attitude.rotation_vectors[piece, 2]
     c3 = attitude.rotation_vectors[piece, 3]
-    rate = wp.float64(1.0e9) / wp.float64(length_ns)
-    if stamp_ns < path.knots_ns[first] or stamp_ns > path.knots_ns[last]:
-        rate = wp.float64(0.0)
     two = wp.float64(2.0)
     three = wp.float64(3.0)
     phi = attitude.rotation_vectors[piece, 0] + u * (c1 + u * (c2 + u * c3))
     d1 = rate * (c1 + u * (two * c2 + three * u * c3))
     d2 = rate * rate * (two * c2 + two * three * u * c3)
-    return _turn(phi, d1, d2, attitude.knots[low])
+    return _turn(phi, d1, d2, attitude.knots[place.knot])
 
 
 @wp.struct

@@ -65,7 +65,7 @@ def make_model(
     *,
     scene: Scene | None = None,
     on_phase: Callable[[str], None] | None = None,
-    meanwhile: Callable[[Model], None] | None = None,
+    meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> Model:
     """Load or generate the scene, plan the path and decide what has to be computed.
 
@@ -73,7 +73,8 @@ def make_model(
         config: What to fly; one vehicle.
         scene: Where to fly, in place of what `config` says; None: as it says.
         on_phase: Told the name of each part of the work when it begins.
-        meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`).
+        meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`), and
+            with what says whether the scene is lit.
 
     Raises:
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
@@ -115,7 +116,7 @@ def make_fleet(
     *,
     scene: Scene | None = None,
     on_phase: Callable[[str], None] | None = None,
-    meanwhile: Callable[[Model], None] | None = None,
+    meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> dict[str, Model]:
     """Return a model for each vehicle by name; they share the scene, its free space and its light.
 
@@ -153,7 +154,7 @@ def make_fleet(
             if meanwhile is not None and lit is not None:
                 name, first = next(iter(members.items()))
                 blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
-                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None))
+                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None), lit.done)
             scene_on_device = None if lit is None else lit.result()
     return {name: model_of(name, config, scene_on_device) for name, config in members.items()}
 

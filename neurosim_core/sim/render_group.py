@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +39,7 @@ from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
+    PictureContext,
     PictureProcess,
     PictureSensorConfig,
     SensorConfig,
@@ -48,7 +48,6 @@ from neurosim_core.sensors.base import (
 )
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
-from neurosim_core.sim.picture_views import Further, make_further, make_picture_context
 
 MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
@@ -90,8 +89,6 @@ class RenderGroupState:
     """Pictures on the host by source, for each batch in flight; empty: they stay on the device."""
     processes: Sequence[Mapping[str, PictureProcess]]
     """What pictures go through on the device, by the name of the sensor, for each batch in flight."""
-    further: Sequence[Mapping[str, Further]]
-    """What their processing needs besides, likewise."""
     frames: dict[str, FrameSensor]
     """The frame sensors, where packets go to the host."""
     images: dict[str, ImageChannel]
@@ -185,22 +182,20 @@ def make_render_group(
         )
         for _ in range(in_flight)
     ]
-    motions: Any = upload_motions(bodies, device) if bodies else None
-    processes, further = _picture_processes(
+    motions: Any = upload_motions(bodies, device, world_count=worlds.count) if bodies else None
+    one_scene = not worlds.arrays or worlds.scene_of_world is None
+    first_scene = wp.zeros(worlds.count, dtype=int, device=device)
+    processes = _picture_processes(
         images,
         renderers,
-        partial(
-            make_picture_context,
-            lens=group.lens,
-            scene=scene,
-            worlds=worlds,
-            times=times,
-            motions=motions,
-            stride=capacity,
-            seeds=seeds,
-            device=device,
-        ),
-        partial(make_further, rows=worlds.count * capacity, body_count=len(bodies or ()), device=device),
+        lenses=worlds.lenses or (group.lens,),
+        lens_of_world=worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
+        scenes=(scene,) if one_scene else worlds.arrays,
+        scene_of_world=first_scene if one_scene else worlds.scene_of_world,
+        motions=motions,
+        times=times,
+        stride=capacity,
+        seeds=seeds,
     )
     p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
     offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
@@ -219,7 +214,6 @@ def make_render_group(
             for each in zip(renderers, processes, strict=True)
         ],
         processes=processes,
-        further=further,
         frames=_frame_sensors(
             group.frame_sensors if on_host else (),
             sensors,
@@ -271,27 +265,25 @@ def _image_channels(
 
 
 def _picture_processes(
-    images: Mapping[str, ImageChannel],
-    renderers: Sequence[Renderer],
-    make_context: Callable[..., Any],
-    make_more: Callable[..., Any],
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return what makes pictures of what a renderer wrote, and what it reads besides, for each renderer.
+    images: Mapping[str, ImageChannel], renderers: Sequence[Renderer], **context: Any
+) -> list[dict[str, PictureProcess]]:
+    """Return what makes pictures of what a renderer wrote, for each renderer; `context`: as `PictureContext`.
 
-    Args:
-        images: Their constants and sources are set.
-        renderers: One for each batch in flight.
-        make_context: Returns what a process is made for, of name, settings and renderer.
-        make_more: Returns what the process of a sensor with some settings reads besides.
+    Constants and sources of the channels are set.
     """
-    contexts = [{n: make_context(n, image.config, r) for n, image in images.items()} for r in renderers]
-    made = [{n: images[n].config.make_process(c) for n, c in by_name.items()} for by_name in contexts]
-    processes = [{n: process for n, process in by_name.items() if process is not None} for by_name in made]
+    processes: list[dict[str, PictureProcess]] = [{} for _ in renderers]
     for name, image in images.items():
-        image.constants = image.config.constants(contexts[0][name])
-    for name in processes[0]:
-        images[name].source = f"{name}/processed"
-    return processes, [{name: make_more(images[name].config) for name in each} for each in processes]
+        for renderer, by_name in zip(renderers, processes, strict=True):
+            sources = {output: getattr(renderer, output) for output in image.config.outputs}
+            made_for = PictureContext(
+                name=name, source=getattr(renderer, image.output), sources=sources, **context
+            )
+            process = image.config.make_process(made_for)
+            if process is not None:
+                by_name[name] = process
+                image.source = f"{name}/processed"
+        image.constants = image.config.constants(made_for)
+    return processes
 
 
 def _picture_copies(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,6 @@ from neurosim_core.scene.bodies import (
 from neurosim_core.sensors.base import (
     PictureViews,
 )
-from neurosim_core.sim.picture_views import look_further
 from neurosim_core.sim.render_group import ImageChannel, RenderGroupState
 from neurosim_core.sim.trace import Trace
 
@@ -159,7 +159,7 @@ def plan_render(
         if chosen is not None:
             chosen.upload()
         stamps = group.stamps[lane]
-        mount = {"p_BC": group.p_BC, "q_BC": group.q_BC}
+        mount: dict[str, Any] = {"p_BC": group.p_BC, "q_BC": group.q_BC}
         poses = {"count": len(posed), **mount, "p_WC": p_WC, "q_WC": q_WC, "stamps": stamps}
         if group.offsets_ns is None:
             trace.camera_poses(from_slots, **poses)
@@ -172,20 +172,19 @@ def plan_render(
         group.renderers[lane].render(
             p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses, active=active
         )
-        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, body_poses)
+
+        def look(offsets_ns: Any, **there: Any) -> None:
+            bodies = there.pop("bodies")
+            trace.ray_poses(from_slots, offsets_ns, count=len(posed), **mount, **there)
+            if group.motions is not None:
+                times = there["stamps"]
+                pose_bodies(group.motions, times, group.instants, count=times.shape[0], poses=bodies)
+
+        find_twists = partial(trace.camera_twists, from_slots, count=len(posed), **mount)
+        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, body_poses, look, find_twists)
         for name in {name: None for _, _, name in pictures}:
             if name in group.processes[lane]:
-                seen = look_further(
-                    group.further[lane][name],
-                    views,
-                    trace,
-                    from_slots,
-                    count=len(posed),
-                    **mount,
-                    motions=group.motions,
-                    instants=group.instants,
-                )
-                group.processes[lane][name].launch(seen)
+                group.processes[lane][name].launch(views)
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:

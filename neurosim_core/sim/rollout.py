@@ -153,7 +153,7 @@ def warm_up(model: Model) -> None:
     step(model, make_state(model), None)
 
 
-def warm_flight(model: Model) -> None:
+def warm_flight(model: Model, *_: object) -> None:
     """Compile and load the kernels of motion and control: fly one control period without cameras.
 
     For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device.

@@ -174,19 +174,11 @@ def _in_scene(config: SimulationConfig, source: SceneSource) -> SimulationConfig
 
 
 def _completed(arrays: SceneArrays) -> SceneData:
-    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not.
-
-    On a CPU rays are shaded in packets without a branch (`packet_shading`): all of it is read, and not used.
-    """
+    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not."""
     if arrays.terms.textured:
         return arrays.data
     data = SceneData()  # that of the model stays as it is: others may look at it
     for name in SceneData.vars:
         setattr(data, name, getattr(arrays.data, name))
-    faces, materials, device = data.face_material.shape[0], data.base_color.shape[0], arrays.device
-    data.material_texture = wp.zeros(materials, dtype=wp.vec2i, device=device)
-    data.face_lod = wp.zeros(faces, dtype=float, device=device)
-    data.corner_uv = wp.zeros(3 * faces, dtype=wp.vec2, device=device)
-    data.levels = wp.array([(0, 1, 1)], dtype=wp.vec3i, device=device)
-    data.texels = wp.zeros(1, dtype=wp.uint32, device=device)
+    data.material_texture = wp.zeros(data.base_color.shape[0], dtype=wp.vec2i, device=arrays.device)
     return data

@@ -22,6 +22,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
+from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
@@ -33,6 +34,7 @@ from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, WorldSettings, make_state, reset_vehicles
 from neurosim_core.sim.step import launch, launch_first
+from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
 
 _logger = logging.getLogger(__name__)
 
@@ -162,6 +164,25 @@ class Simulation:
         They may be written between steps. Controllers and motors go on with the configured ones.
         """
         return self._state.vehicle.airframes
+
+    def throw_bodies(self, position: Any, velocity: Any) -> None:
+        """Let the bodies of each world fly freely, each world its own way, from the begin of its episode on.
+
+        They may be thrown anew where an episode is about to begin; the others must be thrown as before.
+
+        Args:
+            position: p_WO of each body when the episode begins [m], device array of vec3d, shape [N, B].
+            velocity: Its velocity then in W [m/s], likewise.
+
+        Raises:
+            ValueError: A sensor measures how bodies move, which it knows of bodies of the configuration only.
+        """
+        for group in self._state.groups:
+            if group.motions is None:
+                raise ValueError("there are no bodies to throw: say what they are in `bodies`")
+            if any(group.processes) or group.rule is not None:
+                raise ValueError("bodies can be thrown where cameras give colour, depth and events only")
+            throw_bodies(group.motions, position, velocity, (0.0, 0.0, -GRAVITY_M_S2))
 
     @property
     def fields(self) -> Any:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
-from neurosim_core.sim.ray_poses import write_ray_poses
-from neurosim_core.vehicle.history import History, append_history, make_history
+from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -155,6 +154,37 @@ def _camera_poses(
     q_WC_out[row] = wp.quat(q_WC)
     if stamps_out.shape[0] > 0:
         stamps_out[row, 0] = stamps[slot, world]
+
+
+@wp.kernel
+def _ray_poses(
+    # Model:
+    p_BC: wp.vec3d,
+    q_BC: wp.quatd,
+    stride: int,
+    offsets_ns: wp.array[wp.int64],
+    # In:
+    history: History,
+    entries: wp.array2d[wp.int64],
+    slots: wp.array[int],
+    # Out:
+    p_WC_out: wp.array[wp.vec3],
+    q_WC_out: wp.array[wp.quat],
+    stamps_out: wp.array2d[wp.int64],
+) -> None:
+    world, instant, part = wp.tid()
+    last = entries[slots[instant], world]
+    length = wp.int64(history.stamp_ns.shape[1])
+    stamp_ns = history.stamp_ns[world, int(last % length)] + offsets_ns[part]
+    stamp_ns = wp.max(stamp_ns, wp.int64(0))
+    at = motion_at(history, world, last, stamp_ns)
+    p_WB = at.position
+    q_WB = at.orientation
+    row = (world * stride + instant) * offsets_ns.shape[0] + part
+    p_WC_out[row] = wp.vec3(p_WB + wp.quat_rotate(q_WB, p_BC))
+    q_WC_out[row] = wp.quat(q_WB * q_BC)
+    if stamps_out.shape[0] > 0:
+        stamps_out[row, 0] = stamp_ns
 
 
 @wp.kernel
@@ -311,21 +341,45 @@ class Trace:
             self._pose_launches[key] = (slots, launch)
         self._pose_launches[key][1].launch()
 
-    def ray_poses(self, slots: wp.array[int], offsets_ns: Any, **poses: Any) -> None:
-        """Write the poses of a camera when its rays are cast; see `ray_poses.write_ray_poses`."""
-        write_ray_poses(self._rows.history, self._rows.entries, slots, offsets_ns, **poses)
+    def ray_poses(
+        self,
+        slots: wp.array[int],
+        offsets_ns: Any,
+        *,
+        count: int,
+        p_BC: wp.vec3d,
+        q_BC: wp.quatd,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        stamps: Any,
+    ) -> None:
+        """Write the poses of a camera when its rays are cast; before stamp 0 it stands still.
+
+        As `camera_poses`, for J times of each instant: offsets from it [ns], <= 0 and not before the history
+        begins, int64, shape [J]. Arrays that are written have the shape [world K J].
+        """
+        world_count, part_count = self.states.shape[1], offsets_ns.shape[0]
+        stride = p_WC.shape[0] // (world_count * part_count)
+        rows = self._rows
+        wp.launch(
+            _ray_poses,
+            dim=(world_count, count, part_count),
+            inputs=[p_BC, q_BC, stride, offsets_ns, rows.history, rows.entries, slots],
+            outputs=[p_WC, q_WC, stamps],
+            device=p_WC.device,
+        )
 
     def camera_twists(
-        self, slots: wp.array[int], *, count: int, p_BC: wp.vec3d, q_BC: wp.quatd, twist: Any
+        self, slots: wp.array[int], twist: Any, *, count: int, p_BC: wp.vec3d, q_BC: wp.quatd
     ) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
         Args:
             slots: Slots of the instants, shape [K].
+            twist: spatial_vectord, shape [world K]; overwritten.
             count: How many of them to use.
             p_BC: Position of the camera on the body [m].
             q_BC: Orientation of the camera against the body, xyzw.
-            twist: spatial_vectord, shape [world K]; overwritten.
         """
         world_count = self.states.shape[1]
         wp.launch(

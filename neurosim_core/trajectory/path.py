@@ -56,12 +56,23 @@ class PathPoint:
     """[rad/s^2]."""
 
 
-@wp.func
-def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint:
-    """Return point of path `index` at a stamp; before its start and after its end it rests at its ends.
+@wp.struct
+class PathPlace:
+    """Where on a path an instant is."""
 
-    Position and four derivatives come out of one Horner scheme (repeated synthetic division). At a knot the
-    piece that starts there answers; at the last knot the last piece does.
+    knot: int
+    """At which its piece begins."""
+    u: wp.float64
+    """Part of the piece before it, 0 to 1."""
+    rate: wp.float64
+    """du/dt [1/s]; 0 before the start and after the end."""
+
+
+@wp.func
+def find_place(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPlace:
+    """Return where path `index` is at a stamp.
+
+    At a knot it is on the piece that starts there; at the last knot on the last piece.
     """
     first = path.first_knot[index]
     last = path.first_knot[index + 1] - 1
@@ -73,12 +84,26 @@ def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint
             low = middle
         else:
             high = middle
-    start_ns = path.knots_ns[low]
-    length_ns = path.knots_ns[low + 1] - start_ns
-    elapsed_ns = wp.clamp(stamp_ns - start_ns, wp.int64(0), length_ns)
-    u = wp.float64(elapsed_ns) / wp.float64(length_ns)
+    length_ns = path.knots_ns[low + 1] - path.knots_ns[low]
+    elapsed_ns = wp.clamp(stamp_ns - path.knots_ns[low], wp.int64(0), length_ns)
+    place = PathPlace()
+    place.knot = low
+    place.u = wp.float64(elapsed_ns) / wp.float64(length_ns)
+    place.rate = wp.float64(1.0e9) / wp.float64(length_ns)
+    if stamp_ns < path.knots_ns[first] or stamp_ns > path.knots_ns[last]:
+        place.rate = wp.float64(0.0)
+    return place
 
-    piece = low - index  # every path has one piece less than it has knots
+
+@wp.func
+def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint:
+    """Return point of path `index` at a stamp; before its start and after its end it rests at its ends.
+
+    Position and four derivatives come out of one Horner scheme (repeated synthetic division).
+    """
+    place = find_place(path, index, stamp_ns)
+    u = place.u
+    piece = place.knot - index  # every path has one piece less than it has knots
     d0 = wp.vec4d()
     d1 = wp.vec4d()
     d2 = wp.vec4d()
@@ -92,9 +117,7 @@ def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint
         d1 = d1 * u + d0
         d0 = d0 * u + path.coefficients[piece, count - 1 - k]
 
-    rate = wp.float64(1.0e9) / wp.float64(length_ns)
-    if stamp_ns < path.knots_ns[first] or stamp_ns > path.knots_ns[last]:
-        rate = wp.float64(0.0)
+    rate = place.rate
     rate2 = rate * rate
     d1 = d1 * rate
     d2 = d2 * (wp.float64(2.0) * rate2)

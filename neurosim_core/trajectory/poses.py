@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy  # which imports its parts when they are used
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -34,14 +34,13 @@ _LENGTH_TOLERANCE = 0.01
 _REPEAT_SHARE = 0.01
 """Of the median time between poses: what comes sooner is a repeat."""
 
-PoseFormat = Literal["tum", "euroc", "csv", "npy", "bag"]
+PoseFormat = Literal["tum", "euroc", "csv", "bag"]
 """Names of file formats."""
 
 _FORMATS: dict[str, tuple[str, float, tuple[int, ...]]] = {
     "tum": ("time_s x y z qx qy qz qw, apart by spaces", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
     "euroc": ("time_ns,x,y,z,qw,qx,qy,qz and perhaps more", 1e-9, (0, 1, 2, 3, 5, 6, 7, 4)),
     "csv": ("time_s,x,y,z,qx,qy,qz,qw", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "npy": ("time_s, x, y, z, qx, qy, qz, qw", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
 }
 """What a row is, the length of its unit of time [s], and where time, position and quaternion (xyzw) stand."""
 
@@ -69,9 +68,8 @@ class PosesConfig(Settings):
     """File of poses."""
     format: PoseFormat = "tum"
     """`tum`: time_s x y z qx qy qz qw. `euroc`: time_ns,x,y,z,qw,qx,qy,qz,... `csv`:
-    time_s,x,y,z,qx,qy,qz,qw. `npy`: a NumPy array [n, 8] with the columns of csv. `bag`: a bag of ROS 1 or
-    ROS 2, with PoseStamped, TransformStamped or Odometry. Lines that begin with # are left out, and one line
-    of names at the top of csv."""
+    time_s,x,y,z,qx,qy,qz,qw. `bag`: a bag of ROS 1 or ROS 2, with PoseStamped, TransformStamped or Odometry.
+    Lines that begin with # are left out, and one line of names at the top of csv."""
     topic: str | None = None
     """Of a bag: where its poses are; null: the only topic that has some."""
     keyframes: Annotated[tuple[KeyframeConfig, ...], Field(min_length=2)] | None = None
@@ -107,11 +105,11 @@ def pose_path(config: PosesConfig) -> Path:
         ValueError: A file cannot be read, or a row is wrong; the message names file, row and value.
     """
     if config.keyframes is not None:
-        rotation = Rotation.from_euler("xyz", [frame.rpy_rad for frame in config.keyframes])
-        times = np.array([frame.time_s for frame in config.keyframes])
-        rows = [frame.position_m for frame in config.keyframes]
+        quaternions = Rotation.from_euler("xyz", [frame.rpy_rad for frame in config.keyframes]).as_quat()
+        frames = zip(config.keyframes, quaternions, strict=True)
         where = "path.keyframes"
-        poses = check_poses(times, rows, rotation.as_quat(), where, name=lambda row: f"{where}[{row}]")
+        table = np.array([[frame.time_s, *frame.position_m, *turn] for frame, turn in frames])
+        poses = _check_poses(table, where, lambda row: f"{where}[{row}]", repeats=False)
     else:
         assert config.file is not None
         where = str(config.file)
@@ -151,30 +149,12 @@ def read_poses(file: FilePath, kind: PoseFormat, *, topic: str | None = None) ->
     """
     if kind == "bag":
         return _read_bag(file.expanduser(), topic)
-    description, unit_s, columns = _FORMATS[kind]
+    _, unit_s, columns = _FORMATS[kind]
     try:
-        if kind == "npy":
-            table = np.load(file.expanduser(), allow_pickle=False)
-            lines = list(range(1, len(table) + 1))
-        else:
-            table, lines = _read_text(file, kind)
+        table, lines = _read_text(file, kind)
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {file}: {error}") from None
-    if table.ndim != 2 or table.shape[1] < 8 or not np.issubdtype(table.dtype, np.number):
-        raise ValueError(f"{file} must have rows of {description}, got shape {list(table.shape)}")
-    what = "row" if kind == "npy" else "line"
-    values = table[:, columns]
-    times = values[:, 0].astype(np.float64) * unit_s if kind != "euroc" else values[:, 0]
-    poses = check_poses(
-        times,
-        values[:, 1:4].astype(np.float64),
-        values[:, 4:].astype(np.float64),
-        str(file),
-        name=lambda row: f"{file}, {what} {lines[row]}",
-        unit_s=1e-9 if kind == "euroc" else 1.0,
-        repeats=True,
-    )
-    return poses
+    return _check_poses(table[:, columns], str(file), lambda row: f"{file}, line {lines[row]}", unit_s=unit_s)
 
 
 def _read_text(file: FilePath, kind: PoseFormat) -> tuple[NDArray[Any], list[int]]:
@@ -197,7 +177,7 @@ def _read_text(file: FilePath, kind: PoseFormat) -> tuple[NDArray[Any], list[int
             raise ValueError(f"{file}, line {line}: {len(words)} numbers, not 8, {text!r}: {description}")
         rows.append(row)
         lines.append(line)
-    return np.array(rows).reshape(len(rows), -1 if rows else 8), lines
+    return np.array(rows).reshape(-1, 8), lines
 
 
 _POSE_FIELDS = {
@@ -216,7 +196,7 @@ def _read_bag(file: FilePath, topic: str | None) -> Poses:
     except ImportError as error:
         raise ImportError(f"bags need rosbags: {install_hint('ros2')}") from error
     rows: list[list[float]] = []
-    times: list[int] = []
+    start_ns: int | None = None
     try:
         with AnyReader([file], default_typestore=get_typestore(Stores.LATEST)) as reader:
             has_poses = [c for c in reader.connections if c.msgtype.rpartition("/")[2] in _POSE_FIELDS]
@@ -230,54 +210,40 @@ def _read_bag(file: FilePath, topic: str | None) -> Poses:
                 message: Any = reader.deserialize(data, connection.msgtype)
                 where, *parts = _POSE_FIELDS[connection.msgtype.rpartition("/")[2]]
                 place, turn = attrgetter(*parts)(attrgetter(where)(message))
-                rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
-                times.append(message.header.stamp.sec * NS_PER_S + message.header.stamp.nanosec)
+                stamp_ns = message.header.stamp.sec * NS_PER_S + message.header.stamp.nanosec
+                start_ns = stamp_ns if start_ns is None else start_ns
+                pose = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+                rows.append([stamp_ns - start_ns, *pose])
     except (OSError, AnyReaderError) as error:
         raise ValueError(f"cannot read {file}: {error}") from None
-    values = np.array(rows).reshape(-1, 7)
-    stamps_ns = np.array(times, np.int64) - min(times, default=0)
-    return check_poses(
-        stamps_ns,
-        values[:, :3],
-        values[:, 3:],
-        str(file),
-        name=lambda row: f"{file}, message {row}",
-        unit_s=1e-9,
-        repeats=True,
+    return _check_poses(
+        np.array(rows).reshape(-1, 8), str(file), lambda row: f"{file}, message {row}", unit_s=1e-9
     )
 
 
-def check_poses(
-    times: NDArray[Any],
-    position: ArrayLike,
-    orientation: ArrayLike,
+def _check_poses(
+    table: NDArray[Any],
     where: str,
-    *,
     name: Callable[[int], str],
+    *,
     unit_s: float = 1.0,
-    repeats: bool = False,
+    repeats: bool = True,
 ) -> Poses:
     """Return poses, with stamps from the first one on.
 
     Args:
-        times: Strictly increasing, shape [n].
-        position: p_WB [m], shape [n, 3].
-        orientation: q_WB, xyzw, of length 1 to 1 %, shape [n, 4].
+        table: Time, p_WB [m] and q_WB, xyzw, of length 1 to 1 %, shape [n, 8].
         where: What a message calls all of them.
         name: What a message calls a row.
         unit_s: Unit of time [s].
         repeats: Poses less than 1 % of the usual time after the one before are left out, not refused.
-
-    Raises:
-        ValueError: There are less than two, or a row is wrong.
     """
-    p, q = np.asarray(position, np.float64), np.asarray(orientation, np.float64)
+    times, p, q = table[:, 0], table[:, 1:4].astype(np.float64), table[:, 4:].astype(np.float64)
     if len(times) < 2:
         raise ValueError(f"{where}: a motion needs at least two poses, got {len(times)}")
-    finite = np.isfinite(times.astype(np.float64)) & np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
     length = np.linalg.norm(q, axis=1)
-    for row in np.flatnonzero(~finite)[:1]:
-        raise ValueError(f"{name(row)}: not finite, got {[float(times[row]), *p[row], *q[row]]}")
+    for row in np.flatnonzero(~np.isfinite(table).all(axis=1))[:1]:
+        raise ValueError(f"{name(row)}: not finite, got {[float(value) for value in table[row]]}")
     for row in np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)[:1]:
         raise ValueError(f"{name(row)}: no unit quaternion, {q[row].tolist()} has length {length[row]:.6g}")
     stamps_ns = np.rint((times - times[0]) * (unit_s * NS_PER_S)).astype(np.int64)

@@ -30,6 +30,7 @@ class Interval:
     square_nodes: wp.vec3d
     decay: wp.float64
     lag_rate: wp.float64
+    is_adaptive: wp.bool  # take no fixed steps
     rtol: wp.float64  # of adaptive steps
     atol: wp.float64
     evaluation_count_max: wp.int32
@@ -75,6 +76,7 @@ def part_of(interval: Interval, duration_ns: wp.int64) -> Interval:
     part.step_count = wp.int32(step_count)
     part.step_s = wp.float64(duration_ns) / wp.float64(step_count) * wp.float64(1e-9)
     part.lag_rate = interval.lag_rate
+    part.is_adaptive = interval.is_adaptive
     part.rtol = interval.rtol
     part.atol = interval.atol
     part.evaluation_count_max = interval.evaluation_count_max
@@ -91,13 +93,8 @@ def part_of(interval: Interval, duration_ns: wp.int64) -> Interval:
 
 
 @functools.cache
-def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
-    """Return the kernels that compute only the given terms (see `multirotor.TERMS`).
-
-    Args:
-        terms: What is computed.
-        adaptive: Take no fixed steps.
-    """
+def make_kernels(terms: frozenset[str]) -> Kernels:
+    """Return the kernels that compute only the given terms (see `multirotor.TERMS`)."""
     equations = make_equations(terms)
     motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
     wind, changing_wind, turbulence = equations.wind, equations.changing_wind, equations.turbulence
@@ -108,7 +105,7 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     fly_fixed = make_rkmk4(equations)
     fly_adaptive = make_dormand_prince(equations)
     name = "_".join(sorted(terms)) or "rigid"
-    module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}" + (".adaptive" if adaptive else ""))
+    module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}")
 
     @wp.func
     def fly(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
@@ -139,7 +136,7 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
         start_ns = batch.stamp_ns[vehicle]
         remaining = wp.float64(0.0)
         redo = wp.bool(True)
-        if wp.static(not adaptive):
+        if not interval.is_adaptive:
             x, v, q, w, remaining, redo = fly_fixed(
                 airframe, around, vehicle, start_ns,
                 quadratic_cc, quadratic_cd, quadratic_dd, linear_c, linear_d,
@@ -162,7 +159,7 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
                 batch.orientation[vehicle], batch.body_rate[vehicle],
             )  # fmt: skip
             batch.evaluation_count[vehicle] += wp.int64(used)
-            if wp.static(not adaptive):
+            if not interval.is_adaptive:
                 batch.redone_count[vehicle] += wp.int64(1)
             if failure != STATUS_OK:
                 batch.status[vehicle] = failure

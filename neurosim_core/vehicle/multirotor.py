@@ -167,8 +167,8 @@ class Multirotor:
         self.terms = tuple(term for term in TERMS if term in chosen)
         """The terms that are compiled in."""
         self.arrays = allocate_arrays(count, config.rotor_count, self.device)
-        self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
-        self._adaptive = (rtol, atol, evaluation_count_max)
+        self._kernels = make_kernels(frozenset(self.terms))
+        self._adaptive = (integrator == "dormand_prince", rtol, atol, evaluation_count_max)
         self._model = make_airframe(config, self.device)
         self.airframes = alike(self._model.airframe, count, self.device)
         """Parameters of each vehicle, [N], which may be written between steps."""
@@ -390,7 +390,7 @@ class Multirotor:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lags = [lag_constants(step_s, float(tau_s)) for tau_s in self.config.motor_time_constants_s]
-        rtol, atol, evaluation_count_max = self._adaptive
+        is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
         interval = _struct(
             Interval,
             duration_ns=duration_ns,
@@ -401,6 +401,7 @@ class Multirotor:
             square_nodes=wp.vec3d(*lags[0].square_nodes),
             decay=lags[0].decay,
             lag_rate=lags[0].rate_1_s,
+            is_adaptive=is_adaptive,
             rtol=rtol,
             atol=atol,
             evaluation_count_max=evaluation_count_max,

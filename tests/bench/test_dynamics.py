@@ -7,8 +7,8 @@ import pytest
 
 from neurosim_core.bench import dynamics, rotorpy_peer
 from neurosim_core.bench.dynamics import RKMK4
-from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, lagging, light
-from neurosim_core.bench.dynamics_oracle import Equations, attitude_error, compare, make_reference, solve
+from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, short_flight
+from neurosim_core.bench.dynamics_oracle import Equations, compare, make_reference, solve
 from neurosim_core.bench.engine import Multirotor, preset
 
 
@@ -46,7 +46,7 @@ def test_a_fall_is_a_parabola():
 
 def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
     """Steps that are longer than they say miss the precision of an extreme flight."""
-    cases = {"light": (lambda: light("crazyflie", 3e-2), False)}
+    cases = {"light": EXTREMES["mass 30 g, 100 m/s wind, quadratic drag"]}
     right = dynamics._hard(cases, True, lambda _: None)
     limit_m = 2.0 * next(row["position [m]"] for row in right if row["method"] == RKMK4)
     assert dynamics._hard_claim("light", right, limit_m).met
@@ -62,7 +62,7 @@ def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
 
 def test_stiff_flights_are_judged_and_refusals_kept():
     cases = {
-        "1e-6 s": (lambda: lagging(1e-6), False),
+        "1e-6 s": (lambda: short_flight("hummingbird", motor_time_constant_s=1e-6), False),
         "slender": EXTREMES["inertia 1:10:100, 200 rad/s"],
     }
     rows = dynamics._hard(cases, True, lambda _: None)
@@ -92,6 +92,9 @@ def test_rotorpy_flies_the_same_equations(rotor_step):
 
 def test_attitude_errors_are_exact_for_small_ones():
     half = np.array([0.5e-12, 0.05])
-    turned = np.stack([np.sin(half), 0 * half, 0 * half, np.cos(half)], axis=-1)
-    assert attitude_error(turned, np.array([0.0, 0.0, 0.0, 1.0])) == pytest.approx(2.0 * half, rel=1e-12)
-    assert not compare(np.full((2, 17), np.nan), np.zeros((2, 17))).finite
+    turned, still = np.zeros((2, 17)), np.zeros((2, 17))
+    turned[:, 6], turned[:, 9], still[:, 9] = np.sin(half), np.cos(half), 1.0
+    for k in range(2):
+        found = compare(turned[k : k + 1], still[k : k + 1])
+        assert found.attitude_rad == pytest.approx(2.0 * half[k], rel=1e-12)
+    assert not compare(np.full((2, 17), np.nan), still).finite

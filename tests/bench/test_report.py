@@ -21,7 +21,7 @@ from neurosim_core.bench.report import (
     Series,
     Table,
     cell,
-    lines,
+    panel,
     read_chapter,
 )
 
@@ -33,25 +33,18 @@ ROWS = [
 
 
 def chapter(name: str = "flight") -> Chapter:
-    panel = Panel(
-        title="errors",
-        x_label="step",
-        y_label="error",
-        series=lines(ROWS, "step [ms]", "error [m]", by="method"),
-        x_scale="log",
-        y_scale="log",
-        y_lines={"limit": 1e-6},
+    errors = panel(
+        ROWS, "step [ms]", "error [m]", by="method", title="errors", log="xy", y_lines={"limit": 1e-6}
     )
-    marks = Panel(
-        series=[Series(label="n", x=[3, 4], y=[0, 1], style="points")], y_ticks={"one": 0, "two": 1}
-    )
+    points = Series(label="n", x=["one", "two"], y=[0, 1], style="points")
+    marks = Panel(series=[points, Series(label="law", x=["one", "two"], y=[0, 1], style="law")])
     return Chapter(
         name=name,
         title="A <flight>",
         summary="First.\n\nSecond & last.",
         claims=[Claim("it flies", "Newton (1687)", "1 m", True), Claim("it lands", "same", "not", False)],
         tables=[Table(f"{name}-table", "Errors", ROWS, "A note.")],
-        plots=[Plot(f"{name}-plot", "Errors", [panel, marks], 2)],
+        plots=[Plot(f"{name}-plot", "Errors", [errors, marks], 2)],
         facts={"date": "today"},
     )
 
@@ -80,7 +73,7 @@ def test_a_chapter_survives_json(tmp_path):
     assert again.tables[0].rows[0] == ROWS[0]
     assert again.tables[0].rows[1]["error [m]"] is None  # JSON has no nan
     (plot,) = json.loads((tmp_path / "flight.json").read_text())["plots"]
-    assert plot["panels"][1]["y_ticks"]["two"] == 1.0
+    assert plot["panels"][1]["series"][0]["x"] == ["one", "two"]
     assert draw_plot(again.plots[0]) == draw_plot(chapter().plots[0])
     assert read_chapter(tmp_path, "other") is None
 
@@ -125,11 +118,14 @@ def test_cells(value, text):
     assert cell(value) == text
 
 
-def test_lines_leave_gaps_and_have_a_floor():
-    rows = [{"m": "a", "x": 1, "y": 0.0}, {"m": "a", "x": 2, "y": "lost"}, {"m": "b", "x": None, "y": 1.0}]
-    a, b = lines(rows, "x", "y", by="m", y_floor=1e-9)
-    assert (a.x, a.y) == ([1, 2], [1e-9, None])
+def test_panels_of_rows_leave_gaps_and_take_further_series():
+    rows = [{"m": "a", "x": 1, "y": 0.5}, {"m": "a", "x": 2, "y": "lost"}, {"m": "b", "x": None, "y": 1.0}]
+    further = Series(label="law", x=[1], y=[1])
+    drawn = panel(rows, "x", "y", by="m", y_min=0.0, series=[further])
+    a, b, law = drawn.series
+    assert (a.x, a.y) == ([1, 2], [0.5, None])
     assert b.x == []
+    assert (law, drawn.x_label, drawn.y_label, drawn.y_min) == (further, "x", "y", 0.0)
 
 
 @pytest.mark.parametrize("make", [lambda n: Table(n, "", []), lambda n: Plot(n, "", []), chapter])

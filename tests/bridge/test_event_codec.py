@@ -1,4 +1,4 @@
-"""evt3 and mono: exact there and back, against a decoder written word by word, and where time wraps."""
+"""evt3, mono, libcaer: exact there and back, against decoders that read word by word, where time wraps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import pytest
 
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.event_codec import decode_mono, encode_mono, read_dvs
+from cortex_ros2_bridge.event_codec import (
+    decode_libcaer,
+    decode_libcaer_cmp,
+    decode_mono,
+    encode_mono,
+    read_dvs,
+)
 
 WIDTH, HEIGHT = 640, 480
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -373,3 +379,71 @@ def test_arrays_of_dvs_msgs_are_read(count):
     if count:
         with pytest.raises(EventCodecError, match="are no dvs_msgs/EventArray"):
             read_dvs(array[:-8])
+
+
+def test_words_of_libcaer():
+    """Column in the upper 15 bits, then row, polarity and the flag; time wraps after 2^31 us."""
+    words = [(5 << 17 | 7 << 2 | 1 << 1 | 1, 2**31 - 2), (32767 << 17 | 32767 << 2 | 1, 1)]
+    data = np.array(words, "<u4").tobytes()
+    late_ns = (2**31 + 1) * 1000
+    assert rows(decode_libcaer(data, base_ns=9)) == [
+        (9 + (2**31 - 2) * 1000, 5, 7, 1),
+        (9 + late_ns, 32767, 32767, 0),
+    ]
+    assert rows(decode_libcaer(b"", base_ns=0)) == []
+    with pytest.raises(EventCodecError, match="words of 8 bytes"):
+        decode_libcaer(b"1234", base_ns=0)
+
+
+def libcaer_cmp_reference(words: list[int], base_ns: int) -> list[tuple[int, int, int, int]]:
+    """Decode word by word, as the definition reads: times since the base, vectors along a column."""
+    events: list[tuple[int, int, int, int]] = []
+    high = low = x = base = sign = 0
+    for word in words:
+        kind, value = word >> 12, word & 0xFFF
+        t = base_ns + 1000 * (high << 12 | low)
+        if kind == 0:
+            high = value
+        elif kind == 1:
+            low = value
+        elif kind == 2:
+            x = value & 0x7FF
+        elif kind == 3:
+            events.append((t, x, value & 0x7FF, value >> 11))
+        elif kind == 4:
+            base, sign = value & 0x7FF, value >> 11
+        else:
+            events += [(t, x, base + bit, sign) for bit in range(8) if value >> bit & 1]
+            base += 8
+    return [event for event in events if event[1] < WIDTH and event[2] < HEIGHT]
+
+
+def test_words_of_libcaer_cmp():
+    words = [
+        0x0001, 0x1002, 0x2003, 0x3804,  # 1 x 4096 + 2 us, column 3, row 4 brighter
+        0x4810, 0x5081, 0x5F02,  # rows 16 and 23, and row 25 of the next eight; 0xF00 is unused
+        0x1005, 0x4064, 0x5001,  # 3 us later, row 100, darker
+    ]  # fmt: skip
+    data = np.array(words, "<u2").tobytes()
+    expected = [(3, 4, 1), (3, 16, 1), (3, 23, 1), (3, 25, 1)]
+    assert rows(decode_libcaer_cmp(data, base_ns=7, **SIZE)) == [
+        *((4_098_007, *pixel) for pixel in expected),
+        (4_101_007, 3, 100, 0),
+    ]
+
+
+def test_libcaer_cmp_agrees_with_a_decoder_that_reads_word_by_word():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        words = rng.integers(0, 6 << 12, rng.integers(0, 300)).astype("<u2")
+        words = np.concatenate([[2 << 12], words]).astype("<u2")  # a column comes first
+        found = decode_libcaer_cmp(words.tobytes(), base_ns=123, **SIZE)
+        assert rows(found) == libcaer_cmp_reference(words.tolist(), 123)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [([0x2001, 0x6000], "begin with 0x6"), ([0x3001], "before its first column")]
+)
+def test_what_is_no_libcaer_cmp_is_refused(words, message):
+    with pytest.raises(EventCodecError, match=message):
+        decode_libcaer_cmp(np.array(words, "<u2").tobytes(), base_ns=0, **SIZE)

@@ -84,7 +84,9 @@ def test_events_without_a_rate_have_the_stamp_of_the_last_one():
 def test_packets_that_cannot_be_read_are_refused():
     data = bytes(conversion("Events", robot=False, direction="out")(window(1, 3), Context(vehicle="drone")))
     other = data.replace(b"evt3", b"evt2")
-    with pytest.raises(ConvertError, match=r"EventPacket\.encoding must be evt3 or mono, got 'evt2'"):
+    with pytest.raises(
+        ConvertError, match=r"EventPacket\.encoding must be evt3, mono, libcaer or libcaer_cmp, got 'evt2'"
+    ):
         conversion("Events", robot=True, direction="in")(other, Context(vehicle="drone"))
 
 

@@ -130,7 +130,7 @@ def make_rich(number: int, height: int, width: int) -> Rich:
 
 
 class Impostor:
-    """A node that speaks through raw sockets, so that it can say anything."""
+    """A registry and its only node, which speak through raw sockets, so that they can say anything."""
 
     SOURCE = 77
 
@@ -138,17 +138,18 @@ class Impostor:
         self.context = zmq.Context()
         self.router = self.context.socket(zmq.ROUTER)
         self.xpub = self.context.socket(zmq.XPUB)
-        self.control = f"ipc://{directory}/control"
+        self.registry = f"ipc://{directory}/liar"
         data = f"ipc://{directory}/data"
-        self.router.bind(self.control)
+        self.router.bind(self.registry)
         self.xpub.bind(data)
-        endpoint = records.Endpoint("ipc", data, data, self.control, "")
+        endpoint = records.Endpoint("ipc", data, data, "", "")
         schema = schema_of(Scan)
         publisher = records.PublisherRecord(
             "/scan", self.SOURCE, schema.name, schema.fingerprint, schema.to_json(), False
         )
         record = records.NodeRecord(5, "impostor", host_id(), 1, 1, 0, [endpoint], [publisher], [], [])
-        self.record = wire.control_frame(records.Changed(0, record))
+        self.welcome = wire.control_frame(records.Welcome(1, 1, [record.node], [record.revision]))
+        self.record = wire.control_frame(records.Changed(1, record))
         self.stopping = False
         self.thread = threading.Thread(target=self._answer)
         self.thread.start()
@@ -159,7 +160,7 @@ class Impostor:
             if not self.router.poll(20):
                 continue
             identity, *_ = self.router.recv_multipart()
-            for frame in (b"", b"CTX", self.record[:-3], self.record, b"\xff" * 200):
+            for frame in (b"", b"CTX", self.record[:-3], self.welcome, self.record, b"\xff" * 200):
                 self.router.send_multipart([identity, frame])
 
     def await_key(self) -> bytes:

@@ -27,7 +27,6 @@ from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, FileLock, runtime_dir
 from cortex.records import (
     Alive,
     Changed,
-    Describe,
     Gone,
     Heartbeat,
     Hello,
@@ -87,9 +86,9 @@ def publisher(topic: str, schema: str = "{}") -> PublisherRecord:
 
 
 class Node:
-    """A directory, and a ROUTER that answers as a node's does; driven by `drive` in the test's thread."""
+    """A directory that is driven by `drive` in the test's thread."""
 
-    def __init__(self, context, name, *, router=False, **options):
+    def __init__(self, context, name, **options):
         self.record = make_record(name)
         self.changes: list[frozenset[int]] = []
         self.ever_lost: set[int] = set()
@@ -103,11 +102,6 @@ class Node:
         registered = options.get("registry") != "off"
         # The sign of life of a node whose process lives: it is given time when this process stands still.
         self._lock = FileLock.acquire(runtime_dir(0) / f"{self.id:016x}.lock") if registered else None
-        self.router = context.socket(zmq.ROUTER) if router else None
-        self.address = ""
-        if self.router is not None:
-            self.router.bind("tcp://127.0.0.1:*")
-            self.address = self.router.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def _on_change(self, changed):
         self.changes.append(changed)
@@ -126,8 +120,6 @@ class Node:
         if self._lock is not None:
             self._lock.close(remove=True)
             self._lock = None
-        if self.router is not None:
-            self.router.close()
 
 
 def drive(nodes, condition, timeout_s=SOON_S):
@@ -135,23 +127,16 @@ def drive(nodes, condition, timeout_s=SOON_S):
     poller = zmq.Poller()
     owner = {}
     for node in nodes:
-        for socket in [*node.directory.sockets(), *([node.router] if node.router else [])]:
-            poller.register(socket, zmq.POLLIN)
-            owner[socket] = node
+        if node.directory.socket is not None:
+            poller.register(node.directory.socket, zmq.POLLIN)
+            owner[node.directory.socket] = node
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, [(n.record.name, n.names, n.directory.connected) for n in nodes]
         next_ns = min((node.directory.deadline_ns for node in nodes), default=0)
         wait_ms = (next_ns - time.monotonic_ns()) // 1_000_000
         for socket, _ in poller.poll(min(max(wait_ms, 0), 20)):
-            node = owner[socket]
-            if socket is node.router:
-                identity, frame = socket.recv_multipart()
-                answer = node.directory.answer(frame)
-                if answer is not None:
-                    socket.send_multipart([identity, answer])
-            else:
-                node.directory.handle(socket)
+            owner[socket].directory.handle()
         for node in nodes:
             node.directory.tick()
 
@@ -231,7 +216,7 @@ def dealer(context):
     return socket
 
 
-TYPES = control_types(Alive, Changed, Describe, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
+TYPES = control_types(Alive, Changed, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
 
 
 def receive(socket, timeout_ms=1e3 * SOON_S):

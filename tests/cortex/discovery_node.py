@@ -1,7 +1,7 @@
 """A process with one directory: prints a line of JSON for each change. Run by the tests of discovery.
 
-Its argument is JSON: name, domain, registry, peers, keys (a directory), insecure, node (a number), and listen
-(a tcp address, else a unix socket) for its control socket. It ends when its input closes.
+Its argument is JSON: name, domain, registry, keys (a directory), insecure, and node (a
+number). It ends when its input closes.
 """
 
 from __future__ import annotations
@@ -28,22 +28,19 @@ def main() -> None:
     files = NodeFiles(domain, node)
     context = zmq.Context()
     control = context.socket(zmq.ROUTER)
-    control.bind(options.get("listen") or files.endpoint("control"))
-    print(json.dumps({"control": control.getsockopt_string(zmq.LAST_ENDPOINT)}), flush=True)
+    control.bind(files.endpoint("control"))
     record = NodeRecord(node, options["name"], host_id(), os.getpid(), 1, 0, [], [], [], [])
     directory = Directory(
         context,
         domain=domain,
         record=lambda: record,
         registry=options.get("registry", "auto"),
-        peers=options.get("peers", ()),
         keys=load_keys(Path(options["keys"])) if options.get("keys") else None,
         insecure=options.get("insecure", False),
     )
     poller = zmq.Poller()
-    for socket in directory.sockets():
-        poller.register(socket, zmq.POLLIN)
-    poller.register(control, zmq.POLLIN)
+    if directory.socket is not None:
+        poller.register(directory.socket, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
     shown = None
     while True:
@@ -55,13 +52,7 @@ def main() -> None:
                 context.term()
                 files.close()
                 return
-            if socket is control:
-                identity, frame = control.recv_multipart()
-                answer = directory.answer(frame)
-                if answer is not None:
-                    control.send_multipart([identity, answer])
-            else:
-                directory.handle(socket)
+            directory.handle()
         directory.tick()
         seen = {
             "connected": directory.connected,

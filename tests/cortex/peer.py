@@ -225,8 +225,7 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
         options["keys"] = load_keys(Path(options["keys"]))
     with Node(name, **options) as node:
         peer = Peer(node)
-        control = next(e.control for e in node.nodes()[0].endpoints[::-1])
-        say(node=node.id, control=control)
+        say(node=node.id)
         for line in sys.stdin:
             words = json.loads(line)
             say(**getattr(peer, words.pop("do"))(**words))

@@ -13,7 +13,6 @@ from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
 from cortex.inlet import PAUSE_COUNT
-from cortex.loop_reader import LoopReader
 
 STREAM = 12 * PAUSE_COUNT
 
@@ -119,44 +118,6 @@ def test_two_tasks_on_one_subscriber(numbers):
     assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [0, 1, 2]
 
 
-def test_the_tasks_of_a_loop_are_woken_by_one_reader(numbers, monkeypatch):
-    """A loop calls one function for a descriptor: of two readers, one would sleep until its time is over."""
-    publisher, subscriber = numbers
-    made = []
-
-    class Counted(LoopReader):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            made.append(self)
-
-    monkeypatch.setattr("cortex.loop_reader.LoopReader", Counted)
-
-    async def run():
-        tasks = [asyncio.ensure_future(subscriber.recv_async()) for _ in range(3)]
-        while sum(len(reader._waiters) for reader in made) < 3:
-            await asyncio.sleep(0)
-        for value in range(3):
-            publisher.publish(Number(0, value))
-        await asyncio.gather(*tasks)
-
-    asyncio.run(asyncio.wait_for(run(), SOON_S))
-    assert len(made) == 1
-
-
-def test_who_waits_on_after_the_reader_was_stopped_has_a_timer():
-    """Another loop may have stopped it, while a task of this one goes on to wait."""
-
-    async def run():
-        reader = LoopReader(lambda: (0, []), lambda: 0, lambda _: None)
-        waiting = asyncio.ensure_future(reader.wait(0.2))
-        await asyncio.sleep(0)
-        reader.stop()
-        await waiting
-        await asyncio.wait_for(reader.wait(0.2), SOON_S)
-
-    asyncio.run(run())
-
-
 def test_each_task_has_its_own_timeout(numbers):
     """One timer serves all of a loop's tasks: none gives up early, and none waits for another's time."""
     publisher, subscriber = numbers
@@ -195,51 +156,6 @@ def test_a_cancelled_task_takes_nothing_along(numbers):
             await subscriber.recv_async(0.01)
 
     asyncio.run(run())
-
-
-def test_one_loop_after_another(numbers):
-    """The second loop finds what the first did not take; then the blocking way works again."""
-    publisher, subscriber = numbers
-    for value in range(4):
-        publisher.publish(Number(0, value))
-
-    async def take():
-        first = (await subscriber.recv_async(SOON_S)).value
-        with pytest.raises(asyncio.TimeoutError):
-            await asyncio.wait_for(_until_forever(), 0.01)
-        return first
-
-    async def _until_forever():
-        await asyncio.get_running_loop().create_future()
-
-    assert [asyncio.run(take()) for _ in range(3)] == [0, 1, 2]
-    assert subscriber.recv(SOON_S).value == 3
-
-    async def wait_in_vain():
-        with pytest.raises(TimeoutError):
-            await subscriber.recv_async(0.01)
-
-    for _ in range(2):
-        asyncio.run(wait_in_vain())
-    publisher.publish(Number(0, 4))
-    assert subscriber.recv(SOON_S).value == 4
-
-
-@pytest.mark.alone
-def test_a_loop_is_woken_at_once(numbers):
-    """Waking by the descriptor, not by looking ten times a second."""
-    publisher, subscriber = numbers
-
-    async def run():
-        loop = asyncio.get_running_loop()
-        delays = []
-        for _ in range(10):
-            loop.call_later(0.003, lambda: publisher.publish(Number(time.monotonic_ns(), 0)))
-            sent_ns = (await subscriber.recv_async(SOON_S)).stamp_ns
-            delays.append(time.monotonic_ns() - sent_ns)
-        return delays
-
-    wait_for(lambda: max(asyncio.run(run())) < 0.02e9)  # the machine may be busy for a while
 
 
 @pytest.mark.alone
@@ -335,28 +251,3 @@ def test_a_stream_that_never_ends_lets_others_run(node, policy, publisher_count,
         return [later - earlier for earlier, later in pairwise(turns)]
 
     assert max(asyncio.run(run())) <= PAUSE_COUNT
-
-
-def test_cancelling_before_and_while_waiting_takes_no_message(numbers):
-    publisher, subscriber = numbers
-
-    async def run():
-        iterator = aiter_of(subscriber)
-        early = asyncio.ensure_future(iterator.__anext__())
-        early.cancel()  # before it ran
-        waiting = asyncio.ensure_future(iterator.__anext__())
-        await asyncio.sleep(0.01)
-        waiting.cancel()
-        await asyncio.gather(early, waiting, return_exceptions=True)
-        assert early.cancelled()
-        assert waiting.cancelled()
-        for value in range(3):
-            publisher.publish(Number(0, value))
-        return [(await iterator.__anext__()).value for _ in range(3)]
-
-    assert asyncio.run(run()) == [0, 1, 2]
-    assert subscriber.counters.received == 3
-
-
-def aiter_of(subscriber):
-    return type(subscriber).__aiter__(subscriber)

@@ -14,7 +14,6 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from processes import SOON_S, wait_for
 from scipy import stats
@@ -25,7 +24,7 @@ from cortex.bench.measure import CaseResult, Report, Settings, Spread, judge, ru
 from cortex.bench.peers import PEERS
 from cortex.bench.processes import Child, ChildFailed
 from cortex.bench.report import WIDTH, make_console, print_case, print_summary, write_csv
-from cortex.bench.tally import END, WARM, Ages, Finished, Tally, make_payloads, percentiles
+from cortex.bench.tally import END, WARM, Ages, Finished, Tally, make_payloads
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOATS = 10
@@ -76,43 +75,6 @@ def test_tally_sees_a_torn_payload(at: int):
     assert tally.report["corrupt"] == 1
 
 
-def test_tally_tells_of_the_first_message_once():
-    told: list[str] = []
-    handle = Tally(FLOATS, lambda: told.append("connected")).handler()
-    for sequence in (WARM, WARM, 0):
-        handle(sequence, make_payloads(FLOATS)[0])
-    assert told == ["connected"]
-
-
-def batches(*groups: list[int]) -> Any:
-    """Return the report of a tally that was handed these sequences as arrays."""
-    tally = Tally(FLOATS, lambda: None)
-    handle = tally.batch_handler()
-
-    def feed() -> None:
-        for group in groups:
-            tags = [[1.0 + (sequence & 1)] * FLOATS for sequence in group]
-            handle(np.array(group, np.int64), np.array(tags, np.float32))
-
-    with pytest.raises(Finished):
-        feed()
-    return tally.report
-
-
-@pytest.mark.parametrize(
-    ("groups", "counts"),
-    [
-        (([WARM], [WARM, 0, 1], [2, 3, 4], [5], [6, 7, END]), (8, 0, 0)),
-        (([0, 1, 2], [5, 6], [END]), (5, 2, 0)),
-        (([0, 1, 2], [3, 5, 4, 6], [END]), (7, 0, 1)),
-    ],
-)
-def test_batches_are_counted_as_single_messages_are(groups: Any, counts: tuple[int, int, int]):
-    report = batches(*groups)
-    assert (report["received"], report["lost"], report["misordered"]) == counts
-    assert report["corrupt"] == 0
-
-
 def test_ages_count_from_the_stamp_to_the_use():
     ages = Ages(lambda: None, busy=False)
     ages.use(WARM, None)
@@ -122,12 +84,6 @@ def test_ages_count_from_the_stamp_to_the_use():
         ages.use(END, None)
     assert ages.report["received"] == 2
     assert ages.report["age_p99_us"] >= 3_000.0  # what a busy machine adds has no bound
-
-
-def test_percentiles():
-    figures = percentiles(list(range(1_000, 101_000, 1_000)), "rtt")
-    assert figures == {"rtt_p50_us": 51.0, "rtt_p99_us": 100.0}
-    assert percentiles([], "rtt") == {}
 
 
 # Children.
@@ -149,10 +105,6 @@ def _hangs(pipe: Any, _job: None) -> None:
 
 def _echoes(pipe: Any, job: str) -> None:
     pipe.send((job, pipe.recv()))
-
-
-def _ends(pipe: Any, _job: None) -> None:
-    pipe.send("closed")
 
 
 def gone(pid: int) -> bool:
@@ -182,15 +134,6 @@ def test_child_that_fails_is_noticed(role: Any, text: str, beside: bool):
             waited_for.expect([child])
 
 
-def test_child_may_end_before_the_one_that_is_waited_for():
-    """A server that was told to end is gone before its client has said what it measured."""
-    with Child(_echoes, "job", deadline_s=SOON_S) as client, Child(_ends, None, deadline_s=SOON_S) as server:
-        wait_for(lambda: gone(server.pid))
-        client.tell("go")
-        assert client.expect([server]) == ("job", "go")
-        assert server.expect() == "closed"
-
-
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
 def test_child_that_hangs_is_killed_with_all_that_it_started():
     with Child(_hangs, None, deadline_s=1.0) as child:
@@ -211,14 +154,6 @@ def test_the_interval_of_a_median_is_that_of_the_binomial(count: int):
     outside = max(0, int(stats.binom(count, 0.5).ppf(0.025)) - 1)
     assert (spread.low, spread.high) == (1.0 + outside, count - outside)
     assert spread.median == (count + 1) / 2.0
-
-
-def test_an_interval_holds_the_median_as_often_as_it_says():
-    """Of a skewed distribution; 2,000 draws: 5 standard errors are 2.4 %."""
-    draws = np.random.default_rng(0).exponential(size=(2_000, 9))
-    spreads = [spread_of(row) for row in draws.tolist()]
-    held = sum(spread.low <= np.log(2.0) <= spread.high for spread in spreads if spread) / 2_000
-    assert held == pytest.approx(1.0 - 2.0 * stats.binom(9, 0.5).cdf(1), abs=0.024)
 
 
 @pytest.mark.parametrize(
@@ -343,17 +278,6 @@ def test_summary_says_met_or_missed_and_counts():
     assert "1 met, 1 missed" in text
 
 
-def test_a_quick_run_judges_nothing():
-    text = printed(print_case, results()[0], judged=False) + printed(print_summary, results(), judged=False)
-    assert "2 not judged" in text
-    assert not any(word in text for word in (" met", "missed"))
-
-
-def test_tables_are_no_wider_than_a_page():
-    text = printed(print_case, results()[0]) + printed(print_summary, results())
-    assert max(len(line) for line in text.splitlines()) <= WIDTH
-
-
 def test_csv_holds_every_repetition(tmp_path: Path):
     write_csv(tmp_path / "out.csv", results())
     with (tmp_path / "out.csv").open() as file:
@@ -362,13 +286,6 @@ def test_csv_holds_every_repetition(tmp_path: Path):
     assert [row["repetition"] for row in rows] == ["0", "1", "0", "1"]
     assert rows[2]["lost"] == "5"
     assert rows[3]["error"] == "x" * 300
-
-
-def test_list_names_every_case_and_bar(capsys: pytest.CaptureFixture[str]):
-    assert main(["--list"]) == 0
-    text = capsys.readouterr().out
-    assert all(case.name in text and case.title[:50] in text for case in CASES)
-    assert text.count("=") == sum(len(case.bars) for case in CASES)
 
 
 @pytest.mark.parametrize(

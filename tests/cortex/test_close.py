@@ -29,14 +29,6 @@ def subscribe(publisher, start_child, policy: list, count: int = 1) -> list:
     return children
 
 
-def fill(publisher, publish) -> None:
-    """Publish until the only reader of the ring has no room for another such message."""
-    (reader,) = publisher._fanout.readers.values()
-    ring = publisher._fanout.ring._ring
-    while reader.member not in ring.in_the_way(publish()):
-        pass
-
-
 def begin_close(publisher, **options) -> threading.Thread:
     """Close in a thread, which has time for it; returns once nothing can be published any more."""
     thread = threading.Thread(target=publisher.close, kwargs=options)
@@ -126,57 +118,6 @@ def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
     wait_for(lambda: arrives(child, sent.count, lost=sent.refused))
     thread.join(SOON_S)
     assert not thread.is_alive()
-
-
-def test_nobody_holds_up_a_node_for_long(make_node, start_child):
-    """A reader that stands still, and may hold up `publish` for a day."""
-    node = make_node()
-    publisher = node.publisher("/blocks", Block)
-    (child,) = subscribe(publisher, start_child, ["reliable", {"timeout_s": 86_400.0}])
-    before = len(os.listdir("/proc/self/fd"))
-    with child.stopped():
-        waiting = threading.Thread(target=flood, args=(publisher,))
-        waiting.start()
-        wait_for(lambda: publisher._patience.is_waiting)
-        thread = threading.Thread(target=node.close)
-        thread.start()
-        thread.join(SOON_S)
-        assert not thread.is_alive()
-        waiting.join(SOON_S)
-        assert not waiting.is_alive()
-        assert len(os.listdir("/proc/self/fd")) < before
-
-
-def flood(publisher) -> None:
-    """Publish until the publisher is closed."""
-    sent = Sent(publisher, 1000)
-    with contextlib.suppress(Closed):
-        while True:
-            sent()
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node
-def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
-    """Also where the parent waits for a reader at the moment of the fork."""
-    node = make_node()
-    publisher = node.publisher("/blocks", Block)
-    (reader,) = subscribe(publisher, start_child, PATIENT)
-    with reader.stopped():
-        waiting = threading.Thread(target=flood, args=(publisher,))
-        waiting.start()
-        wait_for(lambda: publisher._patience.is_waiting)
-        child = os.fork()
-        if child == 0:
-            signal.alarm(int(SOON_S))
-            try:
-                publisher.publish(make_block(0, 10))
-            except Closed:
-                os._exit(0)
-            os._exit(1)
-        assert os.waitpid(child, 0)[1] == 0
-    publisher.close()
-    waiting.join(SOON_S)
-    assert not waiting.is_alive()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node

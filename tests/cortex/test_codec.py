@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import wire_oracle
 from hypothesis import given
-from random_schemas import any_message, schemas, to_plain
+from random_schemas import any_message, to_plain
 
-from cortex.codec import Codec, MalformedMessage, Plan, codec_of
+from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.message import Array, Float32, Int8, UInt16, UInt64, message
 from cortex.messages import Clock, Image, Imu, MotorCommand
 from cortex.schema import schema_of
@@ -304,38 +304,6 @@ def test_bodies_beyond_4_gib_are_refused():
             attempt(MotorCommand(0, huge))
 
 
-@given(any_message(schemas.filter(lambda schema: codec_of_schema(schema).record_dtype is not None)))
-def test_records_are_the_decoded_fields(value):
-    codec = codec_of(type(value))
-    body = body_of(value)
-    assert codec.record_dtype.itemsize == codec.fixed_size == len(body)
-    if not body:
-        return
-    records = np.frombuffer(body * 3, codec.record_dtype)
-    assert records.shape == (3,)
-    for field in codec.schema.fields:
-        expected = getattr(value, field.name)
-        actual = records[1][field.name]
-        if expected is None or (actual.dtype.names and "present" in actual.dtype.names):
-            assert bool(actual["present"]) == (expected is not None)
-        elif isinstance(expected, Enum):
-            assert actual == expected.value
-        elif not actual.dtype.names:
-            np.testing.assert_array_equal(actual, expected)
-
-
-def codec_of_schema(schema: Any) -> Codec:
-    from cortex.schema import type_from_schema
-
-    return codec_of(type_from_schema(schema))
-
-
-def test_types_with_a_tail_have_no_record():
-    assert codec_of(Everything).record_dtype is None
-    assert codec_of(Everything).fixed_size is None
-    assert codec_of(Imu).record_dtype["specific_force"].shape == (3,)
-
-
 @pytest.mark.parametrize("extra", [-1, 1, 8])
 @pytest.mark.parametrize("value", [Imu(0, np.zeros(3), np.zeros(3)), Clock(1, 2)], ids=["arrays", "numbers"])
 def test_bodies_of_fixed_size_have_that_size(value, extra):
@@ -413,6 +381,9 @@ def test_codecs_die_with_their_classes():
     """Who is sent ever new schemas keeps those of the last 256 only."""
     from cortex import schema as schema_module
     from cortex.schema import Field, Schema
+
+    def codec_of_schema(schema):
+        return codec_of(schema_module.type_from_schema(schema))
 
     codec = codec_of_schema(Schema("test/Passing", (Field("value", "int64"),)))
     assert codec.decode(bytes(8)).value == 0

@@ -28,8 +28,7 @@ from processes import ROOT, SOON_S, wait_for
 
 from cortex import Array, Node, Publisher, Unit, keep_last, reliable
 from cortex.cli import main
-from cortex.commands import session
-from cortex.commands.text import bytes_of, message_lines, number_of, plain, rate, seconds, table, to_plain
+from cortex.commands.text import bytes_of, message_lines, number_of, plain, rate, seconds, to_plain
 from cortex.log import open_log
 from cortex.message import message
 from cortex.schema import schema_of
@@ -265,28 +264,6 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
     assert errors == "cortex info: there is no topic /nothing; there are /scan\n"
 
 
-def test_info_goes_on_until_interrupted_and_shows_rates(make_node: MakeNode) -> None:
-    publisher = make_node("robot").publisher("/number", Number)
-    with publishing(publisher, 0.01):
-        wait_for(lambda: "/number" in cortex("topics")[1])
-        child = start("info", "/number")
-        assert child.stdout is not None
-        rates = []
-
-        def is_right() -> bool:
-            """Whether the next rate is 100 Hz; a machine that stands still makes some of them wrong."""
-            line = child.stdout.readline()
-            assert line
-            if line.startswith("robot"):
-                rates.append(child.stdout.readline().split()[1])
-            return len(rates) > 1 and float(rates[-1]) == pytest.approx(100.0, rel=0.3)
-
-        wait_for(is_right)
-        assert rates[0] == "-"
-        status, _, errors = interrupt(child)
-    assert (status, errors) == (0, "")
-
-
 def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None:
     robot, viewer = make_node("robot"), make_node("viewer")
     publisher = robot.publisher("/number", Number)
@@ -388,30 +365,6 @@ def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
     }  # fmt: skip
 
 
-def test_echo_says_that_it_waits_and_ends_at_once(make_node: MakeNode) -> None:
-    make_node("robot").publisher("/other", Number)
-    child = start("echo", "/number")
-    assert child.stderr is not None
-    assert child.stderr.readline() == "waiting for a publisher of /number; published are: /other\n"
-    began_s = time.monotonic()
-    status, output, errors = interrupt(child)
-    assert (status, output, errors) == (0, "", "")
-    assert time.monotonic() - began_s < PROMPTLY_S
-
-
-def test_echo_into_head_is_quiet(make_node: MakeNode) -> None:
-    publisher = make_node("robot").publisher("/number", Number)
-    with publishing(publisher, 0.001):
-        child = start("echo", "/number")
-        assert child.stdout is not None
-        assert child.stdout.readline().startswith("--- /number")
-        child.stdout.close()  # what `head` does when it has seen enough
-        assert child.wait(SOON_S) == 141
-        assert child.stderr is not None
-        assert [line for line in child.stderr.read().splitlines() if "further messages" not in line] == []
-        child.stderr.close()
-
-
 def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
     """100 messages of 16 bytes each second; a machine that stands still for a while is asked again."""
     publisher = make_node("robot").publisher("/number", Number)
@@ -441,19 +394,6 @@ def rates_and_delays_are_right() -> bool:
         and float(column(bw, "bandwidth").split()[0]) == pytest.approx(1.6, rel=0.3)
         and max(delays_s) < 0.5
     )
-
-
-def test_silence_is_told(make_node: MakeNode) -> None:
-    publisher = make_node("robot").publisher("/number", Number)
-    child = start("hz", "/number", "--window", 1)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for i in range(2):
-        publisher.publish(Number(i, i))
-    assert child.stdout is not None
-    lines = [child.stdout.readline() for _ in range(3)]
-    assert lines[0].split()[0] == "rate"
-    assert lines[2].startswith("no message for ")
-    assert interrupt(child)[0] == 0
 
 
 # Files
@@ -499,35 +439,6 @@ def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) ->
     assert errors.endswith("cortex record: nothing was recorded: no message of /number has come\n")
     with open_log(path) as log:
         assert log.message_count == 0
-
-
-def test_recording_says_what_it_waits_for(make_node: MakeNode, tmp_path: Path) -> None:
-    make_node("robot").publisher("/other", Number)
-    child = start("record", "-o", tmp_path / "run.mcap", "/number")
-    assert child.stderr is not None
-    child.stderr.readline()
-    assert child.stderr.readline() == "waiting for a publisher of /number; published are: /other\n"
-    assert interrupt(child)[0] == 1
-
-
-def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None:
-    from test_log import write_numbers
-
-    path = tmp_path / "run.mcap"
-    write_numbers(path, range(100))
-    subscriber = make_node("listener").subscriber("/number", Number, policy=reliable(100))
-    child = start("play", path, "--loop", "--start", 0.5, "--duration", 0.1)
-    values = [subscriber.recv(SOON_S).value for _ in range(15)]
-    first = values[0] - 50  # on a busy machine the player may begin before the listener is attached
-    assert values == [50 + (first + k) % 10 for k in range(15)]
-    status, output, errors = interrupt(child)
-    assert (status, output) == (0, "")  # it ends in no other way
-    assert " messages played; the latest was " in errors
-    child = start("play", path, "--rate", 0.01)
-    assert subscriber.recv(SOON_S).value >= 0
-    status, _, errors = interrupt(child)
-    assert status == 130
-    assert " played; " in errors
 
 
 @pytest.mark.parametrize(
@@ -613,15 +524,6 @@ def test_every_command_has_help(
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
-    from importlib.metadata import version
-
-    with pytest.raises(SystemExit) as end:
-        main(["--version"])
-    assert end.value.code == 0
-    assert capsys.readouterr().out == f"cortex {version('neurosim-core')}\n"
-
-
 def test_help_loads_no_sockets() -> None:
     code = "import sys, cortex.cli; assert 'zmq' not in sys.modules; assert 'cortex.node' not in sys.modules"
     subprocess.run(
@@ -645,32 +547,6 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
     assert (folder / "key.secret").read_text() == secret
 
 
-def test_cpp_finds_modules_of_this_directory(tmp_path: Path) -> None:
-    (tmp_path / "robot.py").write_text(
-        "from cortex import Array, message\n\n\n@message\nclass Lidar:\n    ranges: Array['float32', 'n']\n"
-    )
-    status, output, errors = cortex("cpp", "robot:Lidar", "--namespace", "mine", cwd=tmp_path)
-    assert (status, errors) == (0, "")
-    assert "struct Lidar" in output
-    assert "namespace mine" in output
-
-
-def test_the_headers_are_where_it_says() -> None:
-    status, output, _ = cortex("cpp", "--include-dir")
-    assert status == 0
-    assert (Path(output.strip()) / "cortex" / "node.hpp").is_file()
-
-
-def test_a_registry_of_a_node_is_told_from_others(make_node: MakeNode) -> None:
-    make_node("robot")
-    wait_for(lambda: "robot" in cortex("nodes")[1])
-    status, output, errors = cortex("discovery")
-    assert (status, output) == (1, "")
-    assert errors.startswith("cortex discovery: a registry started by a node (process ")
-    assert "serves domain 0; stop the nodes, or `kill " in errors
-    assert errors.count("\n") == 1
-
-
 def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) -> None:
     child = start("discovery")
     wait_for(lambda: (runtime / "0" / "registry").exists())
@@ -682,28 +558,6 @@ def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) 
     status, _, errors = interrupt(child)
     assert status == 0
     assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
-
-
-def test_a_directory_of_others_is_not_to_be_closed_to_them(runtime: Path) -> None:
-    folder = runtime.with_name(f"{runtime.name}-shared")  # `tmp_path` may be too long for a socket
-    folder.mkdir()
-    folder.chmod(0o1777)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CORTEX_RUNTIME_DIR", str(folder))
-        status, _, errors = cortex("topics")
-    folder.rmdir()
-    assert status == 1
-    assert errors.endswith("is one that others use, too: choose a directory of your own\n")
-
-
-def test_a_registry_that_does_not_answer_is_an_error(
-    runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(session, "_ANSWER_S", 0.2)
-    with signals_kept():
-        assert main(["topics", "--registry", "tcp://127.0.0.1:1"]) == 1
-    output, errors = capsys.readouterr()
-    assert (output, errors) == ("", "cortex topics: no answer from tcp://127.0.0.1:1\n")
 
 
 # Text
@@ -734,17 +588,6 @@ def test_numbers_have_units(shown: str, expected: str) -> None:
 def test_names_of_others_command_no_terminal() -> None:
     assert plain("robot") == "robot"
     assert plain("a\x1b[31m\n\x9b1mü\u202e") == "a\\x1b[31m\\x0a\\x9b1mü\\x202e"
-
-
-def test_tables_are_aligned() -> None:
-    lines = list(table(("name", "count", "<what"), [("a", "1", "x"), ("long", "1,000", "")]))
-    assert lines == ["name  count  what", "a         1  x", "long  1,000"]
-
-
-def test_a_table_that_is_too_wide_is_folded_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "20")
-    lines = list(table(("name", "count", "<what"), [("n" * 12, "1", "reliable")]))
-    assert [line.split() for line in lines] == [["name"], ["count", "what"], ["n" * 12], ["1", "reliable"]]
 
 
 @given(

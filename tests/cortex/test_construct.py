@@ -99,10 +99,6 @@ def test_refuses_as_init_does(args, kwargs):
     assert str(ours.value) == str(theirs.value)
 
 
-def test_names_need_not_be_interned():
-    assert Point(**{"".join(["x", ""]): 1, bytes([121]).decode(): 2.0}) == Point(1, 2.0)
-
-
 def test_factories_run_for_each_message():
     first, second = Listed(1), Listed(2)
     assert first.items == []
@@ -135,17 +131,6 @@ def test_a_subclass_runs_its_own_init():
     assert Longer(1).z == 9
 
 
-def test_an_init_that_was_replaced_runs(monkeypatch):
-    def init(self: Point, x: int) -> None:
-        object.__setattr__(self, "x", -x)
-
-    assert Point(3).x == 3
-    monkeypatch.setattr(Point, "__init__", init)
-    assert Point(3).x == -3
-    monkeypatch.undo()
-    assert Point(3) == plain_init(Point, 3)
-
-
 def test_values_are_held_once_and_let_go():
     array = np.zeros(3)
 
@@ -171,18 +156,3 @@ def test_cycles_are_collected():
     del items, probe
     gc.collect()
     assert gone() is None
-
-
-@needs_native
-def test_hasten_refuses_what_it_cannot_do():
-    class Loose:
-        def __init__(self, x: int) -> None:
-            self.x = x
-
-    with pytest.raises(AttributeError):
-        native.hasten(Loose, ("x",), {})
-    with pytest.raises(TypeError):
-        native.hasten(Loose, ("__dict__",), {})
-    with pytest.raises(TypeError):
-        native.hasten(int, (), {})
-    assert Loose(1).x == 1

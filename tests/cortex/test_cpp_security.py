@@ -14,10 +14,12 @@ import pytest
 from cpp_client import Peer
 from cpp_messages import Rich, Scan
 from cpp_programs import needs_compiler, programs
+from directories import serving
 from processes import SOON_S, wait_for
 
 from cortex.node import Node
 from cortex.policy import reliable
+from cortex.registry import Registry
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
 
 __all__ = ["programs"]
@@ -52,27 +54,30 @@ def elsewhere() -> Iterator[Path]:
 
 
 @pytest.fixture
-def python_node(places: dict[str, Path], make_node: Callable[..., Node]) -> Node:
-    keys = load_keys(places["python"])
-    return make_node(registry="off", listen="127.0.0.1", keys=keys)
+def registry(places: dict[str, Path], runtime: Path) -> Iterator[Registry]:
+    with serving(listen="tcp://127.0.0.1:*", keys=load_keys(places["python"])) as serves:
+        yield serves
+
+
+@pytest.fixture
+def python_node(registry: Registry, places: dict[str, Path], make_node: Callable[..., Node]) -> Node:
+    return make_node(listen="127.0.0.1", keys=load_keys(places["python"]))
 
 
 @pytest.fixture
 def start_cpp(
     programs: Path,
-    python_node: Node,
+    registry: Registry,
     places: dict[str, Path],
     elsewhere: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Start:
-    """Start a peer of the Python node, with the keys of a directory; a stranger is not waited for."""
+    """Start a program on another host, with the keys of a directory; a stranger is not waited for."""
 
     def start(name: str, *arguments: object) -> Any:
-        [tcp] = [e for e in python_node.nodes()[0].endpoints if e.transport == "tcp"]
-        address = tcp.control
         authorize(places[name], load_keys(places["python"]).public)
         with monkeypatch.context() as environment:
-            environment.setenv("CORTEX_TEST_PEER", address)
+            environment.setenv("CORTEX_TEST_REGISTRY", str(registry.address))
             environment.setenv("CORTEX_TEST_KEYS", str(places[name]))
             environment.setenv("CORTEX_TEST_LISTEN", "127.0.0.1")
             environment.setenv("CORTEX_RUNTIME_DIR", str(elsewhere))
@@ -132,12 +137,7 @@ def test_a_stranger_cannot_read_cpp(
         if e.transport == "tcp"
     ]
     authorize(places["stranger"], tcp.server_key)
-    stranger = make_node(
-        registry="off",
-        peers=[tcp.control],
-        listen="127.0.0.1",
-        keys=load_keys(places["stranger"]),
-    )
+    stranger = make_node(listen="127.0.0.1", keys=load_keys(places["stranger"]))
     scans = stranger.subscriber("/from_cpp", Rich)
     with pytest.raises(TimeoutError):
         scans.recv(1.0)

@@ -12,7 +12,7 @@ import pytest
 from cortex.cppgen import generate
 from cortex.layout import block_size, has_tail, measure_fields
 from cortex.message import Array, Int16, UInt8, message
-from cortex.schema import ArrayType, EnumType, Field, Schema, schema_of
+from cortex.schema import EnumType, Field, Schema, schema_of
 
 INCLUDE = Path(__file__).parents[2] / "cortex" / "cpp" / "include"
 
@@ -72,47 +72,6 @@ def test_codec_carries_identity_and_layout() -> None:
     assert block_size(schema) == 16
     assert ("fixed = true;" in text) == (not has_tail(schema))
     assert "return static_cast<std::int64_t>(message.stamp_ns);" in text
-
-
-def test_words_of_cpp_and_macros_are_avoided(tmp_path: Path) -> None:
-    """Whatever fields may be called, the header compiles, twice in one file."""
-    words = (
-        "class",
-        "int",
-        "NULL",
-        "errno",
-        "linux",
-        "and",
-        "Words",
-        "operator",
-        "at",
-        "out",
-        "sink",
-        "reader",
-    )
-    mode = EnumType("delete", (("default", 1), ("EOF", -(2**31)), ("NULL", 2**31 - 1), ("ONE", 1)))
-    fields = [Field(word, "int32") for word in words]
-    fields += [
-        Field("class_", "str"),
-        Field("mode", mode),
-        Field("n", ArrayType("float32", ("message", "class"))),
-    ]
-    text = generate([_schema("Words", *fields)])
-    for member in (
-        "class_",
-        "int_",
-        "NULL_",
-        "errno_",
-        "linux_",
-        "and_",
-        "Words_",
-        "operator_",
-        "at",
-        "class__",
-    ):
-        assert re.search(rf" {member}\{{\}};", text), member
-    done = _compile(text, tmp_path, "static_assert(static_cast<int>(::delete_::default_) == 1);")
-    assert done.returncode == 0, done.stderr
 
 
 def test_text_of_units_stays_in_comments_and_strings(tmp_path: Path) -> None:

@@ -75,30 +75,6 @@ def test_a_draft_of_an_image_of_open_dtype():
     assert not draft.data.flags.writeable
 
 
-def test_fixed_arrays_of_a_draft_are_in_place():
-    codec = codec_of(Mixed)
-    memory = np.full(codec.draft_size({"n": 5}), 0xAA, np.uint8)
-    draft = codec.draft(memory, {"n": 5})
-    value = mixed()
-    assert np.shares_memory(draft.large, memory)
-    for name in (field.name for field in codec.schema.fields):
-        setattr(draft, name, getattr(value, name))
-    size = codec.finish(draft)
-    assert codec.decode(memory[:size].tobytes()) == value
-
-
-def test_unset_fields_take_their_defaults():
-    codec = codec_of(Mixed)
-    memory = np.zeros(codec.draft_size({"n": 5}), np.uint8)
-    draft = codec.draft(memory, {"n": 5})
-    value = mixed()
-    for field in dataclasses.fields(Mixed)[:-2]:
-        setattr(draft, field.name, getattr(value, field.name))
-    assert codec.decode(memory[: codec.finish(draft)].tobytes()) == value
-    assert draft.flag is True
-    assert draft.tags == ["tag"]
-
-
 def test_drafts_refuse_what_does_not_fit():
     codec = codec_of(Events)
     memory = np.zeros(codec.draft_size({"n": 3}), np.uint8)

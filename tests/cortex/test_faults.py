@@ -13,12 +13,11 @@ import threading
 import time
 
 import pytest
-from peer import Block, Number, OtherNumber, is_whole, make_block
+from peer import Block, Number, is_whole, make_block
 from processes import SOON_S, processes_with, wait_for
 
 from cortex import keep_last, latest, reliable
 from cortex.host import REGISTRY_LOCK, runtime_dir
-from cortex.schema import TypeMismatch
 
 KILLS = int(os.environ.get("CORTEX_KILLS", "15"))
 STOP_S = float(os.environ.get("CORTEX_STOP_S", "2"))
@@ -145,32 +144,6 @@ def test_subscribers_are_killed(make_node, start_child, runtime, policy):
             longest_s.append(stream.longest_s)
     assert min(freed_s) < 0.3  # 1 s, if nobody noticed; a busy machine makes some of them late, but not each
     assert min(longest_s) < 0.5
-
-
-def test_the_other_subscriber_notices_nothing(make_node, start_child, runtime):
-    """One of two is killed again and again; the reliable one beside it gets every message."""
-    node = make_node()
-    publisher = node.publisher("/blocks", Block)
-    numbers = []
-
-    def take(block):
-        assert is_whole(block)
-        numbers.append(block.number)
-
-    other = node.subscriber("/blocks", Block, take, policy=reliable(64, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with Stream(publisher) as stream:
-        for round_ in range(max(KILLS // 7, 1)):
-            policy = POLICIES[round_ % len(POLICIES)]
-            child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=3)
-            child.hear()
-            wait_for(lambda child=child: child.ask()["count"] > 10)
-            child.kill()
-            goes_on(stream)
-    wait_for(lambda: len(numbers) == stream.published)
-    assert numbers == list(range(len(numbers)))
-    assert (other.counters.lost, other.counters.rejected) == (0, 0)
-    assert stream.refused == 0
 
 
 def test_registries_are_killed(make_node, start_child, runtime):
@@ -302,45 +275,6 @@ def test_a_publisher_is_restarted(make_node, start_child, runtime):
             child.finish()
     assert len(sources) == 3
     assert (subscriber.counters.received, subscriber.counters.lost) == (600, 0)
-
-
-def test_a_subscriber_of_another_version(make_node, start_child, runtime):
-    """It is told, the others are not disturbed, and no frame reaches it."""
-    child = start_child("peer")
-    child.hear()
-    child.ask(do="publisher", topic="/numbers", type="Number")
-    node = make_node()
-    other = node.subscriber("/numbers", OtherNumber)
-    right = node.subscriber("/numbers", Number)
-    assert right.wait_for_publisher(SOON_S)
-    with pytest.raises(TypeMismatch, match="float64"):
-        other.recv(SOON_S)
-    child.ask(do="publish", topic="/numbers", count=10)
-    assert [right.recv(SOON_S).value for _ in range(10)] == list(range(10))
-    with pytest.raises(TimeoutError):
-        other.recv(0.0)
-    assert (other.counters.received, other.counters.rejected) == (0, 1)
-
-
-def test_two_hundred_topics(make_node, start_child, runtime):
-    """Between two processes: all meet within seconds, and each carries its own messages."""
-    child = start_child("peer")
-    child.hear()
-    node = make_node()
-    topics = [f"/topic{number}" for number in range(200)]
-    begin = time.monotonic()
-    for topic in topics:
-        child.ask(do="publisher", topic=topic, type="Number")
-    subscribers = [node.subscriber(topic, Number, policy=reliable(8, 60.0)) for topic in topics]
-    assert all(subscriber.wait_for_publisher(SOON_S) for subscriber in subscribers)
-    assert time.monotonic() - begin < SOON_S
-    for number, topic in enumerate(topics):
-        child.ask(do="publish", topic=topic, count=3, start=10 * number)
-    for number, subscriber in enumerate(subscribers):
-        assert [subscriber.recv(SOON_S).value for _ in range(3)] == [10 * number + k for k in range(3)]
-    assert len(node.topics()) == 200
-    child.kill()
-    wait_for(lambda: not any(info.publishers for info in node.topics()))
 
 
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(8, 60.0)], ids=str)

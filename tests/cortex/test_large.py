@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peer import Block, Number, Scan, is_whole, make_block
+from peer import Block, Scan, is_whole, make_block
 from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.broadcast
 import cortex.link
 from cortex import keep_last, latest, reliable
-from cortex.publisher import Closed
 
 LARGE = 100_000
 
@@ -66,43 +65,6 @@ def test_a_large_message_is_a_view(node):
     assert not is_shared(subscriber.recv(SOON_S))
     del message
     assert slots_held(publisher) == 0
-
-
-def test_a_slice_keeps_the_lease(node):
-    """The slot is not written again until the last array that looks at it is gone."""
-    publisher, subscriber = connected(node, Scan, latest())
-    publisher.publish(scan(1))
-    part = subscriber.recv(SOON_S).ranges[10:20][::2]
-    for number in range(2, 100):
-        publisher.publish(scan(number))
-        subscriber.recv(SOON_S)
-    assert part.tolist() == [1.0] * 5
-    assert slots_held(publisher) == 1
-    del part
-    assert slots_held(publisher) == 0
-
-
-def test_who_keeps_more_than_by_default_is_given_room(node):
-    """10 M events/s are a packet of 130 kB each millisecond: a reader that is late by 50 ms loses nothing."""
-    size = 32_000  # of float32: 128 kB
-    publisher, subscriber = connected(node, Scan, keep_last(128))
-    for number in range(4):  # rings are made with the first ones
-        publisher.publish(scan(number, size))
-        assert subscriber.recv(SOON_S).stamp_ns == number
-    for number in range(60):
-        publisher.publish(scan(number, size))
-    assert [subscriber.recv(SOON_S).stamp_ns for _ in range(60)] == list(range(60))
-    assert subscriber.counters.lost == subscriber.counters.overtaken == 0
-
-
-def test_messages_that_wait_and_are_overtaken_give_their_slots_back(node):
-    publisher, subscriber = connected(node, Scan, latest())
-    for number in range(50):
-        publisher.publish(scan(number))
-    assert subscriber.recv(SOON_S).stamp_ns == 49
-    wait_for(lambda: slots_held(publisher) == 0)
-    counters = subscriber.counters
-    assert counters.received + counters.overtaken + counters.lost == 50
 
 
 def test_views_outlive_everything(make_node):
@@ -444,30 +406,6 @@ def test_a_loan_may_be_published_by_another_thread(node, size):
     assert publisher.counters.published == 1
 
 
-def test_a_loan_that_is_not_to_be_had_counts_for_nothing(node):
-    """Unlike `loan`, which is a message that is lost: whoever tries has another way to publish it."""
-    publisher, subscriber = connected(node, Scan, keep_last(64))
-    loans = []
-    while len(loans) < 200 and (loan := publisher.try_loan(n=1_000_000)) is not None:
-        loans.append(loan)
-    assert 3 <= len(loans) < 200
-    for loan in loans:
-        loan.drop()
-    assert publisher.publish(scan(5))
-    assert subscriber.recv(SOON_S).stamp_ns == 5
-    assert (subscriber.counters.lost, publisher.counters.skipped) == (0, 0)
-
-
-def test_rings_of_a_deep_reader_stay_within_their_bound(node):
-    """Messages that grow slowly get larger rings, and none takes more than is meant for it."""
-    publisher, subscriber = connected(node, Scan, keep_last(256))
-    for size in range(100_000, 400_000, 30_000):
-        publisher.publish(scan(size, size))
-        assert subscriber.recv(SOON_S).stamp_ns == size
-        ring = publisher._fanout.ring._ring
-        assert ring.slots * ring.slot_bytes <= cortex.broadcast.DEEP_BYTES
-
-
 def test_too_many_loans(node):
     publisher, subscriber = connected(node, Scan, keep_last(64))
     loans = []
@@ -504,33 +442,3 @@ def test_a_loan_while_the_rings_grow(node):
     assert message.stamp_ns == 100
     assert (message.ranges == 100.0).all()
     assert subscriber.counters.lost == 0
-
-
-def test_a_loan_of_a_closed_publisher(node):
-    """Closing while the block runs: an error, not a message from the grave."""
-    publisher, subscriber = connected(node, Scan, keep_last())
-
-    def lend_and_close(size):
-        other = node.publisher("/large", Scan)
-        with other.loan(n=size) as draft:
-            draft.stamp_ns = 1
-            draft.ranges[:] = 1.0
-            other.close()
-
-    for size in (3, LARGE):
-        with pytest.raises(Closed):
-            lend_and_close(size)
-    assert publisher.publish(scan(2))
-    assert subscriber.recv(SOON_S).stamp_ns == 2
-
-
-def test_a_fixed_type_has_nothing_to_declare(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with publisher.loan() as draft:
-        draft.stamp_ns = 1
-        draft.value = 2
-    assert subscriber.recv(SOON_S) == Number(1, 2)
-    with pytest.raises((TypeError, ValueError), match="n"), publisher.loan(n=3):
-        pass

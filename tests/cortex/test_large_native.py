@@ -22,30 +22,6 @@ def node(make_node):
     return make_node(registry="off")
 
 
-def test_the_gate_sends_large_messages_itself(node, monkeypatch):
-    """As soon as there is a ring; a slot has the bytes that the codec writes."""
-    publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
-    for number in range(3):
-        publisher.publish(scan(number))
-        subscriber.recv(SOON_S)
-    ring = publisher._gate.ring
-    assert ring is not None
-    monkeypatch.setattr(publisher, "_publish_slowly", None)
-    for size in (5_000, 20_000, 100_000):  # copied at once, deferred, without the lock
-        message = scan(7, size)
-        assert publisher.publish(message)
-        info, body, _ = subscriber.recv_raw(1.0)
-        assert bytes(body) == publisher.codec.encode(message, 1 << 30)
-        assert (info.stamp_ns, info.size) == (7, len(body))
-        del body
-    assert publisher.counters.bytes == sum(
-        publisher.codec.size(scan(0, size)) for size in (100_000, 100_000, 100_000, 5_000, 20_000, 100_000)
-    )
-    assert publisher._gate.ring is ring
-    wait_for(lambda: slots_held(publisher) == 0)
-    assert subscriber.counters.lost == 0
-
-
 def test_what_is_not_as_usual_goes_the_long_way(node):
     """Another class, a wrong dtype, an array that is not contiguous: the same words, and no slot is lost."""
     publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
@@ -64,21 +40,6 @@ def test_what_is_not_as_usual_goes_the_long_way(node):
     assert (message.ranges == np.arange(0, 200_000, 2)).all()
     del message
     wait_for(lambda: slots_held(publisher) == 0)
-
-
-def test_a_reader_that_is_behind_holds_up_or_loses(node):
-    """Whoever has no room is left to Python, which waits or counts."""
-    publisher, subscriber = connected(node, Scan, keep_last(4))
-    for number in range(200):
-        assert publisher.publish(scan(number, 30_000))
-    counters = subscriber.counters
-    received = 0
-    message = None
-    while message is None or message.stamp_ns < 199:
-        message = subscriber.recv(SOON_S)
-        assert (message.ranges == message.stamp_ns).all()
-        received += 1
-    wait_for(lambda: received + counters.lost + counters.overtaken == 200)
 
 
 def test_publishers_in_several_threads(node):

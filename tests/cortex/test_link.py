@@ -188,34 +188,6 @@ def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
         feed.close()
 
 
-@pytest.mark.parametrize("kind", [MESSAGE, LARGE])
-def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog):
-    """Or somebody who sends rubbish would fill the log."""
-    feed = Feed(Scan)
-    try:
-        for more in range(1, 40):
-            frames = feed.frames(kind, 1)
-            feed.socket.send_multipart([*frames[:-1], frames[-1] + bytes(more)])
-            assert feed.drain() == []
-        assert feed.subscriber.counters.rejected == 39
-        assert len([record for record in caplog.records if record.name == "cortex.link"]) == 1
-    finally:
-        feed.close()
-
-
-@pytest.mark.parametrize("kind", [MESSAGE, LARGE])
-def test_frames_that_follow_a_good_one_are_junk(runtime, kind):
-    """A message has its frames and no more; what is behind them is not taken for another message."""
-    feed = Feed(Number)
-    try:
-        feed.socket.send_multipart([*feed.frames(kind, 1), b"junk", b""])
-        assert feed.drain() == [1]
-        assert feed.subscriber.counters.rejected == 2
-        feed.still_lives(9)
-    finally:
-        feed.close()
-
-
 def test_a_latched_message_that_is_none_is_rejected(runtime):
     feed = Feed(Number)
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
@@ -12,11 +11,10 @@ import warnings
 import numpy as np
 import pytest
 from peer import Scan
-from processes import SOON_S, wait_for
+from processes import SOON_S
 from test_large import connected, scan
 
 from cortex import Loan, Publisher, keep_last, reliable
-from cortex.context import Closed
 
 LARGE = 50_000
 FORGOTTEN = "/large: a loan was forgotten, neither published nor dropped"
@@ -85,35 +83,6 @@ def test_who_still_can_write_keeps_the_slot(node):
     drop_all([*loans, last])
 
 
-def test_what_was_published_or_dropped_is_not_forgotten(node):
-    """Nor is a small loan, which holds nothing; arrays that outlive a loan tell nothing, and free nothing."""
-    publisher, subscriber = connected(node, Scan, keep_last(64))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        kept = []
-        for number, end in enumerate((Loan.publish, Loan.drop)):
-            loan = publisher.try_loan(n=LARGE)
-            kept.append(loan.draft.ranges)
-            fill(loan.draft, number)
-            end(loan)
-            loan.drop()
-            del loan
-        message = subscriber.recv(SOON_S)
-        loans = borrow_all(publisher)
-        kept.clear()
-        assert borrow_all_or_none(publisher) == []  # what the subscriber looks at is not free
-        assert (message.ranges == 0).all()
-        drop_all(loans)
-        forget_small = publisher.try_loan(n=3)
-        del forget_small
-        gc.collect()
-
-
-def borrow_all_or_none(publisher: Publisher[Scan]) -> list[Loan]:
-    loan = publisher.try_loan(n=LARGE)
-    return [] if loan is None else [loan, *borrow_all(publisher)]
-
-
 def test_the_garbage_collector_comes_at_the_worst_moment(node):
     """While the thread that it runs in holds the locks that publishing takes."""
     publisher, _ = connected(node, Scan, keep_last(64))
@@ -142,46 +111,6 @@ def test_the_garbage_collector_comes_at_the_worst_moment(node):
     drop_all(loans)
 
 
-def test_threads_forget_while_others_publish(node):
-    publisher, subscriber = connected(node, Scan, keep_last(8))
-    count = len(loans := borrow_all(publisher))
-    drop_all(loans)
-    failures: list[BaseException] = []
-
-    def forget_often() -> None:
-        try:
-            for _ in range(300):
-                loan = publisher.try_loan(n=LARGE)
-                if loan is not None:
-                    loan.draft.ranges[:1000] = -1.0
-        except BaseException as error:
-            failures.append(error)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        threads = [threading.Thread(target=forget_often) for _ in range(2)]
-        for thread in threads:
-            thread.start()
-        for number in range(300):
-            publisher.publish(scan(number, LARGE))
-            with contextlib.suppress(TimeoutError):
-                message = subscriber.recv(0.0)
-                assert (message.ranges == message.stamp_ns).all()
-        for thread in threads:
-            thread.join(SOON_S)
-            assert not thread.is_alive()
-    assert not failures
-    message = None
-    subscriber.close()
-    wait_for(lambda: publisher.subscriber_count == 0)
-    other = node.subscriber("/large", Scan)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    loans = borrow_all(publisher)
-    assert len(loans) >= count
-    drop_all(loans)
-    other.close()
-
-
 def test_a_forgotten_loan_does_not_hold_up_the_end(node):
     publisher, _ = connected(node, Scan, keep_last())
     with pytest.warns(ResourceWarning, match=FORGOTTEN):
@@ -195,31 +124,6 @@ def end_in_time(publisher: Publisher[Scan]) -> None:
     thread.start()
     thread.join(SOON_S)
     assert not thread.is_alive()
-
-
-def test_a_loan_that_comes_too_late_gives_its_slot_back(node):
-    """Its publisher is being closed, and waits for what is under way."""
-    publisher, _ = connected(node, Scan, keep_last())
-    loan = publisher.try_loan(n=LARGE)
-    fill(loan.draft, 1)
-    thread = threading.Thread(target=publisher.close, kwargs={"linger_s": 100.0 * SOON_S}, daemon=True)
-    thread.start()
-    wait_for(lambda: publisher._closed)
-    with pytest.raises(Closed):
-        loan.publish()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
-
-
-def test_a_loan_that_outlives_its_publisher_is_silent(node):
-    publisher, _ = connected(node, Scan, keep_last())
-    loan = publisher.try_loan(n=LARGE)
-    publisher.close(linger_s=0.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        loan.draft.ranges[:] = 1.0
-        del loan
-        gc.collect()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node

@@ -6,25 +6,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from peer import Scan, make_block
+from peer import make_block
 from processes import SOON_S, wait_for
 from test_large import connected, slots_held
 
-from cortex import Array, Closed, Publisher, keep_last, message, reliable
+from cortex import Publisher, keep_last, reliable
 from cortex.compiled import native
 from cortex.messages import Image
 
 SHAPE = (60, 480, 3)
 DIMS = dict(zip(("height", "width", "channels"), SHAPE, strict=True))
-
-
-@message
-class Framed:
-    """An array in the block with which a body begins, and one behind it."""
-
-    stamp_ns: int
-    matrix: Array["f8", 3, 3]
-    data: Array["u1", "n"]
 
 
 @pytest.fixture
@@ -110,18 +101,6 @@ def test_arrays_that_lie_elsewhere_are_copied(node, way):
     wait_for(lambda: slots_held(publisher) == 0)
 
 
-def test_an_array_in_the_block_is_kept(node, way):
-    publisher, subscriber = connected(node, Framed, reliable(64, SOON_S))
-    for number in range(3):
-        loan = publisher.try_loan(n=50_000)
-        loan.draft.matrix[:] = np.arange(9).reshape(3, 3) + number
-        loan.draft.data[:] = number
-        loan.publish(Framed(stamp_ns=number, matrix=loan.draft.matrix, data=loan.draft.data))
-        received = subscriber.recv(SOON_S)
-        assert (received.matrix == np.arange(9).reshape(3, 3) + number).all()
-        assert (received.data == number).all()
-
-
 def test_what_lies_elsewhere_goes_the_long_way(node, way):
     """There it is checked against what was lent, and copied without the lock."""
     publisher, subscriber = connected(node, Image, reliable(64, SOON_S))
@@ -133,36 +112,6 @@ def test_what_lies_elsewhere_goes_the_long_way(node, way):
         loan.publish(image(pixels(number), number))
         assert (subscriber.recv(SOON_S).data == pixels(number)).all()
     assert True not in way
-
-
-@message
-class Mount:
-    """An array in a block."""
-
-    matrix: Array["f8", 3, 3]
-
-
-@message
-class Mounted:
-    """A message within, with an array in its block, and an array behind."""
-
-    stamp_ns: int
-    mount: Mount
-    data: Array["f8", "n"]
-
-
-def test_arrays_of_a_message_within_may_lie_in_the_slot(node, way):
-    """Where the body goes: they are read before anything is written there."""
-    publisher, subscriber = connected(node, Mounted, reliable(64, SOON_S))
-    for number in range(3):
-        loan = publisher.try_loan(n=20_000)
-        room = loan.draft.data
-        room[:] = np.arange(20_000) + number
-        loan.publish(Mounted(stamp_ns=number, mount=Mount(room[7:16].reshape(3, 3)), data=room))
-        received = subscriber.recv(SOON_S)
-        assert (received.mount.matrix == np.arange(9).reshape(3, 3) + 7 + number).all()
-        assert (received.data == np.arange(20_000) + number).all()
-        del received, room, loan
 
 
 def test_what_does_not_fit_leaves_no_slot_behind(node, way):
@@ -182,16 +131,6 @@ def test_what_does_not_fit_leaves_no_slot_behind(node, way):
     assert (subscriber.recv(SOON_S).data == pixels(5)).all()
 
 
-def test_a_small_one(node, way):
-    publisher, subscriber = connected(node, Scan, reliable(64, SOON_S))
-    loan = publisher.try_loan(n=100)
-    loan.draft.ranges[:] = 3.0
-    assert loan.publish(Scan(5, loan.draft.ranges))
-    received = subscriber.recv(SOON_S)
-    assert received.stamp_ns == 5
-    assert (received.ranges == 3.0).all()
-
-
 def test_a_reader_without_room(node, way):
     """Who keeps two gets the newest, and whoever is slow is counted: nothing is overwritten that is held."""
     publisher, subscriber = connected(node, Image, keep_last(2))
@@ -208,12 +147,3 @@ def test_a_reader_without_room(node, way):
             held.append(subscriber.recv(SOON_S))
     for received in held:
         assert (received.data == pixels(received.sequence)).all()
-
-
-def test_after_the_end(node, way):
-    publisher, _ = connected(node, Image, reliable(64, SOON_S))
-    loan = publisher.try_loan({"data": "u1"}, **DIMS)
-    lent = image(loan.draft.data)
-    publisher.close()
-    with pytest.raises(Closed):
-        loan.publish(lent)

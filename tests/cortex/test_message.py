@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import typing
-from dataclasses import KW_ONLY, field
+from dataclasses import field
 from enum import Enum, Flag, IntEnum
-from typing import Annotated, Any, ClassVar, Optional, Union
+from typing import Annotated, Any, Optional, Union
 
 import numpy as np
 import pytest
@@ -127,13 +126,6 @@ def test_lists_of_arrays_compare_by_value():
     assert Ragged([np.arange(2)]) != Ragged([np.arange(3)])
 
 
-def test_repr_is_short():
-    assert repr(Point(1.0)) == "Point(x=1.0, y=0.0)"
-    assert "ranges=float32[4](0.0, 1.0, 2.0, 3.0)" in repr(scan())
-    assert "ranges=float32[1000]," in repr(scan(ranges=np.zeros(1000, np.float32)))
-    assert len(repr(scan(tags=["x" * 10000] * 100))) < 2000
-
-
 @given(any_message())
 def test_a_copy_is_equal_and_owns_its_arrays(value):
     copied = value.copy() if "copy" not in value.__cortex_names__ else None
@@ -157,80 +149,6 @@ def test_a_copy_is_deep():
     assert copied.at is not value.at
     with pytest.raises(dataclasses.FrozenInstanceError):
         copied.stamp_ns = 2
-
-
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="typing resolves KW_ONLY in text from 3.11 on")
-def test_keyword_only_fields():
-    @message
-    class Keyed:
-        a: int
-        _: KW_ONLY
-        b: int
-        c: int = 3
-
-    assert Keyed(1, b=2) == Keyed(a=1, b=2, c=3)
-    assert [f.name for f in schema_of(Keyed).fields] == ["a", "b", "c"]
-    with pytest.raises(TypeError):
-        Keyed(1, 2)
-
-
-def test_inherited_fields_come_first():
-    @message
-    class Stamped:
-        stamp_ns: int
-
-    @message
-    class Reading(Stamped):
-        value: float
-
-    assert [f.name for f in schema_of(Reading).fields] == ["stamp_ns", "value"]
-    assert Reading(1, 2.0).copy() == Reading(1, 2.0)
-    assert Reading(1, 2.0) != Stamped(1)
-
-    class Plain(Stamped):  # not a message: it has no schema of its own
-        pass
-
-    assert not is_message(Plain)
-    with pytest.raises(TypeError, match="not a message type"):
-        schema_of(Plain)
-
-
-def test_methods_and_class_variables_are_no_fields():
-    @message
-    class Circle:
-        radius: float
-        sides: ClassVar[int] = 0
-
-        def __post_init__(self) -> None:
-            if self.radius < 0.0:
-                raise ValueError("radius")
-
-        @property
-        def area(self) -> float:
-            return 3.0 * self.radius**2
-
-        def __repr__(self) -> str:
-            return "circle"
-
-    assert [f.name for f in schema_of(Circle).fields] == ["radius"]
-    assert Circle(2.0).area == 12.0
-    assert repr(Circle(2.0)) == "circle"
-    with pytest.raises(ValueError, match="radius"):
-        Circle(-1.0)
-
-
-def test_the_fingerprint_does_not_depend_on_the_module():
-    def define(module: str) -> type:
-        class Twin:
-            __module__ = module
-            a: int
-
-        return message(Twin)
-
-    first, second = define("json"), define("math")
-    assert first is not second
-    assert first.__module__ != second.__module__
-    assert schema_of(first).fingerprint == schema_of(second).fingerprint == first.__cortex_fingerprint__
 
 
 class Colours(Enum):

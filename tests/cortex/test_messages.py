@@ -159,15 +159,6 @@ def test_small_messages_are_of_fixed_size(cls, size):
     assert "of fixed size" in cls.__doc__
 
 
-def test_imu_samples_as_records():
-    codec = codec_of(Imu)
-    samples = [Imu(k, V3 * k, -V3 * k, k) for k in range(5)]
-    records = np.frombuffer(b"".join(codec.encode(s, 64) for s in samples), codec.record_dtype)
-    np.testing.assert_array_equal(records["stamp_ns"], range(5))
-    np.testing.assert_array_equal(records["specific_force"], [s.specific_force for s in samples])
-    np.testing.assert_array_equal(records["angular_rate"], [s.angular_rate for s in samples])
-
-
 def test_event_arrays_have_one_length():
     events = EXAMPLES[4]
     with pytest.raises(ValueError, match=r"cortex/Events\.t: dimension n is 2, but 3"):

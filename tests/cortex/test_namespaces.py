@@ -215,15 +215,3 @@ def test_a_stranger_sees_nobody_and_is_seen_by_nobody(hosts, start, keyring, key
     assert not any("stranger" in line for line in near.said + friend.said)
     if keys:
         assert registry.read("refused key"), registry.said
-
-
-def test_static_peers_of_two_hosts(hosts, start, keyring, place):
-    """Without a registry, over plain tcp that was asked for."""
-    listed = node(start, hosts[0], "listed", registry="off", listen=f"tcp://{ADDRESSES[0]}:0")
-    match = listed.read(r'"control": "(tcp://[0-9.:]+)"')
-    assert match, listed.said
-    lister = node(start, hosts[1], "lister", registry="off", peers=[match[1]], insecure=True)
-    assert lister.sees("listed"), lister.said
-    assert listed.sees("lister"), listed.said
-    lister.signal(signal.SIGKILL)
-    assert listed.sees(), listed.said

@@ -177,41 +177,6 @@ def test_vectors(name):
         assert str(after_c.value) == str(by_python.value)
 
 
-def test_everything_damaged_word_by_word():
-    """All of the body but the items of its large array, and the two words that are its end."""
-    value = everything(names=["", "hé"], ragged=[np.ones((2, 2), np.float16), np.zeros((0, 0))])
-    body = python_body(value)
-    assert coder_of(Everything).encode(value, 1 << 20) == body
-    places = [*range(0, 256, 4), *range(256 + 1600, len(body), 4)]
-    taken = 0
-    for place in places:
-        for word in (0, 1, 2, 64, len(body), len(body) + 1, 2**31, 2**32 - 1):
-            damaged = body[:place] + word.to_bytes(4, "little") + body[place + 4 :]
-            taken += check_decoding(Everything, damaged)
-    assert 0 < taken < 8 * len(places)
-
-
-@pytest.mark.parametrize(
-    "value", [everything(), everything(names=[""] * 3), Point(1.0)], ids=["all", "", "point"]
-)
-def test_bodies_that_are_cut_off_or_longer(value):
-    body = python_body(value)
-    for size in (*range(0, len(body), 7), len(body) - 1):
-        check_decoding(type(value), body[:size])
-    for size in (1, 8, 64):
-        check_decoding(type(value), body + bytes(size))
-
-
-def test_absent_is_none_and_empty_is_nothing():
-    absent = dict.fromkeys(("level", "maybe", "point", "mask", "large"))
-    empty = {name: [] for name in ("points", "modes", "flags", "sizes", "names", "ragged", "deep")}
-    value = everything(**absent, **empty)
-    coder, body = coder_of(Everything), python_body(value)
-    assert coder.encode(value, len(body)) == body
-    assert coder.decode(body, 0, len(body)) == value
-    assert check_decoding(Everything, body)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -332,41 +297,6 @@ def test_more_names_than_there_is_room_for():
     assert coder_of(cls) is None
     value = cls(*[np.full(k // 2, k, np.uint8) for k in range(130)])
     assert codec_of(cls).decode(codec_of(cls).encode(value, 1 << 20)) == value
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        (Point, 16, 0, (("x", (0, "d", 9, None)),)),
-        (Point, 16, 0, (("x", (0, "d", -1, None)),)),
-        (Point, 16, 0, (("x", (0, "?", 0, None)),)),
-        (Point, 16, 0, (("x", (10, "-", 0, None)),)),
-        (Point, 16, 0, (("x", (-1, "-", 0, None)),)),
-        (Point, 16, 0, (("nothing", (0, "d", 0, None)),)),
-        (Point, -1, 0, ()),
-        (Point, 2**32, 0, ()),
-        (Point, 16, 65, ()),
-        (Point, 16, 0, (("x", (3, "-", 0, ((np.dtype("f8"),), (3,), (-1,), 0)),),)),
-        (Point, 16, 0, (("x", (3, "-", 0, ((np.dtype("f8"),), (-1,), (-1,), 0)),),)),
-        (Point, 16, 0, (("x", (4, "-", 0, ((), (-1,), (-1,), 0)),),)),
-        (Point, 16, 0, (("x", (4, "-", 0, (("f8",), (-1,), (-1,), 0)),),)),
-        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,) * 3, (-1,) * 3, 0)),),)),
-        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,), (0,), 0)),),)),
-        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,), (), 0)),),)),
-        (Point, 999, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,) * 33, (-1,) * 33, 0)),),)),
-        (Point, 16, 0, (("x", (7, "-", 0, (0, "d", 0, None))),)),
-        (Point, 16, 0, (("x", (7, "-", 8, (0, "d", 8, None))),)),
-        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 4, 8, 0))),)),
-        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 0, 8, 0))),)),
-        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 8, 3, 0))),)),
-        (Point, 16, 0, (("x", (9, "-", 8, (Point, 16, 0, ()))),)),
-        (Point, 16, 0, (("x", (2, "-", 0, ((2**31, Mode.OFF),))),)),
-    ],
-)  # fmt: skip
-def test_rows_that_are_not_as_they_should_be(row):
-    """What memory safety rests on is checked in C, too."""
-    with pytest.raises((TypeError, ValueError, OverflowError, AttributeError)):
-        native.Coder(row, -1, b"")
 
 
 def test_types_come_and_go():

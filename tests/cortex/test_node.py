@@ -15,13 +15,12 @@ import weakref
 
 import pytest
 import zmq
-from peer import Number, OtherNumber, Scan, make
-from processes import ROOT, SOON_S, in_time, wait_for
+from peer import Number, OtherNumber, Scan
+from processes import ROOT, SOON_S, wait_for
 
 from cortex import latest, reliable
 from cortex.context import new_socket
 from cortex.host import runtime_dir
-from cortex.node import Node
 from cortex.publisher import Closed
 from cortex.records import StatsReply, StatsRequest
 from cortex.registry import control_types
@@ -46,20 +45,6 @@ def run_script(code):
 
 
 # Seeing each other
-
-
-def test_a_name_is_needed(runtime):
-    for name in ("", "x" * 101):
-        with pytest.raises(ValueError, match="1 to 100 characters"):
-            Node(name)
-    assert not list(runtime.iterdir())
-
-
-def test_importing_the_package_and_its_parts_in_any_order(runtime):
-    """`from cortex import message` is the decorator, whatever was imported before."""
-    for first in ("cortex.host", "cortex.message", "cortex.node"):
-        code = f"import {first}\nfrom cortex import message, Node\nprint(callable(message), callable(Node))"
-        assert run_script(code) == ["True", "True"]
 
 
 def test_nodes_and_topics(make_node):
@@ -95,18 +80,6 @@ def test_domains_do_not_see_each_other(make_node):
     assert subscriber.publisher_count == 0
 
 
-def test_a_subscriber_that_is_there_first(make_node):
-    """In either order the two meet."""
-    one, two = make_node("one"), make_node("two")
-    wait_for(lambda: len(one.nodes()) == 2 == len(two.nodes()))
-    for k, (first, second) in enumerate(itertools.product((one, two), repeat=2)):
-        subscriber = first.subscriber(f"/topic{k}", Number)
-        publisher = second.publisher(f"/topic{k}", Number)
-        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        publisher.publish(Number(0, k))
-        assert subscriber.recv(SOON_S).value == k
-
-
 # Counters of others
 
 
@@ -129,23 +102,6 @@ def test_counters_of_this_and_other_nodes(make_node):
         assert got.latency_counts.sum() > 0
     with pytest.raises(KeyError):
         one.ask_stats(12345)
-
-
-def test_a_node_that_does_not_answer(make_node, start_child):
-    """A stopped process: an error in time."""
-    child = start_child("peer")
-    node_id = child.hear()["node"]
-    node = make_node()
-    wait_for(lambda: len(node.nodes()) == 2)
-    with child.stopped():
-
-        def ask():
-            with pytest.raises(TimeoutError, match=r"did not answer within 0\.2 s"):
-                node.ask_stats(node_id, timeout_s=0.2)
-
-        in_time(ask, 1.0)
-    wait_for(lambda: node_id in {n.node for n in node.nodes()})
-    assert node.ask_stats(node_id, SOON_S).node == node_id
 
 
 # Junk
@@ -241,40 +197,6 @@ def test_closing_in_any_order(make_node):
         assert not thread.is_alive()
 
 
-def test_closing_from_several_threads(make_node):
-    for _ in range(5):
-        node = make_node(registry="off")
-        publisher = node.publisher("/numbers", Number)
-        subscriber = node.subscriber("/numbers", Number, lambda message: None)
-        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        closes = [node.close, publisher.close, subscriber.close] * 2
-        threads = [threading.Thread(target=close) for close in closes]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(SOON_S)
-            assert not thread.is_alive()
-
-
-def test_closing_is_quick(make_node):
-    """Also with a reliable subscriber that does not read."""
-
-    def took_s():
-        node, other = make_node("one"), make_node("two")
-        publisher = node.publisher("/scans", Scan)
-        subscriber = other.subscriber("/scans", Scan, policy=reliable(2, 0.01))
-        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        for number in range(30):
-            publisher.publish(make(Scan, number, 100_000))
-        begin = time.monotonic()
-        node.close()
-        assert subscriber.recv(SOON_S).stamp_ns == 0
-        other.close()
-        return time.monotonic() - begin
-
-    wait_for(lambda: took_s() < 1.5)  # a busy machine makes some attempts late, but not each
-
-
 def test_what_is_closed_is_forgotten(make_node):
     """A node that opens and closes publishers, subscribers and services all day does not grow."""
     node = make_node(registry="off")
@@ -333,18 +255,6 @@ print(time.time())
 """
     wait_for(lambda: time.time() - float(run_script(code)[0]) < 3.0)  # a busy machine may be late at times
     wait_for(lambda: set(os.listdir(runtime_dir(0))) <= DOMAIN_FILES)
-
-
-def test_a_program_that_raises_with_open_nodes(runtime):
-    code = """
-import sys
-from cortex import Node
-from peer import Number
-node = Node("failing")
-publisher = node.publisher("/numbers", Number)
-sys.exit(0) if publisher.publish(Number(0, 0)) else None
-"""
-    assert run_script(code) == []
 
 
 # Forks
@@ -462,20 +372,6 @@ def test_a_jump_of_the_clock(make_node, monkeypatch):
             assert 0 < info.latency_ns < 10**9
     assert subscriber.counters.lost == 0
     assert len(one.nodes()) == 2
-
-
-@pytest.mark.parametrize("wrong", [{"policy": latest}, {"policy": "latest"}, {"callback": 3}])
-def test_what_is_no_policy_or_callback_is_refused_at_once(make_node, wrong):
-    """A forgotten pair of parentheses is said where it happens, and not in another thread later."""
-    node = make_node()
-    with pytest.raises(TypeError, match=next(iter(wrong))):
-        node.subscriber("/numbers", Number, **wrong)
-
-
-def test_a_message_in_place_of_its_type_is_refused(make_node):
-    node = make_node()
-    with pytest.raises(TypeError, match="not a message type"):
-        node.publisher("/scans", make(Scan, 0, 3))
 
 
 def test_a_callback_that_always_raises_does_not_flood_the_log(make_node, caplog):

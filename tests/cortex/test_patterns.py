@@ -128,13 +128,6 @@ class NewCar:
     label: str | None
 
 
-@message(name="Number")
-class NewNumber:
-    stamp_ns: int
-    value: int
-    error: float | None
-
-
 def test_a_subscriber_takes_types_that_grew_and_types_that_have_not(make_node):
     node = make_node()
     old = node.publisher("/old", Car)
@@ -156,22 +149,6 @@ def test_a_subscriber_takes_types_that_grew_and_types_that_have_not(make_node):
         assert (shrunk.stamp_ns, shrunk.gear) == (6, Gear.PARKED)
         for received in (grown, shrunk):
             np.testing.assert_array_equal(received.ranges, ranges[:size])
-
-
-def test_arrays_of_a_type_that_has_grown(make_node):
-    """`recv_batch` gives records of the subscriber's own type."""
-    node = make_node()
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", NewNumber, policy=reliable())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for value in range(20):
-        publisher.publish(Number(value, 10 * value))
-    values: list[int] = []
-    while len(values) < 20:
-        records = subscriber.recv_batch(SOON_S)
-        assert "error" in records.dtype.names
-        values += records["value"].tolist()
-    assert values == [10 * value for value in range(20)]
 
 
 def test_other_changes_are_still_refused(make_node):

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from peer import Number, Scan
-from processes import SOON_S, in_time, wait_for
+from processes import SOON_S, wait_for
 
 from cortex import keep_last, reliable
 from cortex.publisher import Closed
@@ -28,18 +28,6 @@ def scan(number, size=3):
 
 
 # What is refused
-
-
-def test_nobody_listens(node):
-    publisher = node.publisher("/numbers", Number)
-    assert all(publisher.publish(Number(0, value)) for value in range(10))
-    counters = publisher.counters
-    assert (counters.published, counters.timeouts, counters.skipped) == (10, 0, 0)
-    assert publisher.subscriber_count == 0
-    begin = time.monotonic()
-    assert not publisher.wait_for_subscribers(1, 0.05)
-    assert time.monotonic() - begin >= 0.05
-    in_time(lambda: publisher.wait_for_subscribers(1, 0.05), 1.0)
 
 
 @pytest.mark.parametrize("listened", [False, True])
@@ -79,13 +67,6 @@ def test_a_topic_has_a_form(node, topic):
     assert node.topics() == []
 
 
-def test_a_type_must_be_a_message(node):
-    with pytest.raises(TypeError, match="int"):
-        node.publisher("/numbers", int)
-    with pytest.raises(TypeError, match="int"):
-        node.subscriber("/numbers", int)
-
-
 # Snapshots and order
 
 
@@ -100,16 +81,6 @@ def test_what_was_published_may_be_changed(node, size):
     received = subscriber.recv(SOON_S).ranges
     assert (received == 1.0).all()
     assert not np.shares_memory(received, ranges)
-
-
-def test_arrays_that_are_not_contiguous(node):
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for size in (10, LARGE):
-        ranges = np.arange(2 * size, dtype=np.float32)[::-2]
-        publisher.publish(Scan(1, ranges))
-        np.testing.assert_array_equal(subscriber.recv(SOON_S).ranges, ranges)
 
 
 def test_small_and_large_messages_keep_their_order(node):
@@ -187,32 +158,6 @@ def test_a_latch_that_was_filled_before_anybody_came_and_across_nodes(make_node)
     publisher.publish(scan(1, LARGE))
     subscriber = make_node("late").subscriber("/scans", Scan)
     assert subscriber.recv(SOON_S).stamp_ns == 1
-
-
-def test_without_a_latch_a_late_subscriber_gets_nothing(node):
-    publisher = node.publisher("/scans", Scan)
-    publisher.publish(scan(1))
-    subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv(0.05)
-    empty = node.publisher("/empty", Scan, latch=True)
-    subscriber = node.subscriber("/empty", Scan)
-    assert empty.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv(0.05)
-
-
-def test_a_loan_is_latched_too(node):
-    publisher = node.publisher("/scans", Scan, latch=True)
-    for size in (3, LARGE):
-        with publisher.loan(n=size) as draft:
-            draft.stamp_ns = size
-            draft.ranges[:] = 7.0
-        subscriber = node.subscriber("/scans", Scan)
-        message = subscriber.recv(SOON_S)
-        assert message.stamp_ns == size
-        assert (message.ranges == 7.0).all()
 
 
 # Coming and going
@@ -304,7 +249,7 @@ def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     done = threading.Event()
 
     def publish():
-        for value in range(20_000):
+        for value in range(40_000):
             assert publisher.publish(Number(0, value))
         done.set()
 

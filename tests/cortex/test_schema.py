@@ -7,11 +7,9 @@ import contextlib
 import copy
 import dataclasses
 import hashlib
-import itertools
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import numpy as np
@@ -201,7 +199,7 @@ def test_a_fixed_part_at_the_limit_has_a_codec():
     """Built without touching any of that memory; a dimension that is not fixed has its own limit."""
     schema = Schema("a", (field(ArrayType("uint8", (2**15, 2**15))),))
     codec = codec_of(type_from_schema(schema))
-    assert codec.record_dtype.itemsize == codec.fixed_size == 2**30
+    assert codec.fixed_size == 2**30
     assert Schema("a", (field(ArrayType("uint8", (2**31, "n"))),))
 
 
@@ -253,24 +251,6 @@ def test_every_change_of_a_type_changes_the_fingerprint():
     ]
     prints = {Schema("a", (field(kind),)).fingerprint for kind in kinds}
     assert len(prints) == len(kinds) > 500
-
-
-def test_no_collision_among_100_000_types():
-    """64 bits: the chance that two of 1e5 collide by accident is 3e-10."""
-    words = ["position", "velocity", "force", *"abcdefg"]
-    types = [*SCALAR_SIZES, "str", "bytes"]
-    units = ["", "m", "m/s", "rad"]
-    frames = ["", "world", "body"]
-    rows = itertools.product(words, types, units, frames, words, types[:9], ["", "s"])
-    template = (
-        '{"name":"t","fields":[{"name":"%s","type":"%s","unit":"%s","frame":"%s"},'
-        '{"name":"%s_","type":"%s","unit":"%s","frame":""}]}'
-    )
-    texts = [template % row for row in rows]
-    prints = {schema_module.fingerprint_of(text.encode()) for text in texts}
-    assert len(prints) == len(texts) == len(set(texts)) >= 100_000
-    for text in (texts[0], texts[len(texts) // 2], texts[-1]):  # the texts are what schemas are written as
-        assert Schema.from_json(text).fingerprint == schema_module.fingerprint_of(text.encode())
 
 
 def test_the_fingerprint_is_the_same_in_every_process():
@@ -390,11 +370,3 @@ def test_the_cache_of_classes_is_bounded():
     for k in range(600):
         type_from_schema(Schema(f"bounded/T{k}", (field(),)))
     assert len(schema_module._classes) <= 256
-
-
-def test_threads_get_one_class():
-    for k in range(20):
-        schema = Schema(f"threads/T{k}", (field(), field("str", "b")))
-        with ThreadPoolExecutor(4) as pool:
-            made = list(pool.map(type_from_schema, [schema] * 4))
-        assert len(set(made)) == 1

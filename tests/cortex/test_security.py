@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 
 import pytest
@@ -139,62 +138,6 @@ def test_without_an_authenticator_a_server_socket_is_refused(context):
     with pytest.raises(RuntimeError, match=r"Authenticator\.acquire"):
         apply_server(socket, pair())
     socket.close()
-
-
-def test_after_the_last_release_nobody_is_let_in(context):
-    """It fails closed: libzmq's default would let everybody in."""
-    keys = pair()
-    authenticator = Authenticator.acquire(context)
-    server, address = serve(context, keys)
-    authenticator.release()
-    client = subscribe(context, address, lambda socket: apply_client(socket, keys, keys.public))
-    assert not gets_something(server, client, NOTHING_MS)
-    server.close()
-    client.close()
-
-
-def test_the_authenticator_lives_as_long_as_its_last_user(context):
-    first, second = Authenticator.acquire(context), Authenticator.acquire(context)
-    assert first is second
-    first.release()
-    keys = pair()
-    server, address = serve(context, keys)
-    client = subscribe(context, address, lambda socket: apply_client(socket, keys, keys.public))
-    assert gets_something(server, client, 1e3 * SOON_S)
-    second.release()
-    assert not [t for t in threading.enumerate() if t.name == "cortex-zap"]
-    third = Authenticator.acquire(context)  # the address is free again
-    third.release()
-    server.close()
-    client.close()
-
-
-def test_terminating_the_context_ends_the_thread():
-    context = zmq.Context()
-    authenticator = Authenticator.acquire(context)
-    worker = threading.Thread(target=context.term)
-    worker.start()
-    worker.join(SOON_S)
-    assert not worker.is_alive()
-    authenticator.release()
-    assert not [t for t in threading.enumerate() if t.name == "cortex-zap"]
-
-
-def test_many_threads_share_one_authenticator(context):
-    def use():
-        for _ in range(20):
-            acquired = Authenticator.acquire(context)
-            acquired.domain_of(pair())
-            acquired.release()
-
-    threads = [threading.Thread(target=use) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(SOON_S)
-    assert not any(thread.is_alive() for thread in threads)
-    with pytest.raises(RuntimeError):
-        Authenticator.of(context)
 
 
 def test_keys_are_private_and_never_overwritten(tmp_path):

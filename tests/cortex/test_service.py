@@ -15,16 +15,11 @@ from cortex import Closed, ServiceFailed, ServiceTimeout, ServiceUnavailable
 from cortex.codec import codec_of
 from cortex.context import new_socket
 from cortex.message import message
-from cortex.records import ServiceError
 from cortex.schema import TypeMismatch
-from cortex.service import PENDING_MAX, Client, Place, Server, Service, service_number
+from cortex.service import PENDING_MAX, Client, Place
 from cortex.wire import (
     CONTROL_LIMIT,
-    ERROR,
-    HEADER_SIZE,
     REPLY,
-    REQUEST,
-    Header,
     pack_header,
     unpack_header,
 )
@@ -92,13 +87,6 @@ def test_a_call_between_processes(make_node, start_child):
     client.close()
 
 
-def test_request_and_reply_of_different_types(node):
-    node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
-    with node.client("/bulk", Number, Bulk) as client:
-        for size in (0, 1, 1000, 10_000_000):
-            assert client.call(Number(0, size), timeout_s=SOON_S).data == bytes(size)
-
-
 # Failures
 
 
@@ -116,18 +104,6 @@ def test_a_handler_that_raises(node, caplog):
     assert sum(record.exc_info is not None for record in caplog.records) == 3
 
 
-def test_a_handler_that_returns_something_else(node, caplog):
-    node.service("/wrong", Number, Number, lambda request: None)
-    node.service("/value", Number, Number, lambda request: Number("x", 1))
-    with (
-        node.client("/wrong", Number, Number) as client,
-        pytest.raises(ServiceFailed, match="must return Number"),
-    ):
-        client.call(Number(0, 0), SOON_S)
-    with node.client("/value", Number, Number) as client, pytest.raises(ServiceFailed, match="stamp_ns"):
-        client.call(Number(0, 0), SOON_S)
-
-
 def test_nobody_offers_it(node):
     with node.client("/nobody", Number, Number) as client:
         assert not client.available()
@@ -139,14 +115,6 @@ def test_nobody_offers_it(node):
             assert time.monotonic() - begin >= 0.1
 
         in_time(call, 1.0)
-
-
-def test_it_comes_in_time(node):
-    with node.client("/late", Number, Number) as client:
-        timer = threading.Timer(0.1, node.service, ("/late", Number, Number, double))
-        timer.start()
-        assert client.call(Number(0, 4), timeout_s=SOON_S).value == 8
-        timer.join()
 
 
 def test_it_is_withdrawn(node):
@@ -199,14 +167,6 @@ def test_a_request_has_a_limit(node, excess):
         assert client.call(Bulk(b"123"), SOON_S).value == 3
 
 
-def test_a_reply_has_a_limit(node, caplog):
-    node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
-    with node.client("/bulk", Number, Bulk) as client:
-        with pytest.raises(ServiceFailed, match="over the limit"):
-            client.call(Number(0, CONTROL_LIMIT + 1), timeout_s=SOON_S)
-        assert client.call(Number(0, 3), SOON_S).data == bytes(3)
-
-
 # Deadlines
 
 
@@ -249,24 +209,6 @@ def test_a_request_whose_time_is_over_is_not_acted_upon(node):
     assert seen == [1, 3]
     for client in clients:
         client.close()
-
-
-def test_a_request_that_was_sent_long_ago_is_not_acted_upon():
-    """A server that was stopped reads it late; the deadline of its host's clock tells."""
-    seen, replies = [], []
-    server = Server(lambda action: action())
-    number = service_number("/double", Number, Number)
-    server.add(Service("/double", number, Number, Number, lambda request: seen.append(request) or request))
-    body = codec_of(Number).encode(Number(0, 1), 1000)
-    fingerprint = codec_of(Number).fingerprint
-    for stamp_ns in (time.monotonic_ns() - 1, time.monotonic_ns() + 10**10, None):
-        header = Header(REQUEST, 1, fingerprint, 1, stamp_ns, 10**10, len(body), number)
-        server.handle(pack_header(header) + body, replies.append)
-    headers = [unpack_header(reply) for reply in replies]
-    assert [header.kind for header in headers] == [ERROR, REPLY, REPLY]
-    assert codec_of(ServiceError).decode(replies[0], HEADER_SIZE).kind == "late"
-    assert [header.stamp_ns for header in headers] == [None] * 3
-    assert len(seen) == 2
 
 
 @pytest.mark.parametrize("local", [True, False])
@@ -356,53 +298,6 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
         socket.close(0)
 
 
-def test_calls_of_several_threads_share_their_time(node):
-    """One client: the calls follow one another; who waits too long for its turn gets an error."""
-    release, entered = threading.Event(), threading.Event()
-
-    def handle(request):
-        entered.set()
-        release.wait(SOON_S)
-        return request
-
-    node.service("/slow", Number, Number, handle)
-    with node.client("/slow", Number, Number) as client:
-        outcomes = []
-
-        def call(value):
-            outcomes.append(client.call(Number(0, value), timeout_s=SOON_S).value == value)
-
-        threads = [threading.Thread(target=call, args=(value,)) for value in range(5)]
-        for thread in threads:
-            thread.start()
-        assert entered.wait(SOON_S)
-        with pytest.raises(ServiceTimeout):
-            client.call(Number(0, 5), timeout_s=0.1)
-        assert not outcomes
-        release.set()
-        for thread in threads:
-            thread.join()
-        assert outcomes == [True] * 5
-
-
-def test_several_clients(node):
-    node.service("/double", Number, Number, double)
-    wrong = []
-
-    def run(number):
-        with node.client("/double", Number, Number) as client:
-            for k in range(50):
-                if client.call(Number(number, k), timeout_s=SOON_S) != Number(number, 2 * k):
-                    wrong.append((number, k))
-
-    threads = [threading.Thread(target=run, args=(number,)) for number in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(SOON_S)
-    assert not wrong
-
-
 def test_too_many_requests(node):
     """Those over the number that may wait are refused at once, the others are served."""
     release, entered = threading.Event(), threading.Event()
@@ -468,24 +363,6 @@ def test_a_handler_that_calls_its_own_node(node, caplog):
         client.call(Number(0, 1), timeout_s=SOON_S)
     assert inner.call(Number(0, 1), timeout_s=SOON_S).value == 2
     inner.close()
-
-
-def test_a_server_that_is_stopped(make_node, start_child):
-    """SIGSTOP: an error when the time is over, not before and not much later; then it goes on."""
-    child = start_child("peer")
-    served(child)
-    with make_node().client("/double", Number, Number) as client:
-        assert client.call(Number(0, 1), timeout_s=SOON_S).value == 2
-        with child.stopped():
-
-            def call():
-                begin = time.monotonic()
-                with pytest.raises(ServiceTimeout):
-                    client.call(Number(0, 1), timeout_s=0.3)
-                assert time.monotonic() - begin >= 0.3
-
-            in_time(call, 1.0)
-        assert client.call(Number(0, 2), timeout_s=SOON_S).value == 4
 
 
 def test_a_server_that_is_killed_during_a_call(make_node, start_child):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 import time
 
 import pytest
 import zmq
 
-from cortex.compiled import native
 from cortex.context import Frames
 
 FRAMES = [b"", b"x", b"y" * 29, b"z" * 30, b"a" * 33, b"b" * 34, b"c" * 5000, b"d" * 300_000]
@@ -88,23 +85,3 @@ def test_a_closed_one_raises(pair):
         sender.send(b"frame", zmq.DONTWAIT)
     with pytest.raises(zmq.ZMQError):
         receiver.receive(zmq.DONTWAIT)
-
-
-@pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
-def test_what_is_no_frame_is_refused(pair):
-    sender = Frames(pair[0])
-    for wrong in ("text", None, bytearray(b"frame")):
-        with pytest.raises(TypeError):
-            sender.send(wrong, 0)
-    with pytest.raises(TypeError):
-        Frames(pair[1]).receive("now")
-
-
-@pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
-def test_a_library_that_is_not_loaded_is_refused():
-    """In a process of its own, as the functions are looked up once."""
-    program = (
-        "import zmq; from cortex import _native; _native.Socket(0, '/nowhere.so', zmq.Again, zmq.ZMQError)"
-    )
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert "OSError: /nowhere.so is not loaded" in found.stderr

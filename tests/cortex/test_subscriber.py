@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import itertools
 import queue
 import signal
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import zmq
-from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
+from peer import Number, OtherNumber, Scan
 from processes import SOON_S, in_time, wait_for
 
-from cortex import keep_last, latest, reliable, turn
+from cortex import keep_last, reliable, turn
 from cortex.codec import codec_of
 from cortex.publisher import Closed
 from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
-from cortex.subscriber import BLOCK_S, LOOK_EVERY
 
 LARGE = 100_000
 
@@ -62,24 +59,6 @@ def test_nothing_comes_in_time(numbers):
         subscriber.recv(0.0)
 
 
-@pytest.mark.parametrize("timeout_s", [0.03, 0.05, 0.09, 0.25])
-def test_what_is_left_of_a_timeout_is_not_waited_for_twice(node, monkeypatch, timeout_s):
-    """Asleep for all of it, nothing blocks in the socket after that; the clock stands but for these."""
-    subscriber = node.subscriber("/numbers", Number, policy=latest())
-    now_s = 0.0
-
-    def wait(duration_s):
-        nonlocal now_s
-        now_s += duration_s
-
-    monkeypatch.setattr("cortex.subscriber.time", SimpleNamespace(monotonic=lambda: now_s))
-    monkeypatch.setattr(subscriber, "_wait", wait)
-    monkeypatch.setattr(subscriber, "_take", lambda *, block: wait(BLOCK_S) if block else None)
-    with pytest.raises(TimeoutError):
-        subscriber.recv(timeout_s)
-    assert now_s == pytest.approx(timeout_s)
-
-
 def test_an_answer_is_looked_for_without_sleeping(numbers, monkeypatch):
     publisher, subscriber = numbers
     with pytest.raises(TimeoutError):
@@ -97,59 +76,6 @@ def test_an_answer_is_looked_for_without_sleeping(numbers, monkeypatch):
         subscriber.look_out(SOON_S)
         assert time.monotonic() < deadline_s
     assert subscriber.recv(SOON_S).value == 1
-
-
-def test_after_a_look_in_vain_the_next_ones_are_left_out(numbers, monkeypatch):
-    publisher, subscriber = numbers
-    wait_for(lambda: not subscriber.look_out(1e-9))
-    looks = []
-    monkeypatch.setattr("cortex.subscriber.os.sched_yield", lambda: looks.append(1))
-    publisher.publish(Number(0, 1))
-    assert [subscriber.look_out(SOON_S) for _ in range(LOOK_EVERY - 1)] == [False] * (LOOK_EVERY - 1)
-    assert looks == []
-    assert subscriber.look_out(SOON_S)
-    assert subscriber.recv(SOON_S).value == 1
-
-
-def test_what_came_along_with_the_last_message_is_not_waited_for(numbers, monkeypatch):
-    """It lies in the socket, or in the reader of the pipe: no descriptor shows it."""
-    publisher, subscriber = numbers
-    wait_for(lambda: not subscriber.look_out(1e-9))  # nothing is left of the beginning
-    subscriber._looks_left_out = 0
-    looks = []
-    monkeypatch.setattr("cortex.subscriber.os.sched_yield", lambda: looks.append(1))
-    for value in (1, 2):
-        publisher.publish(Number(0, value))
-    assert subscriber.recv(SOON_S).value == 1
-    assert subscriber.look_out(SOON_S)
-    assert looks == []
-    assert subscriber.recv(0.0).value == 2
-
-
-def test_a_publisher_that_comes_while_an_answer_is_looked_for(node):
-    subscriber = node.subscriber("/numbers", Number)
-    publishers = []
-
-    def publish():
-        publishers.append(node.publisher("/numbers", Number))
-        assert publishers[0].wait_for_subscribers(timeout_s=SOON_S)
-        for value in (1, 2):
-            publishers[0].publish(Number(0, value))
-
-    later = threading.Timer(0.01, publish)
-    later.start()
-    for value in (1, 2):
-        subscriber.look_out(0.5)
-        assert subscriber.recv(SOON_S).value == value
-    later.join()
-
-
-def test_a_closed_subscriber_is_not_looked_at(numbers):
-    _, subscriber = numbers
-    subscriber.close()
-    assert subscriber.look_out(SOON_S)
-    with pytest.raises(Closed):
-        subscriber.recv(0.0)
 
 
 @pytest.mark.alone
@@ -216,18 +142,6 @@ def test_what_is_known_of_a_message(node, numbers):
         assert info.size == codec_of(Number).fixed_size
 
 
-def test_a_type_without_a_stamp_has_none(node):
-    publisher = node.publisher("/blocks", Block)
-    subscriber = node.subscriber("/blocks", Block)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    publisher.publish(make_block(1, 10))
-    publisher.publish(make_block(2, LARGE))
-    for number in (1, 2):
-        message, info = subscriber.recv_with_info(SOON_S)
-        assert (message.number, info.stamp_ns) == (number, None)
-        assert is_whole(message)
-
-
 def test_arrays_cannot_be_written(node):
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan)
@@ -266,74 +180,6 @@ def test_several_threads_share_a_stream(numbers):
     assert sorted(itertools.chain.from_iterable(taken)) == list(range(2000))
     assert all(values == sorted(values) for values in taken)
     assert subscriber.counters.received == 2000
-
-
-# Batches
-
-
-def test_a_batch_holds_what_is_there(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    values, stamps, sizes = [], [], []
-    for start in range(0, 1000, 200):
-        for value in range(start, start + 200):
-            publisher.publish(Number(10 * value, value))
-        while len(values) < start + 200:
-            batch = subscriber.recv_batch(SOON_S)
-            assert batch.dtype == codec_of(Number).record_dtype
-            assert not batch.flags.writeable
-            values += batch["value"].tolist()
-            stamps += batch["stamp_ns"].tolist()
-            sizes.append(len(batch))
-    assert values == list(range(1000))
-    assert stamps == [10 * value for value in values]
-    assert max(sizes) > 10
-    assert subscriber.counters.received == 1000
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-
-
-def test_single_messages_after_batches(node):
-    """Who has asked for batches may go on one by one, in order."""
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-    for value in range(100):
-        publisher.publish(Number(value, value))
-    first = subscriber.recv_batch(SOON_S)["value"].tolist()
-    rest = [subscriber.recv_with_info(SOON_S) for _ in range(100 - len(first))]
-    assert first + [message.value for message, _ in rest] == list(range(100))
-    assert [info.sequence for _, info in rest] == list(range(len(first), 100))
-    assert subscriber.counters.received == 100
-
-
-@pytest.mark.parametrize("depth", [1, 10])
-def test_batches_are_bounded_by_the_policy(node, depth):
-    """Of a thousand, the last ones wait."""
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=keep_last(depth))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    with pytest.raises(TimeoutError):
-        subscriber.recv_batch(0.0)
-    for value in range(1000):
-        publisher.publish(Number(value, value))
-    values = []
-    while not values or values[-1] < 999:
-        values += subscriber.recv_batch(SOON_S)["value"].tolist()
-    assert values == list(range(1000 - depth, 1000))
-    counters = subscriber.counters
-    assert (counters.received, counters.overtaken) == (depth, 1000 - depth)
-
-
-def test_a_type_of_varying_size_has_no_batches(node):
-    subscriber = node.subscriber("/scans", Scan)
-    with pytest.raises(TypeError, match="only a type of fixed size"):
-        subscriber.recv_batch(0.0)
-    with pytest.raises(TypeError, match="only a type of fixed size"):
-        node.subscriber("/scans", None).recv_batch(0.0)
 
 
 # Raw and generic
@@ -407,32 +253,6 @@ def test_another_type_is_told_once_with_both_structures(node):
     assert subscriber.recv(SOON_S) == Number(1, 1)
 
 
-def test_a_new_subscriber_is_not_taken_for_a_dead_one(node):
-    """One that did not fit is closed, and what comes in its place is not treated as it was."""
-    publisher = node.publisher("/numbers", Number)
-    for value in range(20):
-        wrong = node.subscriber("/numbers", OtherNumber)
-        with pytest.raises(TypeMismatch):
-            wrong.recv(SOON_S)
-        wrong.close()
-        del wrong
-        gc.collect()
-        right = node.subscriber("/numbers", Number)
-        assert publisher.wait_for_subscribers(1, SOON_S)
-        publisher.publish(Number(0, value))
-        assert right.recv(SOON_S).value == value
-        right.close()
-        del right
-        gc.collect()
-        wait_for(lambda: publisher.subscriber_count == 0)
-
-
-def test_a_callback_hears_of_another_type_in_the_log(node, caplog):
-    node.publisher("/numbers", OtherNumber)
-    node.subscriber("/numbers", Number, lambda message: None)
-    wait_for(lambda: any("float64" in record.getMessage() for record in caplog.records))
-
-
 # Iterators
 
 
@@ -482,7 +302,6 @@ def test_use_after_close(numbers):
         lambda: subscriber.recv(0.0),
         lambda: subscriber.recv_with_info(0.0),
         lambda: subscriber.recv_raw(0.0),
-        lambda: subscriber.recv_batch(0.0),
         lambda: subscriber.wait_for_publisher(0.0),
         lambda: asyncio.run(subscriber.recv_async(0.0)),
     ]
@@ -524,7 +343,7 @@ def test_many_publishers_of_a_topic(node):
         assert streams[publisher.source] == [(number, value, value) for value in range(40)]
 
 
-@pytest.mark.parametrize("how", ["recv", "recv_batch", "callback"])
+@pytest.mark.parametrize("how", ["recv", "callback"])
 @pytest.mark.parametrize("policy", [reliable(16, 60.0), keep_last(64)], ids=str)
 def test_no_publisher_starves_another(node, policy, how):
     """Two that send more than is read: both come through."""
@@ -558,11 +377,8 @@ def test_no_publisher_starves_another(node, policy, how):
         while not done.is_set() and time.monotonic() < deadline:
             if how == "callback":
                 done.wait(0.01)
-            elif how == "recv":
-                take(subscriber.recv(SOON_S))
             else:
-                for stamp_ns, value in subscriber.recv_batch(SOON_S).tolist():
-                    take(Number(stamp_ns, value))
+                take(subscriber.recv(SOON_S))
     finally:
         starved = not done.is_set()
         done.set()
@@ -629,12 +445,6 @@ def test_iteration_goes_on_after_a_mismatch(node):
         next(messages)
     assert next(messages).value == 7
     bad.close()
-
-
-def test_messages_for_a_callback_are_not_to_be_fetched(node):
-    subscriber = node.subscriber("/numbers", Number, lambda message: None)
-    with pytest.raises(RuntimeError, match="callback"):
-        subscriber.recv(0.01)
 
 
 @pytest.mark.parametrize("how", ["recv", "recv_async"])

@@ -6,11 +6,12 @@ import contextlib
 import os
 import shutil
 import subprocess
+import sys
 
 import pytest
 import zmq
-from peer import Block, Number, Scan, is_whole, make, make_block
-from processes import SOON_S, wait_for
+from peer import Block, Number, is_whole, make_block
+from processes import SOON_S
 
 import cortex.node
 from cortex import reliable
@@ -265,33 +266,6 @@ def test_frames_have_a_limit(runtime):
             assert least + HEADER_SIZE < socket.maxmsgsize < least + HEADER_SIZE + 10_000
 
 
-# Without a registry
-
-
-@pytest.mark.parametrize("transport", ["ipc", "tcp"])
-def test_static_peers(make_node, start_child, transport, runtime):
-    """No registry is started; each names the other, or one of them does."""
-    options = {} if transport == "ipc" else {"listen": "127.0.0.1", "host": "elsewhere"}
-    child = start_child("peer", registry="off", **options)
-    control = child.hear()["control"]
-    assert control.startswith(transport)
-    node = make_node(registry="off", peers=[control], listen=None if transport == "ipc" else "127.0.0.1")
-    child.ask(do="subscriber", topic="/ours", type="Scan", policy=["reliable"])
-    child.ask(do="publisher", topic="/theirs", type="Scan")
-    publisher, subscriber = node.publisher("/ours", Scan), node.subscriber("/theirs", Scan)
-    assert publisher.wait_for_subscribers(1, SOON_S)
-    assert subscriber.wait_for_publisher(SOON_S)
-    for number, size in enumerate((12, 400_000)):
-        assert publisher.publish(make(Scan, number, size))
-        assert child.ask(do="receive", topic="/ours", until=number)["count"] == 1
-        child.ask(do="publish", topic="/theirs", count=1, start=number, size=size)
-        assert subscriber.recv(SOON_S) == make(Scan, number, size)
-    assert node.wait_for_registry(5.0)
-    assert not (runtime / "0" / "registry").exists()
-    child.finish()
-    wait_for(lambda: len(node.nodes()) == 1)
-
-
 # Two hosts
 
 
@@ -327,25 +301,23 @@ def hosts(runtime):
 
 
 def test_two_hosts(hosts, start_child, tmp_path):
-    """Two kernels' worth of separation: static peers over a cable, encrypted, both ways, large and small."""
+    """Two kernels' worth of separation: a cable, encrypted, both ways, large and small."""
     directories = keys_of(tmp_path, ("one", "two"))
     (place, address), (other_place, other_address) = hosts
-    one = start_child(
-        "peer", name="one", listen=address, registry="off", keys=str(directories["one"]), **place
-    )
-    control = one.hear()["control"]
-    assert control.startswith(f"tcp://{address}:")
-    server = load_keys(directories["one"]).public
-    (directories["two"] / AUTHORIZED_FILE).write_text(f"{server} {address}\n")
+    registry = f"tcp://{address}:7461"
+    (directories["two"] / AUTHORIZED_FILE).write_text(f"{load_keys(directories['one']).public} {address}\n")
+    serve = [sys.executable, "-m", "cortex.discovery", "--listen", registry, "--keys", directories["one"]]
+    serving = subprocess.Popen([*place["prefix"], *serve], env={**os.environ, **place["env"]})
+    one = start_child("peer", name="one", listen=address, keys=str(directories["one"]), **place)
     two = start_child(
         "peer",
         name="two",
         listen=other_address,
-        registry="off",
-        peers=[control],
+        registry=registry,
         keys=str(directories["two"]),
         **other_place,
     )
+    one.hear()
     two.hear()
     for sender, receiver, topic in ((one, two, "/a"), (two, one, "/b")):
         sender.ask(do="publisher", topic=topic, type="Block")
@@ -359,5 +331,7 @@ def test_two_hosts(hosts, start_child, tmp_path):
             assert receiver.hear() == expected
     one.finish()
     two.finish()
+    serving.terminate()
+    serving.wait(SOON_S)
     shutil.rmtree(place["env"]["CORTEX_RUNTIME_DIR"])
     shutil.rmtree(other_place["env"]["CORTEX_RUNTIME_DIR"])

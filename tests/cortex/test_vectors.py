@@ -33,7 +33,7 @@ from cortex.wire import (
 )
 
 VECTORS = load_vectors()
-CONTROL = {"cortex/Describe": records.Describe}
+CONTROL = {"cortex/Leave": records.Leave}
 CASES = [(name, case) for name, vector in VECTORS.items() for case in vector["cases"]]
 MALFORMED = [(name, case) for name, vector in VECTORS.items() for case in vector["malformed"]]
 

@@ -10,6 +10,7 @@ import trimesh
 import warp as wp
 from render_scenes import LOOK_DOWN, LUMA, UNSHADOWED, box, plane, render, scene_of
 from scipy.spatial.transform import Rotation
+from small_room import room_scene
 
 from neurosim_core import run
 from neurosim_core.render.camera import PinholeConfig
@@ -183,10 +184,10 @@ def test_same_bits_where_silhouettes_run_along_tiles(device, fov_deg, behind):
         parts += [box((12.0, 12.0, 12.0), (0.0, 0.0, 0.0))] if behind == "walls" else []
         poses = [(tuple(place), tuple(turn.as_quat()))] * 2
         scene = scene_of(*parts)
-        expected = render(scene, lens, poses, outputs=("instance", "depth"), config=ALONE, device=device)
+        expected = render(scene, lens, poses, outputs=OUTPUTS, config=ALONE, device=device)
         arrays = upload_scene(scene, with_lists(), device)
         for form in (arrays, by_block(arrays)):
-            assert_same(render(form, lens, poses, outputs=("instance", "depth"), device=device), expected)
+            assert_same(render(form, lens, poses, outputs=OUTPUTS, device=device), expected)
         hits += (expected["instance"] == 0).sum()
     assert hits > 1000
 
@@ -211,14 +212,14 @@ def test_same_bits_through_a_slit_that_no_probe_finds(device):
     bar = box((0.4, 2.6, 0.1), (-0.84, 0.0, 0.0))  # short: all of it is beyond the reach
     scene = scene_of(*plates, slope, bar)
     pose = [((0.0, 0.0, 2.5), LOOK_DOWN)]
-    expected = render(scene, lens, pose, outputs=("instance", "depth"), config=ALONE, device=device)
+    expected = render(scene, lens, pose, outputs=OUTPUTS, config=ALONE, device=device)
     assert (expected["instance"][0, :, 3] == 3).all()
     assert (np.delete(expected["instance"][0], 3, axis=1) < 2).all()
     renderer, _ = lists_of(scene, pose, device, lens=lens)
     assert renderer.candidates.data.reach.numpy().max() < 2.0
     arrays = upload_scene(scene, with_lists(), device)
     for form in (arrays, by_block(arrays)):
-        assert_same(render(form, lens, pose, outputs=("instance", "depth"), device=device), expected)
+        assert_same(render(form, lens, pose, outputs=OUTPUTS, device=device), expected)
 
 
 def test_same_bits_when_the_camera_whirls(device):
@@ -266,7 +267,7 @@ def test_lists_hold_what_rays_hit(device):
     """Every triangle that a ray meets within the reach, hidden or not, by brute force in float64."""
     part = soup(60, 6)
     poses = path(6, 0.03, 0.02)
-    renderer, _ = lists_of(scene_of(part), poses, device, instants=6, face_count_max=64)
+    renderer, _ = lists_of(scene_of(part), poses, device, instants=8, face_count_max=64)
     data = renderer.candidates.data
     count, reach = data.count.numpy()[0], data.reach.numpy()[0]
     lists = data.faces.numpy().reshape(len(count), 64)
@@ -379,28 +380,32 @@ def test_what_kernels_cannot_count_is_refused():
         WarpRenderer(arrays, lens, outputs=("depth",), instant_count=8)
 
 
-def test_events_of_a_flight_are_the_same():
+def test_events_of_a_flight_are_the_same(tmp_path):
+    camera = {
+        "kind": "event_camera",
+        "lens": {"width": 40, "height": 30, "horizontal_fov_rad": 1.5},
+        "sampling_rate_hz": 1000,
+        "packet_rate_hz": 50,
+    }
+    turn = [
+        {"time_s": time_s, "position_m": [time_s, 0.0, 1.2], "rpy_rad": [0.0, 0.0, 0.2 + 3.0 * time_s]}
+        for time_s in (0.0, 0.1, 0.2)
+    ]
     settings = {
         "duration_s": 0.2,
         "device": "cpu",
-        "scene": {"kind": "apartment", "rooms": 1},
-        "sensors": {
-            "events": {
-                "kind": "event_camera",
-                "lens": {"width": 40, "height": 30, "horizontal_fov_rad": 1.5},
-                "sampling_rate_hz": 1000,
-                "packet_rate_hz": 50,
-            }
-        },
+        "scene": room_scene(tmp_path),
+        "path": {"kind": "poses", "keyframes": turn},
+        "sensors": {"events": camera},
     }
+    light = {"lighting": {"mode": "unshadowed"}, "exposure": 1.0, "samples_per_pixel": 1}
     streams = []
     for traversal in (
-        {"cpu_traversal": "warp"},
+        {"cpu_traversal": "warp", "candidate_lists": None},
         {"candidate_lists": {}},
-        {"candidate_lists": {"instants": 5}},
+        {"candidate_lists": {"instants": 12}},
     ):
-        light = {"mode": "unshadowed"}
-        packets = list(run({**settings, "render": {"lighting": light, "exposure": 1.0, **traversal}}))
+        packets = list(run({**settings, "render": {**light, **traversal}}))
         streams.append([np.concatenate(column) for column in zip(*(p.numpy() for p in packets), strict=True)])
     assert len(streams[0][0]) > 50
     for other in streams[1:]:

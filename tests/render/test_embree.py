@@ -19,6 +19,7 @@ from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_caster, packet_width
 from neurosim_core.render.lighting import refine
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
@@ -232,7 +233,6 @@ def room():
 @pytest.mark.parametrize("samples", [1, 4])
 def test_pictures_are_those_of_warp(width, samples):
     scene, poses = room()
-    names = ("log_radiance", "rgb", "depth", "normal", "instance")
     by = {}
     for traversal in ("embree", "warp"):
         config = RenderConfig(
@@ -240,7 +240,7 @@ def test_pictures_are_those_of_warp(width, samples):
         )
         arrays = upload_scene(scene, config, "cpu")
         assert arrays.terms.embree == (width if traversal == "embree" else 0)
-        by[traversal] = render(arrays, LENS, poses, outputs=names)
+        by[traversal] = render(arrays, LENS, poses, outputs=OUTPUTS)
     sky = by["warp"]["instance"] < 0
     assert sky.any()
     assert not sky.all()

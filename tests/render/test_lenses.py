@@ -19,6 +19,7 @@ from neurosim_core.render.lenses import (
     RationalConfig,
     RayTableConfig,
 )
+from neurosim_core.render.outputs import OUTPUTS
 
 SIZE = {"width": 64, "height": 48, "fx": 45.0, "fy": 44.0, "cx": 31.3, "cy": 24.9}
 RADTAN = (-0.28, 0.07, 1.9e-3, -7e-4, 0.004)
@@ -125,14 +126,13 @@ def test_pictures_of_a_plane_through_each_lens():
     """Depth is planar whatever the lens: the distance 2 m to a plane before the camera, for all rays."""
     scene = scene_of(plane(1000.0))
     for lens in (LENSES[0], LENSES[3], LENSES[5]):
-        seen = render(scene, lens, [((0.0, 0.0, 2.0), LOOK_DOWN)], outputs=("depth", "rgb", "log_radiance"))
+        seen = render(scene, lens, [((0.0, 0.0, 2.0), LOOK_DOWN)], outputs=OUTPUTS)
         np.testing.assert_allclose(seen["depth"], 2.0, rtol=2e-6)
 
 
 def test_blind_pixels_are_black_and_infinitely_far():
     lens = EquidistantConfig(width=24, height=24, fx=12.0, fy=12.0, cx=12.0, cy=12.0, angle_max_rad=0.8)
-    outputs = ("log_radiance", "rgb", "depth", "normal", "instance")
-    seen = render(scene_of(plane(100.0)), lens, [((0.0, 0.0, 2.0), LOOK_DOWN)], outputs=outputs)
+    seen = render(scene_of(plane(100.0)), lens, [((0.0, 0.0, 2.0), LOOK_DOWN)], outputs=OUTPUTS)
     blind = lens.blind_pixels()
     assert 0 < blind.sum() < blind.size
     assert (seen["rgb"][0][blind] == 0).all()

@@ -235,6 +235,8 @@ def test_scenes_without_bodies_are_compiled_without_them(device):
 @pytest.mark.parametrize("config", [UNSHADOWED, BAKED])
 def test_bodies_out_of_view_change_no_bit(device, traversal, config):
     """With them another kernel runs; behind the camera and behind the wall they are met by no ray."""
+    if config is BAKED and (traversal, device) == ("warp", "cpu"):
+        pytest.skip("baked light is read alike whoever finds what rays hit")
     config = config.model_copy(update={"cpu_traversal": traversal, "samples_per_pixel": 2})
     scene = scene_of(
         box((0.1, 40.0, 40.0), (6.05, 0.0, 0.0)), box((1.0, 1.0, 1.0), (3.0, 0.5, 0.0)),

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.ray_times import RayTimes, ShutterConfig
 from neurosim_core.render.renderer import make_renderer, upload_scene
 from neurosim_core.scene.scene import Ambient, Material
@@ -33,8 +34,8 @@ def half_white() -> object:
     return scene_of(*parts, materials=materials, part_material=(0, 1), ambient=WHITE)
 
 
-def render(scene, times, positions, orientations, *, outputs, traversal="auto", samples=1):
-    """Render one instant whose rays have these poses, shape [J, ...]."""
+def render(scene, times, positions, orientations, *, traversal="auto", samples=1):
+    """Render all outputs of one instant whose rays have these poses, shape [J, ...]."""
     config = RenderConfig(
         lighting=LightingConfig(mode="unshadowed"),
         exposure=1.0,
@@ -42,24 +43,23 @@ def render(scene, times, positions, orientations, *, outputs, traversal="auto", 
         cpu_traversal=traversal,
     )
     arrays = upload_scene(scene, config, device="cpu")
-    renderer = make_renderer(arrays, LENS, outputs=outputs, instant_count=1, times=times)
+    renderer = make_renderer(arrays, LENS, outputs=OUTPUTS, instant_count=1, times=times)
     p = wp.array(np.asarray(positions, np.float32), dtype=wp.vec3, device="cpu")
     q = wp.array(np.asarray(orientations, np.float32), dtype=wp.quat, device="cpu")
     renderer.render(p, q, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
-    return {name: getattr(renderer, name).numpy()[0].copy() for name in outputs}
+    return {name: getattr(renderer, name).numpy()[0].copy() for name in OUTPUTS}
 
 
 @pytest.mark.parametrize("traversal", ["embree", "warp"])
 @pytest.mark.parametrize("samples", [1, 4])
 def test_one_time_for_all_rays_gives_the_same_bytes(traversal, samples):
-    outputs = ("log_radiance", "rgb", "depth", "normal", "instance")
     scene = textured_plane(checker(8, 4), size_m=4.0)
     pose = ([[0.1, 0.2, 1.5]], [Rotation.from_euler("xyz", [3.0, 0.2, 0.3]).as_quat()])
     layers = 1 + samples if samples > 1 else 1
     times = RayTimes(np.zeros(1, np.int64), np.zeros((layers, 48 * 24), np.int32), samples)
-    own = render(scene, times, *pose, outputs=outputs, traversal=traversal, samples=samples)
-    one = render(scene, None, *pose, outputs=outputs, traversal=traversal, samples=samples)
-    for name in outputs:
+    own = render(scene, times, *pose, traversal=traversal, samples=samples)
+    one = render(scene, None, *pose, traversal=traversal, samples=samples)
+    for name in OUTPUTS:
         assert own[name].tobytes() == one[name].tobytes(), name
 
 
@@ -78,7 +78,6 @@ def test_rolling_rows_shear_a_vertical_edge(traversal):
         times,
         positions,
         turn.as_quat(),
-        outputs=("log_radiance",),
         traversal=traversal,
         samples=64,
     )
@@ -99,7 +98,7 @@ def test_an_exposure_blurs_a_step_to_a_trapezium():
     moved_m = speed_px * depth_m / 60.0 * t_s / exposure_s  # to the right: the edge goes to the left
     positions = np.stack([moved_m, np.zeros_like(t_s), np.full_like(t_s, depth_m)], axis=-1)
     orientations = np.tile(LOOK_DOWN, (len(t_s), 1))
-    picture = render(half_white(), times, positions, orientations, outputs=("log_radiance", "depth"))
+    picture = render(half_white(), times, positions, orientations)
     white = np.exp(picture["log_radiance"].astype(float)) - 1e-3
     edge = 24.0 + speed_px * np.linspace(0.0, 1.0, 20001)  # where it is during the exposure
     columns = np.arange(48)
@@ -112,7 +111,7 @@ def test_exposures_average_light_not_its_logarithm():
     """Half the time white, half black: half the light, which is brighter than half the logarithm."""
     times = RayTimes(np.array([-1, 0]), np.array([[0], [0], [1]]).repeat(48 * 24, axis=1).astype(np.int32), 2)
     positions = [[-4.0, 0.0, 2.0], [4.0, 0.0, 2.0]]
-    picture = render(half_white(), times, positions, [LOOK_DOWN] * 2, outputs=("log_radiance", "depth"))
+    picture = render(half_white(), times, positions, [LOOK_DOWN] * 2)
     np.testing.assert_allclose(picture["log_radiance"], np.log(0.5 + 1e-3), rtol=1e-5)
 
 

@@ -246,7 +246,7 @@ def test_outputs_of_a_known_view(device):
         scene,
         lens,
         [((0.0, 0.0, 3.0), LOOK_DOWN)],
-        outputs=("rgb", "normal", "instance", "depth"),
+        outputs=OUTPUTS,
         device=device,
     )
     instance = got["instance"][0]
@@ -282,24 +282,23 @@ def test_fewer_outputs_give_the_same_bits(device, config):
 def test_instants_and_threads_do_not_change_a_bit(device):
     """K = 5 at once, one at a time, on one, two or three threads, and repeated: all the same."""
     arrays = upload_scene(room(), BAKED, device)
-    outputs = ("log_radiance", "rgb", "depth")
-    at_once = render(arrays, LENS, POSES, outputs=outputs, device=device)
-    alone = [render(arrays, LENS, [pose], outputs=outputs, device=device) for pose in POSES]
-    for name in outputs:
+    at_once = render(arrays, LENS, POSES, outputs=OUTPUTS, device=device)
+    alone = [render(arrays, LENS, [pose], outputs=OUTPUTS, device=device) for pose in POSES]
+    for name in OUTPUTS:
         np.testing.assert_array_equal(at_once[name], np.concatenate([one[name] for one in alone]))
     for threads, launches in itertools.product((1, 2, 3), (1, 2)):
         again = render(
-            arrays, LENS, POSES, outputs=outputs, device=device, thread_count=threads, launches=launches
+            arrays, LENS, POSES, outputs=OUTPUTS, device=device, thread_count=threads, launches=launches
         )
-        for name in outputs:
+        for name in OUTPUTS:
             np.testing.assert_array_equal(again[name], at_once[name])
 
 
 def test_images_are_written_for_the_instants_that_have_a_slot(device):
     """Cameras that share a cast: log radiance of all instants, images only where requested."""
     arrays = upload_scene(room(), BAKED, device)
-    alone = render(arrays, LENS, POSES, outputs=("log_radiance", "rgb", "depth"), device=device)
-    for outputs in (("log_radiance", "rgb", "depth"), ("rgb", "depth")):
+    alone = render(arrays, LENS, POSES, outputs=OUTPUTS, device=device)
+    for outputs in (OUTPUTS, ("rgb", "depth")):
         shared = render(arrays, LENS, POSES, outputs=outputs, device=device, slots=[-1, 1, -1, 0, -1])
         for name in ("rgb", "depth"):
             np.testing.assert_array_equal(shared[name][0], alone[name][3])
@@ -329,13 +328,12 @@ def test_samples_average_linear_radiance(device):
     )
     lens = PinholeConfig(width=8, height=8, fx=20.0, fy=20.0, cx=4.27, cy=4.0)
     pose = [((0.0, 0.0, 2.0), LOOK_DOWN)]
-    outputs = ("log_radiance", "depth", "instance")
-    one = render(scene, lens, pose, outputs=outputs, device=device)
+    one = render(scene, lens, pose, outputs=OUTPUTS, device=device)
     many = render(
         scene,
         lens,
         pose,
-        outputs=outputs,
+        outputs=OUTPUTS,
         device=device,
         config=UNSHADOWED.model_copy(update={"samples_per_pixel": 16}),
     )

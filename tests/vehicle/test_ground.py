@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from neurosim_core import load_config, sim
 from neurosim_core.packets import Collision, Odometry
-from neurosim_core.vehicle import GroundConfig, Multirotor, MultirotorConfig, MultirotorState, preset
+from neurosim_core.vehicle import TERMS, GroundConfig, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
 HUMMINGBIRD = preset("hummingbird")
@@ -25,7 +25,10 @@ def on(ground: GroundConfig | dict, **override) -> MultirotorConfig:
 
 
 def landed(config: MultirotorConfig, device: str, **start) -> Multirotor:
-    vehicle = Multirotor(config, device=device)
+    terms = (
+        TERMS if "ground_effect" in config.terms() else preset("hummingbird", ground=GroundConfig()).terms()
+    )
+    vehicle = Multirotor(config, device=device, terms=terms)  # two sets of kernels for all
     vehicle.reset(**{"rotor_speed": OFF, **start})
     return vehicle
 
@@ -157,7 +160,7 @@ def test_touch_down_against_the_second_multirotor(integrator, device):
     config = preset(
         "hummingbird", ground=GroundConfig(rotor_radius_m=0.1), flapping_kg_m=1e-5, wind_m_s=(2.0, 1.0, 0.0)
     )
-    vehicle = Multirotor(config, device=device, integrator=integrator)
+    vehicle = Multirotor(config, device=device, integrator=integrator, terms=TERMS)
     vehicle.reset(
         position=(0.0, 0.0, 0.08),
         velocity=(0.3, 0.1, -1.0),

@@ -8,7 +8,7 @@ from multirotor_oracle import angle, derivative, solve
 from pydantic import ValidationError
 
 from neurosim_core.control import make_controller
-from neurosim_core.vehicle import Multirotor, MultirotorState, preset
+from neurosim_core.vehicle import TERMS, Multirotor, MultirotorState, preset
 
 MS = 1_000_000
 UNLIKE = {
@@ -33,7 +33,7 @@ def test_derivatives_of_unlike_rotors(device):
         5.0 * rng.normal(size=(10, 3)),
         rng.uniform(0.0, 1500.0, (10, 4)),
     )
-    vehicle = Multirotor(config, count=10, device=device)
+    vehicle = Multirotor(config, count=10, device=device, terms=TERMS)
     vehicle.reset(*states)
     expected = np.array([derivative(config, np.concatenate(s[:4]), s[4]) for s in zip(*states, strict=True)])
     found = vehicle.acceleration

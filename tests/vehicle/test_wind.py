@@ -14,6 +14,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from neurosim_core import load_config, sim
 from neurosim_core.vehicle import (
+    TERMS,
     GroundConfig,
     GustConfig,
     Multirotor,
@@ -47,7 +48,8 @@ def felt(vehicle: Multirotor) -> np.ndarray:
 
 def make_vane(count: int = 1, *, device: str, seed: int = 0, **weather) -> Multirotor:
     config = preset("hummingbird", **{**VANE, **weather})
-    vehicle = Multirotor(config, count=count, device=device, seed=seed, max_step_ns=100 * MS)
+    # kernels of all terms: one set for all weather
+    vehicle = Multirotor(config, count=count, device=device, seed=seed, max_step_ns=100 * MS, terms=TERMS)
     vehicle.reset(rotor_speed=np.full(4, 500.0))
     return vehicle
 
@@ -81,7 +83,7 @@ def test_gust_follows_its_law(hold_s, after, device):
         return 0.5 * (1.0 + np.cos(np.pi * fallen / 0.1))
 
     vehicle = make_vane(device=device, wind_m_s=(1.0, 0.0, 0.0), gusts=(first, second))
-    assert vehicle.terms[-2:] == ("wind", "gusts")
+    assert vehicle.config.terms()[-2:] == ("wind", "gusts")
     heard = listen(vehicle, 7 * MS, 50)[:, 0]
     for k, velocity in enumerate(heard):
         t = 0.007 * k
@@ -312,7 +314,7 @@ def climb(parts_ms, *, sample_s: float, device: str, **settings) -> np.ndarray:
         turbulence=TurbulenceConfig(wind_20ft_m_s=15.4, sample_s=sample_s),
         **settings,
     )
-    vehicle = Multirotor(config, device=device)
+    vehicle = Multirotor(config, device=device, terms=TERMS if settings else None)
     vehicle.reset(position=(0.0, 0.0, 10.0), velocity=(4.0, -1.0, 6.0))
     for command in config.hover_rotor_speed_rad_s * np.array(
         [[1.01, 0.99, 1.0, 1.02], [1.0, 1.01, 1.0, 0.99]]

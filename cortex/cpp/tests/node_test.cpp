@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Nodes in one process, used by many threads at once, for the thread sanitizer (ZeroMQ itself is not judged: it is
-// built without). No registry: the nodes are static peers.
+// built without). There has to be a registry.
 #include <atomic>
 #include <chrono>
 #include <cstdlib>
@@ -37,13 +37,6 @@ bool is_whole(const Scan& scan) {
     if (range != static_cast<float>(scan.stamp_ns)) return false;
   }
   return true;
-}
-
-cortex::Options alone(const std::vector<std::string>& peers = {}) {
-  cortex::Options options;
-  options.registry = "off";
-  options.peers = peers;
-  return options;
 }
 
 // Two threads publish on one publisher, three subscriptions read: none of a reliable one's messages is missing.
@@ -182,8 +175,8 @@ void read_late(cortex::Node& talker, cortex::Node& hearer) {
 
 // A node that ends under its users: receivers return, publishers throw, received messages stay.
 void end_early() {
-  auto talker = std::make_unique<cortex::Node>("talker", alone());
-  auto hearer = std::make_unique<cortex::Node>("hearer", alone({talker->control_address()}));
+  auto talker = std::make_unique<cortex::Node>("talker");
+  auto hearer = std::make_unique<cortex::Node>("hearer");
   auto publisher = talker->advertise<Scan>("/end");
   auto subscription = hearer->subscribe<Scan>("/end", cortex::reliable(4, 100ms));
   expect(publisher.wait_for_subscribers(1, 60s), "the subscriber attaches");
@@ -214,8 +207,8 @@ void end_early() {
 
 int main() {
   {
-    cortex::Node talker{"talker", alone()};
-    cortex::Node hearer{"hearer", alone({talker.control_address()})};
+    cortex::Node talker{"talker"};
+    cortex::Node hearer{"hearer"};
     std::thread large([&] { share(talker, hearer, "/large", 8000, 150); });
     share(talker, hearer, "/small", 10, 500);
     large.join();

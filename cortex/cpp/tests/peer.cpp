@@ -177,10 +177,7 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
 int main(int argc, char** argv) {
   const auto argument = [&](int index) { return std::string(index < argc ? argv[index] : "0"); };
   cortex::Options options;
-  if (const char* peers = std::getenv("CORTEX_TEST_PEER")) {
-    options.registry = "off";
-    options.peers = {peers};
-  }
+  if (const char* registry = std::getenv("CORTEX_TEST_REGISTRY")) options.registry = registry;
   if (const char* keys = std::getenv("CORTEX_TEST_KEYS")) options.keys = keys;
   if (const char* listen = std::getenv("CORTEX_TEST_LISTEN")) options.listen = listen;
   cortex::Node node{"cpp", options};

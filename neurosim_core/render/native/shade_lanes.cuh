@@ -50,16 +50,22 @@ if (different == 1) {
         for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
     for (int channel = 0; channel < 3; ++channel) repeat(emitted[channel]);
 }
+alignas(64) int first[N], level_count[N];
+int sampled = 0; // whether any lane has a texture
 if constexpr (TEXTURED) {
-    alignas(64) float x[N], y[N], blend[N], lod[N];
-    alignas(64) int first[N], finer[N];
-    alignas(64) float uv[2][3][N], away[2][N];
-    alignas(64) float face_lods[N];
-    alignas(64) int level_count[N];
     for (int lane = 0; lane < different; ++lane) {
         const wp::vec2i& texture = scene.material_texture.data[material[lane]];
         first[lane] = texture[0];
         level_count[lane] = texture[1];
+        sampled |= texture[1];
+    }
+}
+if (sampled) {
+    alignas(64) float x[N], y[N], blend[N], lod[N];
+    alignas(64) int finer[N];
+    alignas(64) float uv[2][3][N], away[2][N];
+    alignas(64) float face_lods[N];
+    for (int lane = 0; lane < different; ++lane) {
         face_lods[lane] = scene.face_lod.data[face[lane]];
         const wp::vec2* corner = scene.corner_uv.data + 3 * (size_t)face[lane];
         for (int tip = 0; tip < 3; ++tip)

@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "cortex/array.hpp"
+#include "cortex/broadcast.h"
 #include "cortex/placer.hpp"
 #include "cortex/wire.hpp"
 
@@ -357,7 +358,7 @@ class Writer {
     const auto position = reinterpret_cast<std::uintptr_t>(from) - reinterpret_cast<std::uintptr_t>(out_);
     if (bytes > 0 && position < capacity_) return position;
     const std::size_t start = take(bytes, alignment);
-    if (bytes > 0) std::memcpy(out_ + start, from, bytes);
+    if (bytes > 0) cortex_copy(out_ + start, from, bytes);
     return start;
   }
 

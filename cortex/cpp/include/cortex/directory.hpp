@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A node's view of the others: what it hears from the registry and from static peers (cortex/registry.py describes
+// A node's view of the others: what it hears from the registry (cortex/registry.py describes
 // the protocol). It belongs to the node's thread.
 #pragma once
 
@@ -76,26 +76,20 @@ class Directory {
  public:
   using Nodes = std::map<std::uint64_t, records::NodeRecord>;
 
-  Directory(zmq::context_t& context, std::function<records::NodeRecord()> record, std::string registry,
-            const std::vector<std::string>& peers, std::shared_ptr<const Keys> keys,
-            std::shared_ptr<net::Complaints> complaints)
+  // Without a registry (an empty address) nobody else is known.
+  Directory(zmq::context_t& context, std::function<records::NodeRecord()> record, const std::string& registry,
+            std::shared_ptr<const Keys> keys, std::shared_ptr<net::Complaints> complaints)
       : record_(std::move(record)), keys_(std::move(keys)), complaints_(std::move(complaints)) {
     own_ = next_record();
-    if (!registry.empty()) connect(context, registry, true);
-    for (const auto& peer : peers) connect(context, peer, false);
+    if (!registry.empty()) connect(context, registry);
   }
 
-  std::vector<zmq::socket_t*> sockets() {
-    std::vector<zmq::socket_t*> result;
-    for (auto& link : links_) result.push_back(&link->socket);
-    return result;
-  }
+  // The socket to poll; null without a registry.
+  zmq::socket_t* socket() noexcept { return link_ == nullptr ? nullptr : &link_->socket; }
 
   const Nodes& nodes() const noexcept { return nodes_; }
   std::uint64_t rejected() const noexcept { return rejected_; }
-  bool connected() const {
-    return std::all_of(links_.begin(), links_.end(), [](const auto& link) { return link->welcomed; });
-  }
+  bool connected() const noexcept { return link_ == nullptr || link_->welcomed; }
   // Whether `nodes` has changed since the last call.
   bool take_changed() noexcept { return std::exchange(changed_, false); }
 
@@ -103,105 +97,33 @@ class Directory {
   void announce() noexcept { dirty_ = true; }
 
   std::int64_t deadline_ns() const {
-    std::int64_t deadline = tick_ns_ + heartbeat_ns;
-    for (const auto& link : links_) deadline = std::min(deadline, link->next_ns);
-    return dirty_ ? tick_ns_ : deadline;
+    const std::int64_t deadline = tick_ns_ + heartbeat_ns;
+    return dirty_ ? tick_ns_ : link_ == nullptr ? deadline : std::min(deadline, link_->next_ns);
   }
 
   void tick() {
     const std::int64_t now_ns = monotonic_ns();
-    if (tick_ns_ != 0 && now_ns - tick_ns_ > stall_ns) forgive(now_ns - tick_ns_);
+    const std::int64_t stood_ns = tick_ns_ == 0 ? 0 : now_ns - tick_ns_;
     tick_ns_ = now_ns;
-    for (auto& link : links_) receive(*link, now_ns);
+    if (stood_ns > stall_ns && link_ != nullptr) forgive(*link_, stood_ns);
+    if (link_ != nullptr) receive(*link_, now_ns);
     if (dirty_) {
       own_ = next_record();
-      for (auto& link : links_) {
-        if (link->welcomed) say_hello(*link, now_ns, false);
-      }
+      if (link_ != nullptr && link_->welcomed) say_hello(*link_, now_ns, false);
     }
-    for (auto& link : links_) {
-      if (now_ns >= link->next_ns) beat(*link, now_ns);
-      expire(*link, now_ns);
-    }
-    for (auto entry = inbound_.begin(); entry != inbound_.end();) {
-      if (now_ns - entry->second.seen_ns > lease_ns) {
-        drop(nullptr, entry->first);
-        entry = inbound_.erase(entry);
-      } else {
-        ++entry;
-      }
-    }
-  }
-
-  // Answers a control frame that came to this node's own ROUTER: nodes may have it as static peer.
-  //
-  // `sender` says whence it came: a node belongs to who came with it first.
-  std::optional<zmq::message_t> answer(const ControlFrame& frame, const std::string& sender) {
-    const std::int64_t now_ns = monotonic_ns();
-    if (frame.is<records::Describe>()) return control_frame(records::Changed{0, own_}, frame.header.sequence);
-    if (frame.is<records::Hello>()) {
-      const auto hello = frame.as<records::Hello>();
-      check(hello.record);
-      if (inbound_.count(hello.record.node) == 0 && inbound_.size() >= 1024) {
-        return control_frame(records::Refused{hello.record.node, "this node has 1024 peers already"});
-      }
-      const auto found = inbound_.emplace(hello.record.node, Inbound{now_ns, sender}).first;
-      if (found->second.sender != sender) {
-        return control_frame(records::Refused{hello.record.node, "it is the node of another process or key"});
-      }
-      const auto& places = hello.record.endpoints;
-      if (is_key(sender) && std::any_of(places.begin(), places.end(), [&](const records::Endpoint& place) {
-            return !place.server_key.empty() && place.server_key != sender;
-          })) {
-        return control_frame(records::Refused{hello.record.node, "its addresses have another key than it came with"});
-      }
-      found->second.seen_ns = now_ns;
-      put(nullptr, hello.record);
-      return control_frame(records::Changed{0, own_});
-    }
-    if (frame.is<records::Heartbeat>()) {
-      const auto heartbeat = frame.as<records::Heartbeat>();
-      const auto known = inbound_.find(heartbeat.node);
-      std::uint64_t held = 0;
-      if (known != inbound_.end()) {
-        known->second.seen_ns = now_ns;
-        held = known_[heartbeat.node][nullptr].revision;
-      }
-      if (heartbeat.held != own_.revision) return control_frame(records::Changed{0, own_});
-      return control_frame(records::Alive{own_.node, 0, held});
-    }
-    if (frame.is<records::Leave>()) {
-      const auto leave = frame.as<records::Leave>();
-      const auto found = inbound_.find(leave.node);
-      if (found == inbound_.end() || found->second.sender != sender) return std::nullopt;
-      inbound_.erase(found);
-      drop(nullptr, leave.node);
-      for (auto& link : links_) {
-        if (!link->registry) drop(link.get(), leave.node);
-      }
-      return std::nullopt;
-    }
-    throw MalformedMessage("an unexpected control message");
+    if (link_ == nullptr) return;
+    if (now_ns >= link_->next_ns) beat(*link_, now_ns);
+    expire(*link_, now_ns);
   }
 
   void leave() {
-    for (auto& link : links_) {
-      if (link->welcomed) try_send(link->socket, control_frame(records::Leave{own_.node}));
-    }
+    if (link_ != nullptr && link_->welcomed) try_send(link_->socket, control_frame(records::Leave{own_.node}));
   }
 
  private:
-  // A node that has us as static peer.
-  struct Inbound {
-    std::int64_t seen_ns;
-    std::string sender;
-  };
-
-  // A connection to the registry or to a static peer.
   struct Link {
     std::string address;
     zmq::socket_t socket;
-    bool registry = false;
     std::int64_t next_ns = 0;   // when to send the next heartbeat or `Hello`
     std::int64_t heard_ns = 0;  // when the other side was last heard
     std::int64_t wait_ns = first_wait_ns;
@@ -210,7 +132,6 @@ class Directory {
     bool welcomed = false;
     std::uint64_t epoch = 0;
     std::uint64_t version = 0;
-    std::set<std::uint64_t> nodes;
     std::map<std::uint64_t, std::uint64_t> missing;  // revisions that `Welcome` named and that have not come yet
     std::map<std::uint64_t, std::int64_t> doubted;   // when to drop nodes that the registry did not name
   };
@@ -222,16 +143,15 @@ class Directory {
     return socket.send(std::move(frame), zmq::send_flags::dontwait).has_value();
   }
 
-  void connect(zmq::context_t& context, const std::string& address, bool registry) {
+  void connect(zmq::context_t& context, const std::string& address) {
     if (address.rfind("tcp://", 0) != 0 && address.rfind("ipc://", 0) != 0) {
-      throw std::invalid_argument("a registry or peer must be a tcp:// or ipc:// address, got '" + address + "'");
+      throw std::invalid_argument("a registry must be a tcp:// or ipc:// address, got '" + address + "'");
     }
     auto link = std::make_unique<Link>();
     link->address = address;
-    link->registry = registry;
     link->socket = net::make_socket(context, zmq::socket_type::dealer, net::is_tcp(address), 4096, 200);
     link->socket.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
-    // Nothing may queue for a peer that is not there: a `send` that fails tells us so at once.
+    // Nothing may queue for a registry that is not there: a `send` that fails tells us so at once.
     link->socket.set(zmq::sockopt::immediate, true);
     if (keys_ != nullptr && net::is_tcp(address)) {
       const std::string server_key = keys_->of_host(net::host_of(address));
@@ -240,7 +160,7 @@ class Directory {
     }
     link->socket.connect(address);
     link->heard_ns = monotonic_ns();
-    links_.push_back(std::move(link));
+    link_ = std::move(link);
   }
 
   records::NodeRecord next_record() {
@@ -267,13 +187,7 @@ class Directory {
 
   void beat(Link& link, std::int64_t now_ns) {
     if (!link.welcomed) return say_hello(link, now_ns, true);
-    std::uint64_t held = 0;
-    if (!link.registry) {
-      for (const auto node : link.nodes) held = std::max(held, known_[node][&link].revision);
-    }
-    if (!try_send(link.socket, control_frame(records::Heartbeat{own_.node, own_.revision, held}))) {
-      return lose(link, now_ns);
-    }
+    if (!try_send(link.socket, control_frame(records::Heartbeat{own_.node, own_.revision, 0}))) return lose(link, now_ns);
     link.next_ns = now_ns + heartbeat_ns;
     warn_of_silence(link, now_ns);
   }
@@ -297,9 +211,7 @@ class Directory {
 
   void warn_of_silence(const Link& link, std::int64_t now_ns) {
     if (now_ns - link.heard_ns > 3 * lease_ns) {
-      complaints_->once("silent " + link.address, std::string("no answer of the ") +
-                                                      (link.registry ? "registry" : "peer") + " at " + link.address +
-                                                      "; is it running? Trying on.");
+      complaints_->once("silent " + link.address, "no answer of the registry at " + link.address + "; is it running? Trying on.");
     }
   }
 
@@ -328,13 +240,13 @@ class Directory {
     } else if (frame.is<records::Alive>()) {
       on_alive(link, frame.as<records::Alive>(), now_ns);
     } else if (frame.is<records::Changed>()) {
-      on_changed(link, frame.as<records::Changed>(), now_ns);
+      on_changed(link, frame.as<records::Changed>());
     } else if (frame.is<records::Gone>()) {
       const auto gone = frame.as<records::Gone>();
       count(link, gone.version);
       link.missing.erase(gone.node);
       link.doubted.erase(gone.node);
-      drop(&link, gone.node);
+      drop(gone.node);
     } else if (frame.is<records::Refused>()) {
       complaints_->once("refused " + link.address,
                         link.address + " refuses this node: " + frame.as<records::Refused>().reason);
@@ -354,9 +266,7 @@ class Directory {
   }
 
   void on_welcome(Link& link, const records::Welcome& welcome, std::int64_t now_ns) {
-    if (!link.registry || welcome.nodes.size() != welcome.revisions.size()) {
-      throw MalformedMessage("a welcome of a peer, or with lists of different lengths");
-    }
+    if (welcome.nodes.size() != welcome.revisions.size()) throw MalformedMessage("a welcome with lists of different lengths");
     greet(link, now_ns);
     link.epoch = welcome.epoch;
     link.version = welcome.version;
@@ -366,13 +276,15 @@ class Directory {
       const std::uint64_t node = welcome.nodes[index];
       if (node == own_.node) continue;
       named.insert(node);
-      if (link.nodes.count(node) == 0 || known_[node][&link].revision != welcome.revisions[index]) {
+      const auto known = nodes_.find(node);
+      if (known == nodes_.end() || known->second.revision != welcome.revisions[index]) {
         link.missing[node] = welcome.revisions[index];
       }
     }
     // A registry that was just started does not know everybody yet: one lease of grace.
     std::map<std::uint64_t, std::int64_t> doubted;
-    for (const auto node : link.nodes) {
+    for (const auto& entry : nodes_) {
+      const std::uint64_t node = entry.first;
       if (named.count(node) != 0) continue;
       const auto since = link.doubted.find(node);
       doubted[node] = since != link.doubted.end() ? since->second : now_ns + lease_ns;
@@ -382,33 +294,21 @@ class Directory {
 
   void on_alive(Link& link, const records::Alive& alive, std::int64_t now_ns) {
     if (!link.welcomed || now_ns < link.quiet_ns) return;  // the answer to our last `Hello` says more
-    if (link.registry) {
-      if (alive.epoch != link.epoch || alive.version != link.version || !link.missing.empty()) {
-        return say_hello(link, now_ns, true);
-      }
-    } else if (link.nodes.count(alive.epoch) == 0 && alive.epoch != own_.node) {
-      link.welcomed = false;
-      link.next_ns = now_ns;
-      return;
-    }
+    if (alive.epoch != link.epoch || alive.version != link.version || !link.missing.empty()) return say_hello(link, now_ns, true);
     if (alive.held != own_.revision) say_hello(link, now_ns, false);
   }
 
-  void on_changed(Link& link, records::Changed changed, std::int64_t now_ns) {
+  void on_changed(Link& link, records::Changed changed) {
     check(changed.record);
     const std::uint64_t node = changed.record.node;
-    if (link.registry) {
-      count(link, changed.version);
-      link.missing.erase(node);
-      link.doubted.erase(node);
-    } else {
-      greet(link, now_ns);
-      const std::set<std::uint64_t> before = link.nodes;
-      for (const auto other : before) {  // another node may have taken over this address
-        if (other != node) drop(&link, other);
-      }
-    }
-    put(&link, std::move(changed.record));
+    count(link, changed.version);
+    link.missing.erase(node);
+    link.doubted.erase(node);
+    if (node == own_.node) return;
+    const auto known = nodes_.find(node);
+    if (known != nodes_.end() && known->second.revision == changed.record.revision) return;
+    nodes_[node] = std::move(changed.record);
+    changed_ = true;
   }
 
   static void count(Link& link, std::uint64_t version) noexcept {
@@ -417,66 +317,25 @@ class Directory {
 
   // What is known
 
-  void forgive(std::int64_t stood_ns) {
-    for (auto& link : links_) {
-      link->heard_ns += stood_ns;
-      for (auto& doubt : link->doubted) doubt.second += stood_ns;
-    }
-    for (auto& entry : inbound_) entry.second.seen_ns += stood_ns;
+  static void forgive(Link& link, std::int64_t stood_ns) {
+    link.heard_ns += stood_ns;
+    for (auto& doubt : link.doubted) doubt.second += stood_ns;
   }
 
   void expire(Link& link, std::int64_t now_ns) {
-    std::vector<std::uint64_t> gone;
-    if (link.registry) {
-      if (!link.welcomed) return;  // without a registry nobody is removed
-      for (const auto& [node, at_ns] : link.doubted) {
-        if (now_ns > at_ns) gone.push_back(node);
-      }
-    } else if (now_ns - link.heard_ns > lease_ns) {
-      gone.assign(link.nodes.begin(), link.nodes.end());
-    }
-    for (const auto node : gone) {
-      link.doubted.erase(node);
-      drop(&link, node);
+    if (!link.welcomed) return;  // without a registry nobody is removed
+    for (auto doubt = link.doubted.begin(); doubt != link.doubted.end();) {
+      if (now_ns > doubt->second) drop(doubt->first);
+      doubt = now_ns > doubt->second ? link.doubted.erase(doubt) : std::next(doubt);
     }
   }
 
-  // One holder's records come in order, so its last one counts; of several holders' the newest. Null: inbound.
-  void put(Link* holder, records::NodeRecord record) {
-    const std::uint64_t node = record.node;
-    if (node == own_.node) return;
-    known_[node][holder] = std::move(record);
-    if (holder != nullptr) holder->nodes.insert(node);
-    choose(node);
-  }
-
-  void drop(Link* holder, std::uint64_t node) {
-    if (holder != nullptr) holder->nodes.erase(node);
-    const auto known = known_.find(node);
-    if (known != known_.end() && known->second.erase(holder) > 0) choose(node);
-  }
-
-  void choose(std::uint64_t node) {
-    const auto& holders = known_[node];
-    if (holders.empty()) {
-      known_.erase(node);
-      changed_ = nodes_.erase(node) > 0 || changed_;
-      return;
-    }
-    const auto newest = std::max_element(holders.begin(), holders.end(), [](const auto& a, const auto& b) {
-      return a.second.revision < b.second.revision;
-    });
-    const auto before = nodes_.find(node);
-    if (before == nodes_.end() || before->second.revision != newest->second.revision) {
-      nodes_[node] = newest->second;
-      changed_ = true;
-    }
-  }
+  void drop(std::uint64_t node) { changed_ = nodes_.erase(node) > 0 || changed_; }
 
   std::function<records::NodeRecord()> record_;
   std::shared_ptr<const Keys> keys_;
   std::shared_ptr<net::Complaints> complaints_;
-  std::vector<std::unique_ptr<Link>> links_;
+  std::unique_ptr<Link> link_;
   records::NodeRecord own_;
   std::uint64_t revision_ = 0;
   bool dirty_ = false;
@@ -484,8 +343,6 @@ class Directory {
   std::uint64_t rejected_ = 0;
   std::int64_t tick_ns_ = 0;
   Nodes nodes_;
-  std::map<std::uint64_t, std::map<Link*, records::NodeRecord>> known_;
-  std::map<std::uint64_t, Inbound> inbound_;
 };
 
 }  // namespace cortex::detail

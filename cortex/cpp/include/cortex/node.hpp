@@ -33,15 +33,14 @@ namespace cortex {
 struct Options {
   int domain = -1;                 // 0 to 232; -1 takes CORTEX_DOMAIN, else 0
   std::string registry = "auto";   // "auto": the one of this host; "off"; or "tcp://host:port"
-  std::vector<std::string> peers;  // control addresses of nodes to talk to without a registry
   std::string listen;              // address of an interface to be reached at over tcp; empty: this host only
   std::string keys;                // directory of CURVE keys for tcp (`cortex keys new`); empty: none
   bool insecure = false;           // without keys, allow plain tcp beyond this host
   Log log = [](const std::string& text) { std::clog << "cortex: " + text + "\n"; };
 };
 
-// Registers itself like a Python node. It starts no registry: as long as none answers it knows its static peers only,
-// says so once through the log, and goes on trying.
+// Registers itself like a Python node. It starts no registry: as long as none answers it knows nobody, says so once
+// through the log, and goes on trying.
 class Node {
  public:
   explicit Node(std::string name, Options options = {}) : name_(std::move(name)), options_(std::move(options)) {
@@ -60,7 +59,7 @@ class Node {
                                  : options_.registry == "off" ? ""
                                                               : options_.registry;
     directory_ = std::make_unique<detail::Directory>(
-        context_, [this] { return record(); }, registry, options_.peers, keys_, complaints_);
+        context_, [this] { return record(); }, registry, keys_, complaints_);
     connected_ = directory_->connected();
     thread_ = std::thread([this] { run(); });
   }
@@ -71,8 +70,6 @@ class Node {
 
   const std::string& name() const noexcept { return name_; }
   std::uint64_t id() const noexcept { return id_; }
-  // Where others can reach this node without a registry: one of their `peers`.
-  const std::string& control_address() const noexcept { return endpoints_.back().control; }
 
   template <class T>
   Publisher<T> advertise(const std::string& topic, const PublisherOptions& options = {}) {
@@ -103,7 +100,7 @@ class Node {
     return Subscription<T>(std::move(core));
   }
 
-  // Waits until the registry and all static peers have answered.
+  // Waits until the registry has answered.
   bool wait_for_registry(std::chrono::nanoseconds timeout) const {
     const std::int64_t deadline_ns = detail::deadline(timeout);
     while (!connected_.load()) {
@@ -152,11 +149,7 @@ class Node {
     if (options_.insecure || keys_ != nullptr) return;
     std::vector<std::string> hosts;
     if (!options_.listen.empty()) hosts.push_back(options_.listen);
-    std::vector<std::string> addresses = options_.peers;
-    addresses.push_back(options_.registry);
-    for (const auto& address : addresses) {
-      if (net::is_tcp(address)) hosts.push_back(net::host_of(address));
-    }
+    if (net::is_tcp(options_.registry)) hosts.push_back(net::host_of(options_.registry));
     for (const auto& host : hosts) {
       if (!net::is_loopback(host)) {
         throw std::invalid_argument("plain tcp to " + host + " is open to the network: set keys (`cortex keys new`), " +
@@ -301,7 +294,7 @@ class Node {
     const auto add = [&](int fd) { fds.push_back({fd, POLLIN, 0}); };
     add(waker_.fd());
     add(router_.get(zmq::sockopt::fd));
-    for (auto* socket : directory_->sockets()) add(socket->get(zmq::sockopt::fd));
+    if (directory_->socket() != nullptr) add(directory_->socket()->get(zmq::sockopt::fd));
     add(lossy_fd_);
     add(strict_fd_);
     if (authenticator_ != nullptr) add(authenticator_->fd());
@@ -394,12 +387,9 @@ class Node {
           throw MalformedMessage("not one frame");
         }
         const auto control = detail::parse_control(net::bytes(frame));
-        std::optional<zmq::message_t> reply = control.is<records::StatsRequest>()
-                                                  ? detail::control_frame(stats(), control.header.sequence)
-                                                  : directory_->answer(control, net::sender_of(frame));
-        if (!reply) continue;
+        if (!control.is<records::StatsRequest>()) throw MalformedMessage("an unexpected control message");
         router_.send(identity, zmq::send_flags::sndmore | zmq::send_flags::dontwait);
-        router_.send(*reply, zmq::send_flags::dontwait);
+        router_.send(detail::control_frame(stats(), control.header.sequence), zmq::send_flags::dontwait);
       } catch (const MalformedMessage& error) {
         ++rejected_;
         complaints_->once("router", std::string("rejected a control frame: ") + error.what());

@@ -69,15 +69,6 @@ inline Span<const std::uint8_t> bytes(const zmq::message_t& message) {
   return {static_cast<const std::uint8_t*>(message.data()), message.size()};
 }
 
-// Who sent a message: its CURVE key; else user, group and process of this host, or the address of another.
-inline std::string sender_of(const zmq::message_t& message) {
-  for (const char* name : {"User-Id", "Peer-Address"}) {
-    const char* found = zmq_msg_gets(message.handle(), name);
-    if (found != nullptr && *found != 0) return found;
-  }
-  return "";
-}
-
 // Takes in the parts of a message after the one that was read; returns how many there were.
 inline std::size_t drop_parts(zmq::socket_t& socket) {
   std::size_t dropped = 0;

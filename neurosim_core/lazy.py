@@ -1,0 +1,46 @@
+"""Public names that are imported on first use."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def lazy_names(
+    package: str, file: str, prepare: Callable[[], object] = lambda: None
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package.
+
+    Its names are those that `if TYPE_CHECKING:` imports (`from module import name as name`): a type checker
+    reads the same lines, so that no name is listed twice.
+
+    Args:
+        package: `__name__` of the package.
+        file: Its `__file__`.
+        prepare: Called before a name is imported; it may raise ImportError.
+    """
+    tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+    (block,) = (
+        node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+    )
+    homes = {
+        alias.asname or alias.name: (str(node.module), alias.name)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    names = sorted(homes)
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}, known: {', '.join(names)}")
+        prepare()
+        module, attribute = homes[name]
+        if module == package:  # a module of the package itself
+            return importlib.import_module(f"{module}.{attribute}")
+        return getattr(importlib.import_module(module), attribute)
+
+    return find, lambda: names, names
