@@ -68,7 +68,7 @@ class Scan(Settings):
 
 
 class SpinningScan(Scan):
-    """A column of lasers that turns about z; all lasers of a column fire at once.
+    """A column of lasers that turns to the right about z; all lasers of a column fire at once.
 
     Column 0 looks backwards, so that the cut between sweeps is behind the vehicle.
     """
@@ -78,13 +78,10 @@ class SpinningScan(Scan):
     """Elevation of each ring [rad]; ring 0 is the first."""
     columns: Annotated[int, Field(ge=1, le=16384)] = 1024
     """Columns of a turn."""
-    clockwise: bool = True
-    """The head turns to the right, as seen from above."""
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""
-        turn = 2.0 * math.pi * np.arange(self.columns) / self.columns
-        azimuth = math.pi + (-turn if self.clockwise else turn)
+        azimuth = math.pi - 2.0 * math.pi * np.arange(self.columns) / self.columns
         return np.stack(np.broadcast_arrays(azimuth, np.array(self.elevations_rad)[:, None]), axis=-1)
 
 
