@@ -16,9 +16,10 @@ import ast
 import dataclasses
 import functools
 import inspect
+import itertools
 import json
 import re
-import textwrap
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -248,13 +249,33 @@ def _field_docs(cls: type) -> dict[str, str]:
     docs: dict[str, str] = {}
     for base in reversed(cls.__mro__[:-1]):
         try:
-            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
-        except (OSError, TypeError, SyntaxError):
+            node = _class_nodes(inspect.getsource(sys.modules[base.__module__])).get(base.__qualname__)
+        except (KeyError, OSError, TypeError, SyntaxError):
             continue
-        for field, text in zip(body.body, body.body[1:], strict=False):  # type: ignore[attr-defined]
+        body = [] if node is None else node.body
+        for field, text in itertools.pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 docs[ast.unparse(field.target)] = inspect.cleandoc(str(ast.literal_eval(text.value)))
     return docs
+
+
+@functools.cache
+def _class_nodes(source: str) -> dict[str, ast.ClassDef]:
+    """Return the classes of a module by qualified name; `inspect` would parse the module for each of them."""
+    found: dict[str, ast.ClassDef] = {}
+    todo: list[tuple[ast.AST, str]] = [(ast.parse(source), "")]
+    while todo:
+        parent, prefix = todo.pop()
+        for node in ast.iter_child_nodes(parent):
+            inner = prefix
+            if isinstance(node, ast.ClassDef):
+                found[prefix + node.name] = node
+                inner = f"{prefix}{node.name}."
+            elif isinstance(node, ast.FunctionDef):
+                inner = f"{prefix}{node.name}.<locals>."
+            if isinstance(node, ast.stmt):
+                todo.append((node, inner))
+    return found
 
 
 class EventArrays(NamedTuple):

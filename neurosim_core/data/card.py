@@ -14,7 +14,7 @@ from PIL import ImageDraw
 from neurosim_core import __version__
 from neurosim_core.data.make import DEPTH_EDGES_M, SPEED_EDGES_M_S, DatasetPlan, FlightStats
 from neurosim_core.data.stream import Dataset
-from neurosim_core.view.pictures import BACKGROUND_SRGB, event_picture
+from neurosim_core.view.pictures import BACKGROUND_SRGB, color_picture, event_picture
 
 _SHEET_FLIGHTS = 6
 _TILE_PX = 240
@@ -142,9 +142,7 @@ def _tiles(path: Path, label: str) -> list[Picture.Image]:
             if sample.events is not None:
                 picture = event_picture(sample.events, width=sample.width, height=sample.height)
             elif sample.rgb is not None:
-                picture = np.broadcast_to(
-                    sample.rgb.reshape(*sample.rgb.shape[:2], -1), (*sample.rgb.shape[:2], 3)
-                )
+                picture = color_picture("colour", sample.rgb)
             else:
                 assert sample.depth is not None
                 picture = _colour_depth(sample.depth)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from neurosim_core.install import install_hint
-from neurosim_core.io.event_file import EventFileError, split_blocks
+from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
 from neurosim_core.packets import EventArrays
 
 _PACKET_EVENTS = 8192
@@ -124,9 +124,7 @@ def _whole(path: Path, blocks: Iterator[Any]) -> Iterator[Any]:
 
 
 def _columns(events: Any) -> EventArrays:
-    polarity = "on" if "on" in events.dtype.names else "p"
-    kinds = {"t": np.int64, "x": np.uint16, "y": np.uint16, polarity: np.uint8}
-    return EventArrays(*(events[name].astype(kind) for name, kind in kinds.items()))
+    return events_of(*(events[name] for name in ("t", "x", "y", "on" if "on" in events.dtype.names else "p")))
 
 
 def _import_faery() -> ModuleType:

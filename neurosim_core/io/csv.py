@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.io.event_file import EventFileError, split_blocks
+from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
 from neurosim_core.packets import EventArrays
 
 _BLOCK_LINES = 200_000
@@ -103,8 +103,7 @@ class CsvSource:
         rest[:, 2] = np.where(rest[:, 2] == -1, 0, rest[:, 2])
         if not np.isfinite(t).all() or (rest < 0).any() or (rest > 0xFFFF).any() or (rest[:, 2] > 1).any():
             raise EventFileError(f"{self._path}: an event before line {number} is impossible")
-        x, y, p = rest.T
-        return EventArrays(t.astype(np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8))
+        return events_of(t, *rest.T)
 
 
 class CsvSink:

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from neurosim_core.io.event_file import (
-    BLOCK_EVENTS,
     EventFileError,
+    events_of,
     read_header,
+    read_words,
     split_blocks,
 )
 from neurosim_core.packets import EventArrays
@@ -32,7 +33,6 @@ class DatSource:
     """Reads a DAT file."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self.notes: list[str] = []
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
         try:
@@ -54,24 +54,10 @@ class DatSource:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        position = self._begin
-        while True:
-            self._file.seek(position)
-            data = self._file.read(BLOCK_EVENTS * _RECORD.itemsize)
-            if len(data) % _RECORD.itemsize:
-                self.notes.append(f"{self._path} ends within an event: it was cut off")
-                data = data[: len(data) - len(data) % _RECORD.itemsize]
-            if not data:
-                return
-            position += len(data)
+        for _, data in read_words(self._file, self._begin, _RECORD.itemsize, self.notes):
             records = np.frombuffer(data, _RECORD)
             pixel = records["pixel"]
-            yield EventArrays(
-                records["t"].astype(np.int64),
-                (pixel & 0x3FFF).astype(np.uint16),
-                (pixel >> 14 & 0x3FFF).astype(np.uint16),
-                (pixel >> 28).astype(np.uint8),
-            )
+            yield events_of(records["t"], pixel & 0x3FFF, pixel >> 14 & 0x3FFF, pixel >> 28)
 
 
 class DatSink:

@@ -20,7 +20,7 @@ import yaml
 from numpy.typing import NDArray
 
 from neurosim_core.install import install_hint
-from neurosim_core.io.event_file import EventFileError
+from neurosim_core.io.event_file import EventFileError, events_of
 from neurosim_core.io.hdf5_events import Hdf5Source, damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, Packet
 
@@ -66,12 +66,7 @@ class DsecSource:
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
             seen += len(x)
             left_out += len(x) - int(inside.sum())
-            yield EventArrays(
-                events.t[inside],
-                x[inside].astype(np.uint16),
-                y[inside].astype(np.uint16),
-                events.polarity[inside],
-            )
+            yield events_of(events.t[inside], x[inside], y[inside], events.polarity[inside])
         if left_out:
             self.notes.append(f"{left_out:,} of {seen:,} events are beyond the rectified picture")
 

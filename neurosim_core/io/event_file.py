@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, join_events
 
@@ -255,6 +256,29 @@ def _find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
             width = max(width, int(events.x.max()) + 1)
             height = max(height, int(events.y.max()) + 1)
     return width, height
+
+
+def events_of(t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike) -> EventArrays:
+    """Return columns in the types that events have."""
+    kinds = (np.int64, np.uint16, np.uint16, np.uint8)
+    return EventArrays(
+        *(np.asarray(c).astype(kind, copy=False) for c, kind in zip((t, x, y, polarity), kinds, strict=True))
+    )
+
+
+def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:
+    """Yield whole words of `size` bytes from `begin` on, and where each part begins; note a cut one."""
+    left = 0
+    while not left:
+        file.seek(begin)
+        data = file.read(4 * BLOCK_EVENTS)
+        left = len(data) % size
+        if left:
+            notes.append(f"{file.name} ends within a word: it was cut off")
+        if len(data) == left:
+            return
+        yield begin, data[: len(data) - left]
+        begin += len(data)
 
 
 def gather_blocks(parts: Iterable[Any]) -> Iterator[EventArrays]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex.evt3 import EventCodecError
+from neurosim_core.io.event_file import events_of
 from neurosim_core.packets import EventArrays
 
 _ON, _TIME_HIGH, _TRIGGER, _OTHERS, _CONTINUED = 0x1, 0x8, 0xA, 0xE, 0xF
@@ -89,9 +90,5 @@ class Evt2Decoder:
         if len(highs):
             self._high = int(highs[-1])
         events = words[where]
-        return EventArrays(
-            high << _LOW_BITS | events >> 22 & 0x3F,
-            (events >> 11 & 0x7FF).astype(np.uint16),
-            (events & 0x7FF).astype(np.uint16),
-            (events >> 28).astype(np.uint8),
-        )
+        t = high << _LOW_BITS | events >> 22 & 0x3F
+        return events_of(t, events >> 11 & 0x7FF, events & 0x7FF, events >> 28)

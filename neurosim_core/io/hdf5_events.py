@@ -22,6 +22,7 @@ from neurosim_core.io.event_file import (
     PACKET_US,
     EventFileError,
     PacketCutter,
+    events_of,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
@@ -116,12 +117,7 @@ class Hdf5Source:
                 t, x, y, p = (read_rows(column, begin, end) for column in self._columns)
             if len(t) != end - begin:
                 raise EventFileError(f"{self._path}: fewer events than its index says")
-            yield EventArrays(
-                t.astype(np.int64, copy=False) + self._offset_us,
-                x.astype(np.uint16, copy=False),
-                y.astype(np.uint16, copy=False),
-                p.astype(np.uint8, copy=False),
-            )
+            yield events_of(t + np.int64(self._offset_us), x, y, p)
 
 
 class RecordingSink:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, events_of
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.hdf5 import import_h5py
@@ -69,12 +69,8 @@ class MvsecSource:
             pixels = rows[:, :2]
             if not np.isfinite(rows).all() or (pixels < 0).any() or (pixels > 0xFFFF).any():
                 raise EventFileError(f"{self._path}: an event after number {begin} is impossible")
-            yield EventArrays(
-                np.rint(rows[:, 2] * 1e6).astype(np.int64),
-                pixels[:, 0].astype(np.uint16),
-                pixels[:, 1].astype(np.uint16),
-                (rows[:, 3] > 0).astype(np.uint8),
-            )
+            x, y = pixels.T
+            yield events_of(np.rint(rows[:, 2] * 1e6), x, y, rows[:, 3] > 0)
 
     def _rows(self, name: str) -> Iterator[Packet]:
         array = self._group[_ROWS[name]]

@@ -17,12 +17,12 @@ from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from neurosim_core.io.event_file import (
     EventFileError,
     read_header,
+    read_words,
     split_blocks,
 )
 from neurosim_core.io.evt2 import Evt2Decoder, Evt2Encoder
 from neurosim_core.packets import EventArrays
 
-_BLOCK_BYTES = 4_000_000
 _SIZE_MAX = 2048
 _HOUR_US = 3_600_000_000
 _GAP_MAX_US = 48 * _HOUR_US
@@ -53,15 +53,7 @@ class RawSource:
         """See `EventSource.read`."""
         word = 2 if self._encoding == "evt3" else 4
         evt2, evt3 = Evt2Decoder(), Evt3Decoder()
-        position = self._begin
-        while True:
-            self._file.seek(position)
-            data = self._file.read(_BLOCK_BYTES)
-            if len(data) % word:
-                self.notes.append(f"{self._path} ends within a word: it was cut off")
-                data = data[: len(data) - len(data) % word]
-            if not data:
-                return
+        for position, data in read_words(self._file, self._begin, word, self.notes):
             try:
                 if self._encoding == "evt3":
                     events = EventArrays(*evt3.decode(data, width=_SIZE_MAX, height=_SIZE_MAX))
@@ -69,7 +61,6 @@ class RawSource:
                     events = evt2.decode(data)
             except EventCodecError as error:
                 raise EventFileError(f"{self._path}, after byte {position}: {error}") from None
-            position += len(data)
             if self._t0_us:
                 events = events._replace(t=events.t + self._t0_us)
             if len(events.t):

@@ -18,7 +18,9 @@ def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
     learn.add_argument(
-        "what", metavar="TASK", help="hover, avoid, gates, depth, flow, pretrain; `eval` or `rate`"
+        "what",
+        metavar="TASK",
+        help="hover, throw-recover, dodge, avoid, gates; depth, flow, pretrain; `eval` or `rate`",
     )
     learn.add_argument(
         "run",

@@ -14,8 +14,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-_SEEDS_APART = 10_000
-"""Between the first flights of two processes."""
+from neurosim_core.data.ray_source import SEEDS_APART
 
 
 def flight_settings(
@@ -52,7 +51,7 @@ def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> I
     names = [f"/flight{index}" for index in range(count)]
     program, cores = [sys.executable, "-m", __name__], str(core_count() // count)
     commands = [
-        [*program, name, json.dumps(settings), str(seed + _SEEDS_APART * index), cores]
+        [*program, name, json.dumps(settings), str(seed + SEEDS_APART * index), cores]
         for index, name in enumerate(names)
     ]
     with contextlib.ExitStack() as stack:

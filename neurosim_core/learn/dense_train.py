@@ -61,6 +61,10 @@ class DenseConfig:
     """Windows that are kept to be seen again; of more, the oldest go."""
     reuse: float = 4.0
     """Worlds fly on when their windows have been seen so often, on average."""
+    renders: int | None = None
+    """Of the event camera in a window, of worlds; None: as in other flights, ten in 50 ms."""
+    threshold_spread: float = 0.25
+    """Each world draws its thresholds up to this share above the nominal ones, or below, in each flight."""
     size_px: int = 48
     """Of the pictures of all flights that are flown here [px]."""
     test_flights: int = 8
@@ -155,14 +159,14 @@ class WindowPool:
             self._oldest = (self._oldest + 1) % self._most
 
     def draw(self, count: int, random: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Return sequences, half of them mirrored, shapes [T, B, bins, H, W] and [T, B, C, H, W]."""
+        """Return sequences, half of them mirrored: voxels (float16, [T, B, bins, H, W]), and targets."""
         with self._lock:
             picked = [self._sequences[k] for k in random.integers(len(self._sequences), size=count)]
         mirrored = (random.random(count) < 0.5).tolist()
         sign = self._sign.to(picked[0][1].device)
         voxel = [v.flip(-1) if m else v for (v, _), m in zip(picked, mirrored, strict=True)]
         target = [t.flip(-1) * sign if m else t for (_, t), m in zip(picked, mirrored, strict=True)]
-        return torch.stack(voxel, 1).float(), torch.stack(target, 1)
+        return torch.stack(voxel, 1), torch.stack(target, 1)
 
     def targets(self) -> Tensor:
         """Return the targets of all windows, shape [n, C, H, W]."""
@@ -253,8 +257,8 @@ def train_dense(
     head, net = config.head, config.net()
     if config.backbone is not None:
         net.take_backbone(Path(config.backbone))
-    if live:
-        torch.set_num_threads(1)  # threads that wait for each other beside processes that fly are slower
+    if live or torch.device(config.device).type == "cuda":
+        torch.set_num_threads(1)  # more wait for each other where others work, and only put batches together
     pool = WindowPool(
         length=config.sequence + head.ahead,
         room=config.room,
@@ -315,7 +319,10 @@ def _source(
 
         fly_device = config.fly_device or config.device
         settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        flown = world_windows(settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s)
+        flown = world_windows(
+            settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
+            renders=config.renders, threshold_spread=config.threshold_spread,
+        )  # fmt: skip
         while len(pool) < min(config.batch, worlds):
             pool.add(next(flown))
 
@@ -424,7 +431,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         asked_s = time.monotonic()
         more(steps)
         waited_s += time.monotonic() - asked_s
-        voxel, target = (part.to(config.device) for part in pool.draw(config.batch, random))
+        voxel, target = (part.to(config.device).float() for part in pool.draw(config.batch, random))
         memory, predicted = None, []
         for window in voxel[: config.sequence]:
             one, memory = net(window, memory)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from neurosim_core.config import SimulationConfig, load_config
@@ -17,20 +18,38 @@ from neurosim_core.sim.simulation import Simulation
 _SCENES = 8
 _PATHS_MAX = 64
 """Most paths that are flown at a time; further worlds share them."""
+_CONTROL_HZ = 80.0
+"""About how often the controller acts where renders are rarer."""
 
 
 def world_windows(
-    settings: Mapping[str, Any], head: Head, *, worlds: int, bins: int, window_s: float
+    settings: Mapping[str, Any],
+    head: Head,
+    *,
+    worlds: int,
+    bins: int,
+    window_s: float,
+    renders: int | None = None,
+    threshold_spread: float = 0.0,
 ) -> Iterator[Windows]:
     """Yield the windows of all worlds, one of each at a time, for ever; the next overwrites their tensors.
 
     Generated scenes are eight, of the seeds from that of the settings on. When a flight is over, all worlds
-    fly other paths, and one of these scenes has been replaced by the next.
+    fly other paths with other thresholds, and one of these scenes has been replaced by the next.
+
+    Args:
+        settings: Of a flight.
+        head: What is predicted.
+        worlds: How many.
+        bins: Of the voxels.
+        window_s: Length of a window [s].
+        renders: Of the event camera in a window; None: as the settings say.
+        threshold_spread: Each world draws its thresholds up to this share above the nominal ones, or below.
 
     Raises:
         ValueError: A window is not a whole number of control periods.
     """
-    base = load_config(dict(settings))
+    base = load_config(dict(settings) if renders is None else _with_renders(settings, renders / window_s))
     steps = round(window_s * base.control.rate_hz)
     if steps < 1 or abs(steps / base.control.rate_hz - window_s) > 1e-9:
         raise ValueError(f"windows must be whole periods of control.rate_hz, got {window_s} s")
@@ -50,7 +69,7 @@ def world_windows(
     while True:
         count = _SCENES if hasattr(base.scene, "seed") else 1
         scenes += [make_model(_seeded(base, first + number + k)) for k in range(len(scenes), count)]
-        flown = _simulate(base, scenes, worlds, first + number * _PATHS_MAX)
+        flown = _simulate(base, scenes, worlds, first + number * _PATHS_MAX, threshold_spread)
         names = [f"{number} {world}" for world in range(worlds)]
         for start_ns in range(0, flown.model.duration_ns - window_ns + 1, window_ns):
             stamp_ns = start_ns + window_ns
@@ -76,13 +95,36 @@ def _seeded(config: SimulationConfig, seed: int) -> SimulationConfig:
     return config.model_copy(update={"scene": scene})
 
 
-def _simulate(base: SimulationConfig, scenes: list[Model], worlds: int, seed: int) -> Simulation:
+def _with_renders(settings: Mapping[str, Any], rate_hz: float) -> dict[str, Any]:
+    sensors = dict(settings["sensors"])
+    sensors["events"] = {**sensors["events"], "sampling_rate_hz": rate_hz}
+    control = {"rate_hz": rate_hz * max(1, round(_CONTROL_HZ / rate_hz))}
+    return {**settings, "sensors": sensors, "control": control}
+
+
+def _simulate(
+    base: SimulationConfig, scenes: list[Model], worlds: int, seed: int, spread: float
+) -> Simulation:
     """Return worlds at the begin of paths of their own."""
     paths = [base.path.model_copy(update={"seed": seed + k}) for k in range(min(worlds, _PATHS_MAX))]
     models = [
         refit(scenes[k % len(scenes)], base.model_copy(update={"path": path}), replan=True)
         for k, path in enumerate(paths)
     ]
-    flown = Simulation(base, worlds=worlds, models=models, seeds=seed)
+    pixel = getattr(base.sensors["events"], "pixel")  # noqa: B009 (of any event camera)
+    drawn = (1.0 + spread) ** np.random.default_rng(seed).uniform(-1.0, 1.0, (2, worlds))
+    parameters = {
+        f"events.{name}": getattr(pixel, name) * factor
+        for name, factor in zip(("threshold_on", "threshold_off"), drawn, strict=True)
+    }
+    # Voxels and counts are sums: the order of events does not matter.
+    flown = Simulation(
+        base,
+        worlds=worlds,
+        models=models,
+        seeds=seed,
+        parameters=parameters if spread else None,
+        sorted=False,
+    )
     flown.reset()
     return flown
