@@ -30,16 +30,21 @@ enum {
     CORTEX_HEAD_BYTES = 1 << 16, /* before the frames: a multiple of every page size */
     CORTEX_PAGE_BYTES = 4096,
     CORTEX_ENTRY_BYTES = 8,      /* before each frame: its size, and what it is */
+    CORTEX_FRAME_BYTES = 64,     /* of a frame's header, which is all of a frame that names a slot */
     CORTEX_SPARE_BYTES = 128,    /* kept free of messages, so that the last entry always finds room */
     CORTEX_WIDE_BYTES = 1 << 21, /* of a ring that a reliable reader has once been a whole ring behind in */
     CORTEX_SLOTS = 1024,         /* at most: each reader's page has a byte for each */
+    CORTEX_SMALL_BYTES = 4 << 20,  /* what small slots take in all, so that they stay in cache; most that growing ones have to spare */
+    CORTEX_DEEP_BYTES = 16 << 20,  /* what slots take, and how many there are, where a reader keeps more messages than by default */
+    CORTEX_DEEP_SLOTS = 128,
+    CORTEX_PRIVATE_BYTES = 64 << 20, /* most that a reader copies of what it may lease no more */
     CORTEX_STREAM_BYTES = 8 << 20, /* of an array that is copied past the caches, which it would sweep out */
 };
 
 enum { CORTEX_FRAME = 0, CORTEX_MOVED = 1 };                          /* what an entry is */
 enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a ring is to its reader */
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
-enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT }; /* what a reader finds in a slot */
+enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT, CORTEX_CROWDED }; /* what a reader finds in a slot */
 
 #define CORTEX_RING_MAGIC 0x3254534143585443u /* "CTXCAST2" */
 
@@ -130,6 +135,14 @@ typedef struct {
     CortexMap *map;
     uint32_t slot;
 } CortexLease;
+
+/* The body of a message that came in a slot: leased, or copied where the reader has enough leases. */
+typedef struct {
+    CortexLease lease; /* of a copy only the seat, where its bytes are counted */
+    uint8_t *data;
+    uint64_t size;
+    int is_leased;
+} CortexBody;
 
 typedef struct {
     uint64_t source, reader;
@@ -237,10 +250,15 @@ static inline void cortex_writer_append(CortexWriter *writer, const void *frame,
     writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_FRAME, frame, size);
 }
 
-/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
-static inline void cortex_writer_share(CortexWriter *writer) {
+static inline uint64_t cortex_writer_readers(const CortexWriter *writer) {
     uint64_t readers = 0;
     for (int index = 0; index < writer->count; ++index) readers += writer->members[index].used && !writer->members[index].left;
+    return readers;
+}
+
+/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
+static inline void cortex_writer_share(CortexWriter *writer) {
+    const uint64_t readers = cortex_writer_readers(writer);
     const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
     __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
 }
@@ -385,6 +403,31 @@ static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *me
     return member->strict && member->tail < end;
 }
 
+static inline uint64_t cortex_most(uint64_t a, uint64_t b) { return a > b ? a : b; }
+static inline uint64_t cortex_least(uint64_t a, uint64_t b) { return a < b ? a : b; }
+
+/* How many slots of a size its readers want. */
+static inline uint64_t cortex_slots_wanted(const CortexWriter *writer, uint64_t slot_bytes, int deep) {
+    const uint64_t least = 2 * cortex_writer_readers(writer) + 2;
+    return deep ? cortex_most(least, cortex_least(CORTEX_DEEP_SLOTS, CORTEX_DEEP_BYTES / cortex_most(slot_bytes, 1))) : least;
+}
+
+/* Make slots for bodies of a size, if need be: 1 if there are some, else 0; -1 if there are not, or not enough, as there is no
+   memory. With `exact` all bodies have this size, and nothing is kept for growth; `deep`: a reader keeps many messages. */
+static inline int cortex_writer_provide(CortexWriter *writer, uint64_t size, int exact, int deep) {
+    const uint64_t before = writer->map->slot_bytes, count = writer->map->slot_count;
+    const int fits = before >= size;
+    if (fits && count >= cortex_slots_wanted(writer, before, deep)) return 1;
+    uint64_t bytes = exact ? size : size + size / 4;
+    if (count && !exact && !fits) bytes = cortex_most(bytes, size + cortex_least(size, CORTEX_SMALL_BYTES)); /* these are to last */
+    bytes = (cortex_most(bytes, before) + CORTEX_PAGE_BYTES - 1) / CORTEX_PAGE_BYTES * CORTEX_PAGE_BYTES;
+    uint64_t slots = cortex_least(cortex_most(CORTEX_SMALL_BYTES / bytes, 4), 64);
+    slots = cortex_most(slots, cortex_slots_wanted(writer, bytes, deep));
+    slots = cortex_most(4, cortex_least(slots, ((uint64_t)2 << 30) / bytes));
+    if (fits && count >= slots) return 1;
+    return cortex_writer_grow(writer, writer->capacity, slots, bytes) == 0 ? 1 : -1;
+}
+
 static inline void cortex_slot_abandon(CortexWriter *writer, int slot) {
     writer->slots[slot].busy = 0;
     writer->slots[slot].end = 0;
@@ -427,7 +470,7 @@ static inline void cortex_reader_skip(CortexReader *reader) {
     cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
 }
 
-/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if none will come, see `state`. */
+/* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
     while (reader->state == CORTEX_SOUND) {
         const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
@@ -449,14 +492,7 @@ static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **f
     return -1;
 }
 
-/* Done with a frame of so many bytes; 0 if it was written over meanwhile, and what was copied is worth nothing. */
-static inline int cortex_reader_take(CortexReader *reader, int64_t size) {
-    if (!cortex_reader_is_whole(reader)) return 0;
-    cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
-    return 1;
-}
-
-/* Lease the slot that a frame names, before `cortex_reader_take`. CORTEX_COPY: the reader has enough of them, but may copy the
+/* Lease the slot that a frame names. CORTEX_COPY: the reader has enough of them, but may copy the
    message and then call `cortex_reader_has`; CORTEX_NO_SLOT: the frame is wrong. */
 static inline int cortex_reader_lease(CortexReader *reader, uint64_t slot, uint64_t sequence, uint64_t size, CortexLease *lease) {
     CortexMap *map = reader->map;
@@ -502,6 +538,59 @@ static inline void cortex_lease_end(const CortexLease *lease) {
     __atomic_fetch_sub(&seat->held, 1, __ATOMIC_RELAXED);
     cortex_map_end(lease->map);
     cortex_seat_end(seat);
+}
+
+/* Let go of a body; any thread may. */
+static inline void cortex_body_end(CortexBody *body) {
+    if (body->is_leased) {
+        cortex_lease_end(&body->lease);
+    } else if (body->data != NULL) {
+        __atomic_fetch_sub(&body->lease.seat->private_bytes, body->size, __ATOMIC_RELAXED);
+        cortex_seat_end(body->lease.seat);
+        free(body->data);
+    }
+    memset(body, 0, sizeof *body);
+}
+
+/* Copy what may not be leased: CORTEX_COPY, CORTEX_OVERWRITTEN, or CORTEX_CROWDED if too much is kept already. */
+static inline int cortex_body_copy(const CortexReader *reader, CortexBody *body, uint64_t sequence) {
+    CortexSeat *seat = reader->seat;
+    const uint64_t many = CORTEX_PRIVATE_BYTES, most = body->size < many / 4 ? many : 4 * body->size;
+    if (__atomic_load_n(&seat->private_bytes, __ATOMIC_RELAXED) + body->size > most) return CORTEX_CROWDED;
+    body->data = (uint8_t *)malloc((size_t)cortex_most(body->size, 1));
+    if (body->data == NULL) return CORTEX_CROWDED;
+    body->lease.seat = seat;
+    __atomic_fetch_add(&seat->users, 1, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&seat->private_bytes, body->size, __ATOMIC_RELAXED);
+    cortex_copy(body->data, cortex_slot_memory(reader->map, (int)body->lease.slot), (size_t)body->size);
+    return cortex_reader_has(reader, body->lease.slot, sequence) ? CORTEX_COPY : CORTEX_OVERWRITTEN;
+}
+
+/* Done with a frame that was copied from where `cortex_reader_peek` found it: 1. If it names a slot, `body` gets what is there; its
+   data is NULL if there is nothing, as the frame is wrong. 0: frame or body were written over meanwhile. -1: the message has to
+   wait until the user lets others go, or to be passed over. */
+static inline int cortex_reader_finish(CortexReader *reader, const uint8_t *frame, int64_t size, CortexBody *body) {
+    int found = CORTEX_NO_SLOT;
+    memset(body, 0, sizeof *body);
+    if (!cortex_reader_is_whole(reader)) return 0;
+    if (size == CORTEX_FRAME_BYTES && frame[3] == 'S') {
+        uint64_t rest[5]; /* sequence, two times, size, slot */
+        memcpy(rest, frame + CORTEX_FRAME_BYTES - sizeof rest, sizeof rest);
+        found = cortex_reader_lease(reader, rest[4], rest[0], rest[3], &body->lease);
+        body->size = rest[3];
+        body->is_leased = found == CORTEX_LEASED;
+        if (body->is_leased) body->data = cortex_slot_memory(body->lease.map, (int)body->lease.slot);
+        if (found == CORTEX_COPY) found = cortex_body_copy(reader, body, rest[0]);
+        if (found == CORTEX_CROWDED) return -1;
+        if (found == CORTEX_OVERWRITTEN) cortex_body_end(body);
+    }
+    cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
+    return found != CORTEX_OVERWRITTEN;
+}
+
+/* Leave out the message that has to wait. */
+static inline void cortex_reader_pass_over(CortexReader *reader) {
+    cortex_reader_move(reader, reader->tail + cortex_entry_bytes(CORTEX_FRAME_BYTES));
 }
 
 /* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring
