@@ -125,8 +125,7 @@ def _config(options: argparse.Namespace, ros: RosArguments, parameters: Mapping[
     """Return settings: those of the file, over them parameters, over them options, over them remappings."""
     given = {name: getattr(options, name) for name in ("backend", "distro", "cortex_domain", "namespace")}
     config = load(
-        options.config,
-        {**parameters, **{name: value for name, value in given.items() if value is not None}},
+        options.config, {**parameters, **{name: value for name, value in given.items() if value is not None}}
     )
     node, namespace = ros.names(config.node, config.namespace)
     converters = (*config.converters, *(options.converter or ()))

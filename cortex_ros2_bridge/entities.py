@@ -47,10 +47,7 @@ class Entities:
     """
 
     def __init__(
-        self,
-        call: Callable[[str, Any], None],
-        news: Callable[[str, type[Any]], Any],
-        frame_names: FrameNames,
+        self, call: Callable[[str, Any], None], news: Callable[[str, type[Any]], Any], frame_names: FrameNames
     ) -> None:
         self._call = call
         self._news = news

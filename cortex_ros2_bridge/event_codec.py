@@ -15,15 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortex.evt3 import (
-    Buffer,
-    Bytes,
-    EventCodecError,
-    EventColumns,
-    check_events,
-    hold_value,
-    read_words,
-)
+from cortex.evt3 import Buffer, Bytes, EventCodecError, EventColumns, check_events, hold_value, read_words
 
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
 

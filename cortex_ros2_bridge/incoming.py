@@ -103,24 +103,21 @@ class Incoming:
     def take(self, data: bytes) -> None:
         """Take in a message of ROS, from any thread."""
         with self._lock:
-            if not self._is_active():
-                for target in self._targets[:1]:
-                    target.tally.count("received")
-                    target.tally.count("refused", NOT_ACTIVE)
+            if not self._targets:
                 return
-            for target in self._targets:
+            meant, reason = self._targets[0], "it commands nothing that Cortex has a topic for"
+            is_active = self._is_active()
+            for target in self._targets if is_active else ():
                 try:
                     command = self._convert(target, data)
                 except (ConvertError, cdr.CdrError) as error:
-                    target.tally.count("received")
-                    target.tally.count("refused", str(error))
-                    return
+                    meant, reason = target, str(error)
+                    break
                 if command is not None:
                     self._deliver(target, command)
                     return
-            for target in self._targets[:1]:
-                target.tally.count("received")
-                target.tally.count("refused", "it commands nothing that Cortex has a topic for")
+            meant.tally.count("received")
+            meant.tally.count("refused", reason if is_active else NOT_ACTIVE)
 
     def close(self) -> None:
         """Withdraw the subscription."""

@@ -80,6 +80,7 @@ TRANSITIONS = _CALLS + tuple(
     for number, (how, goal) in enumerate(zip(("success", "failure", "error"), goals, strict=True))
 )
 """All of them, also those that follow by themselves."""
+_TRANSITIONS = "GetAvailableTransitions"
 
 
 class Lifecycle:
@@ -89,30 +90,16 @@ class Lifecycle:
         self._managed = managed
         self._lock = threading.Lock()
         self._resources = contextlib.ExitStack()
-        answers: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
-            "change_state": (
-                "ChangeState",
-                "success",
-                lambda request: self.change(request.transition.id, request.transition.label),
-            ),
-            "get_state": ("GetState", "current_state", lambda _: _state(managed.state)),
-            "get_available_states": (
-                "GetAvailableStates",
-                "available_states",
-                lambda _: [_state(number) for number in STATES],
-            ),
-            "get_available_transitions": (
-                "GetAvailableTransitions",
-                "available_transitions",
-                lambda _: [_described(each) for each in TRANSITIONS if each.start == managed.state],
-            ),
-            "get_transition_graph": (
-                "GetAvailableTransitions",
-                "available_transitions",
-                lambda _: [_described(each) for each in TRANSITIONS],
-            ),
-        }
-        for name, (kind, field, value) in answers.items():
+        states = [_state(number) for number in STATES]
+        graph = [_described(each) for each in TRANSITIONS]
+        answers: tuple[tuple[str, str, str, Callable[[Any], Any]], ...] = (
+            ("change_state", "ChangeState", "success", self._change),
+            ("get_state", "GetState", "current_state", lambda _: _state(managed.state)),
+            ("get_available_states", "GetAvailableStates", "available_states", lambda _: states),
+            ("get_available_transitions", _TRANSITIONS, "available_transitions", self._available),
+            ("get_transition_graph", _TRANSITIONS, "available_transitions", lambda _: graph),
+        )
+        for name, kind, field, value in answers:
             answer = functools.partial(_answer, field, value)
             service = backend.service(f"{node}/{name}", f"lifecycle_msgs/srv/{kind}", answer)
             self._resources.callback(service.close)
@@ -148,6 +135,12 @@ class Lifecycle:
             self._tell(TRANSITIONS_BY_NUMBER[first])
             logger.info("%s", STATES[goal])
             return True
+
+    def _change(self, request: Any) -> bool:
+        return self.change(request.transition.id, request.transition.label)
+
+    def _available(self, _request: Any) -> list[Any]:
+        return [_described(each) for each in TRANSITIONS if each.start == self._managed.state]
 
     def _tell(self, transition: Transition) -> None:
         event = message_class("lifecycle_msgs/msg/TransitionEvent")(timestamp=time.time_ns())

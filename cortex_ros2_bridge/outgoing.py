@@ -11,16 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
-from cortex.messages import (
-    Clock,
-    CommandRanges,
-    Events,
-    Image,
-    Odometry,
-    PointCloud,
-    Simulation,
-    Transform,
-)
+from cortex.messages import Clock, CommandRanges, Events, Image, Odometry, PointCloud, Simulation, Transform
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
 from cortex_ros2_bridge.convert import Context, ConvertError, static_transforms, transform_of
@@ -98,11 +89,9 @@ class Outgoing:
             self.context.max_thrust_n = self.whereabouts.max_thrust_n
         try:
             data = self._convert(message, self.context)
-        except (ConvertError, cdr.CdrError) as error:
-            tally.count("refused", str(error))
-            return
         except Exception as error:  # whatever is wrong with a message, the next one may be right
-            tally.count("refused", f"{type(error).__name__}: {error}")
+            kind = "" if isinstance(error, ConvertError | cdr.CdrError) else f"{type(error).__name__}: "
+            tally.count("refused", f"{kind}{error}")
             return
         if data is None:
             return
@@ -301,9 +290,7 @@ class Feed:
         while self._subscriber is subscriber:
             try:
                 message = subscriber.recv(RECEIVE_S)
-            except TimeoutError:
-                continue
-            except TypeMismatch:  # counted by Cortex
+            except (TimeoutError, TypeMismatch):  # the second is counted by Cortex
                 continue
             except Closed:
                 return

@@ -115,12 +115,11 @@ class Parameters:
     def _describe(self, request: Any, response: Any) -> Any:
         known = self.all()
         make = message_class("rcl_interfaces/msg/ParameterDescriptor")
-        for name in request.names:
-            each = known.get(name, Described(None, "", False))
-            response.descriptors = [
-                *response.descriptors,
-                make(name=name, type=kind_of(each.value)[0], description=each.text, read_only=each.fixed),
-            ]
+        found = [(name, known.get(name, Described(None, "", False))) for name in request.names]
+        response.descriptors = [
+            make(name=name, type=kind_of(each.value)[0], description=each.text, read_only=each.fixed)
+            for name, each in found
+        ]
         return response
 
     def _types(self, request: Any, response: Any) -> Any:

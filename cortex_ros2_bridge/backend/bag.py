@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys.store import Typestore
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, check_message
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, check_type, typestore
@@ -83,15 +83,11 @@ class BagBackend:
                 )
             return BagPublisher(self, self._connections[key], stamp_reader(type_name, typestore(self.distro)))
 
-    def subscription(
-        self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
-    ) -> NoReturn:
-        """There are no subscriptions: nobody publishes."""
-        raise BackendError(f"{topic}: nobody publishes into a bag")
+    def subscription(self, topic: str, *_: Any) -> NoReturn:
+        """There are neither subscriptions nor services: nobody publishes, and nobody asks."""
+        raise BackendError(f"{topic}: nobody else is there in a bag")
 
-    def service(self, name: str, type_name: str, callback: Serve) -> NoReturn:
-        """There are no services: nobody asks."""
-        raise BackendError(f"{name}: nobody asks a bag")
+    service = subscription
 
     def topics(self) -> list[TopicInfo]:
         """Nobody else is there."""

@@ -281,12 +281,7 @@ class DdsSubscription(_Part):
     """Receives from one topic."""
 
     def __init__(
-        self,
-        backend: DdsBackend,
-        topic: str,
-        type_name: str,
-        qos: Qos,
-        callback: Callable[[bytes], None],
+        self, backend: DdsBackend, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> None:
         super().__init__(backend)
         self._lost_count = 0

@@ -164,17 +164,10 @@ class Graph:
                 with self._lock:
                     self._endpoints.pop(sample.key.bytes, None)
                 continue
-            if sample.participant_key.bytes == self._key:
+            participant, data, qos = sample.participant_key.bytes, _user_data(sample.qos), _qos_of(sample.qos)
+            if participant == self._key:
                 continue
-            qos = sample.qos
-            endpoint = Endpoint(
-                kind,
-                sample.participant_key.bytes,
-                sample.topic_name,
-                sample.type_name,
-                _user_data(qos),
-                _qos_of(qos),
-            )
+            endpoint = Endpoint(kind, participant, sample.topic_name, sample.type_name, data, qos)
             with self._lock:
                 self._endpoints[sample.key.bytes] = endpoint
 
@@ -238,17 +231,9 @@ class Graph:
             return [as_gid(guid) for guid, endpoint in self._own.items() if endpoint.kind == kind]
 
         name, namespace = self._node
-        message = info(
-            gid=as_gid(self._key),
-            node_entities_info_seq=[
-                node(
-                    node_namespace=namespace,
-                    node_name=name,
-                    reader_gid_seq=gids("reader"),
-                    writer_gid_seq=gids("writer"),
-                )
-            ],
-        )
+        readers, writers = gids("reader"), gids("writer")
+        own = node(node_namespace=namespace, node_name=name, reader_gid_seq=readers, writer_gid_seq=writers)
+        message = info(gid=as_gid(self._key), node_entities_info_seq=[own])
         write(self._writer, store.serialize_cdr(message, DISCOVERY_TYPE))
 
 

@@ -10,14 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from cortex_ros2_bridge.backend.base import (
-    BackendError,
-    Buffer,
-    Qos,
-    Serve,
-    TopicInfo,
-    check_message,
-)
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
@@ -26,7 +19,7 @@ from cortex_ros2_bridge.typestore import DEFAULT_DISTRO
 _log = logging.getLogger(__name__)
 
 _CLOSE_S = 3.0
-"""Longest wait for an executor that was told to end [s]."""
+"""Longest wait for a thread that was told to end [s]."""
 _CALL_S = 10.0
 """Longest wait for an executor to make or destroy something [s]."""
 _TAKE_COUNT_MAX = 32
@@ -37,26 +30,30 @@ _Result = TypeVar("_Result")
 
 
 class _Loop:
-    """A node, and the thread that executes its callbacks.
+    """A node, and the thread that waits for its messages and requests.
 
-    Everything that the executor waits for is made and destroyed on its thread, between two waits: a handle
-    that another thread destroys while the executor builds its wait set ends the executor of Humble. One
-    that fails nevertheless may never look at some of its endpoints again, and is not used any more.
+    It does what a `SingleThreadedExecutor` does, but for timers and coroutines, and keeps its wait set. The
+    executors of Humble and Jazzy make one for each message, and two more to see that there is nothing else:
+    up to 0.5 ms, in which what comes waits.
+
+    Everything that it waits for is made and destroyed on its thread, between two waits: a handle that another
+    thread destroys would end it. One that fails nevertheless is not used any more.
 
     Attributes:
         node: The node of rclpy.
+        endpoints: What is open.
         failure: Why it is dead for good; empty while it lives.
     """
 
     def __init__(self, context: Any, name: str, namespace: str) -> None:
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
 
         self.failure = ""
         self._context = context
         self._jobs: deque[Callable[[], None]] = deque()
-        self._endpoints: dict[_Endpoint, None] = {}
+        self.endpoints: dict[_Endpoint, None] = {}
         self._closed = False
+        self._wait_set: Any = None
         self.node: Any = rclpy.create_node(
             name,
             context=context,
@@ -64,8 +61,8 @@ class _Loop:
             use_global_arguments=False,
             start_parameter_services=False,
         )
-        self._executor: Any = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.node)
+        self._guard = self.node.create_guard_condition(lambda: None)
+        context.on_shutdown(self._wake)
         self._thread = threading.Thread(target=self._run, name=f"executor {name}", daemon=True)
         self._thread.start()
 
@@ -96,59 +93,54 @@ class _Loop:
             ) from None
 
     def defer(self, job: Callable[[], None]) -> None:
-        """Have a function called on the executor's thread, after the callback that runs now."""
+        """Have a function called on the executor's thread, after the callbacks that run now."""
         self._jobs.append(job)
-        self._executor.create_task(self._work)
+        self._wake()
+
+    def _wake(self) -> None:
+        if not self._closed:
+            self._guard.trigger()
 
     def add(self, endpoint: _Endpoint) -> None:
         """Make the handle of an endpoint."""
 
         def make() -> None:
             endpoint.handle = endpoint.make(self.node)
-            self._endpoints[endpoint] = None
+            self.endpoints[endpoint] = self._wait_set = None
 
         self.call(make)
 
     def remove(self, endpoint: _Endpoint) -> None:
-        """Destroy the handle of an endpoint."""
+        """Destroy the handle of an endpoint, after the callbacks that run now."""
+        handle, endpoint.handle = endpoint.handle, None
+        self.endpoints.pop(endpoint, None)
 
         def destroy() -> None:
-            if endpoint in self._endpoints:
-                del self._endpoints[endpoint]
-                handle, endpoint.handle = endpoint.handle, None
-                getattr(self.node, endpoint.destroyer)(handle)
+            getattr(self.node, endpoint.destroyer)(handle)
+            self._wait_set = None
 
-        if self._closed or self.failure:
-            endpoint.handle = None  # it went with the node
-        elif threading.current_thread() is self._thread:
-            self.defer(destroy)
-        else:
-            self.call(destroy)
-
-    def endpoints(self) -> list[_Endpoint]:
-        """Return what is open."""
-        return list(self._endpoints)
+        self.defer(destroy)
 
     def close(self) -> None:
         """End the thread, and then the node with all that it has."""
         self._closed = True
         if self._thread.is_alive():
-            self._executor.create_task(lambda: None)  # wakes it up
+            self._guard.trigger()
             if threading.current_thread() is not self._thread:
                 self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
             _log.error("a callback still runs %g s after the end: its node is left as it is", _CLOSE_S)
             return
-        for endpoint in self._endpoints:
+        for endpoint in self.endpoints:
             endpoint.handle = None
-        self._executor.shutdown(timeout_sec=0.0)
+        self._wait_set = None
         self.node.destroy_node()
 
     def _run(self) -> None:
         while not self._closed and not self.failure:
             reason = ""
             try:
-                self._executor.spin_once()
+                self._spin_once()
             except Exception as error:  # whatever rclpy raises: the node must not go deaf unnoticed
                 reason = f"the executor of rclpy has failed: {type(error).__name__}: {error}"
             if not self._context.ok():
@@ -157,9 +149,39 @@ class _Loop:
                 self.failure = reason
                 _log.error("%s: nothing is received any more", reason)
 
-    def _work(self) -> None:
+    def _spin_once(self) -> None:
+        """Wait, and see to all that has come: messages, requests, jobs."""
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
+        subscriptions, services = list(self.node.subscriptions), list(self.node.services)
+        if self._wait_set is None:
+            sizes = len(subscriptions), 1, 0, 0, len(services), 0
+            self._wait_set = rclpy_implementation.WaitSet(*sizes, self._context.handle)
+        waits = self._wait_set
+        waits.clear_entities()
+        waits.add_guard_condition(self._guard.handle)
+        for subscription in subscriptions:
+            waits.add_subscription(subscription.handle)
+        for service in services:
+            waits.add_service(service.handle)
+        waits.wait(-1)
+        for index, subscription in enumerate(subscriptions):
+            if waits.is_ready("subscription", index):
+                self._take(subscription)
+        for index, service in enumerate(services):
+            if waits.is_ready("service", index):
+                request, header = service.handle.service_take_request(service.srv_type.Request)
+                if header is not None:
+                    service.send_response(service.callback(request, service.srv_type.Response()), header)
         while self._jobs:
             self._jobs.popleft()()
+
+    def _take(self, subscription: Any) -> None:
+        for _ in range(_TAKE_COUNT_MAX):
+            taken = subscription.handle.take_message(subscription.msg_type, True)
+            if taken is None:
+                return
+            subscription.callback(taken[0])
 
 
 class RclpyBackend:
@@ -175,12 +197,10 @@ class RclpyBackend:
         from rclpy.context import Context
         from rclpy.signals import SignalHandlerOptions
 
-        self._names = check_node_name(node_name, namespace)
+        name, namespace = check_node_name(node_name, namespace)
         self.distro = chosen_distro() or DEFAULT_DISTRO
-        self._lock = threading.Lock()
         self._closed = False
         self._context = Context()
-        self._service_loop: _Loop | None = None
         try:
             rclpy.init(
                 args=[],
@@ -188,14 +208,15 @@ class RclpyBackend:
                 domain_id=domain,
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            self._loop = _Loop(self._context, *self._names)
+            self._loop = _Loop(self._context, name, namespace)
+            self._service_loop = _Loop(self._context, f"_{name}{_SERVICES}", namespace)
         except Exception as error:  # rclpy has many, of modules without public names
             raise BackendError(f"rclpy does not start: {error}") from error
 
     @property
     def failure(self) -> str:
         """Why nothing is received any more, for good; empty while all is well."""
-        return next((loop.failure for loop in self._loops() if loop.failure), "")
+        return self._loop.failure or self._service_loop.failure
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
@@ -209,18 +230,14 @@ class RclpyBackend:
 
     def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
         """Answer requests to a service; all services share a node and a thread of their own."""
-        with self._lock:
-            self._here()
-            if self._service_loop is None:
-                node_name, namespace = self._names
-                self._service_loop = _Loop(self._context, f"_{node_name}{_SERVICES}", namespace)
+        self._here()
         return RclpyService(self._service_loop, name, type_name, callback)
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
         if self._closed or self._loop.failure:
             return []
-        node, parts = self._loop.node, self._loop.endpoints()
+        node, parts = self._loop.node, list(self._loop.endpoints)
         me = node.get_name(), node.get_namespace()
         found: dict[tuple[str, str], tuple[list[Qos], list[Qos]]] = {}
         for topic, _ in node.get_topic_names_and_types():
@@ -236,16 +253,11 @@ class RclpyBackend:
 
     def close(self) -> None:
         """End the node."""
-        with self._lock:
-            if self._closed:
-                return
+        if not self._closed:
             self._closed = True
-        for loop in self._loops():
-            loop.close()
-        self._context.try_shutdown()
-
-    def _loops(self) -> list[_Loop]:
-        return [self._loop] if self._service_loop is None else [self._loop, self._service_loop]
+            self._loop.close()
+            self._service_loop.close()
+            self._context.try_shutdown()
 
     def _here(self) -> _Loop:
         if self._closed:
@@ -331,23 +343,7 @@ class RclpySubscription(_Endpoint):
     def make(self, node: Any) -> Any:
         """Return a handle of a node."""
         arguments = {"raw": True, "event_callbacks": _no_events("SubscriptionEventCallbacks")}
-        return node.create_subscription(self._kind, self.topic, self.take, self._profile, **arguments)
-
-    def take(self, message: bytes) -> None:
-        """Deliver a message, and those that have come meanwhile.
-
-        An executor spends most of its time on waiting: in this way one that falls behind catches up.
-        """
-        self.deliver(message)
-        waiting = self.handle
-        if waiting is None:
-            return
-        with waiting.handle:
-            for _ in range(_TAKE_COUNT_MAX):
-                taken = waiting.handle.take_message(waiting.msg_type, True)
-                if taken is None:
-                    break
-                self.deliver(taken[0])
+        return node.create_subscription(self._kind, self.topic, self.deliver, self._profile, **arguments)
 
     @property
     def publisher_count(self) -> int:

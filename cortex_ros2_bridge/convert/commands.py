@@ -20,7 +20,7 @@ DEFAULT_MAX_THRUST_N = 50.13
 
 It is that of the airframe that Neurosim flies by default: four rotors at 1500 rad/s with 5.57e-6 N s^2."""
 _AT_START_NS = 1
-"""What `_target` stamps an answer to the state of 0 ns with: 0 would mean now, also when it is said again."""
+"""Stamp in ROS of an answer to the state of 0 ns: 0 would mean now, also when it is said again."""
 _VELOCITY = ("frame", "max_speed_m_s", "max_rate_rad_s", "beyond")
 _POSITION = ("max_position_m", "beyond")
 _IGNORE_RATES = (1, 2, 4)
@@ -169,7 +169,10 @@ def trajectory(message: Any, context: Context) -> messages.PoseCommand:
     return _pose_command(message, first.translation, first.rotation, context)
 
 
-recorded(messages.MotorCommand, "actuator_msgs/Actuators", "actuators")(rotor_speeds)
+@recorded(messages.MotorCommand, "actuator_msgs/Actuators", "actuators")
+def recorded_speeds(message: messages.MotorCommand, context: Context) -> Any:
+    """Convert to actuator_msgs/Actuators, velocities in the order of the rotors."""
+    return rotor_speeds(messages.RotorSpeeds(message.stamp_ns or _AT_START_NS, message.speed), context)
 
 
 @recorded(messages.AttitudeCommand, "mavros_msgs/AttitudeTarget", "attitude_target", "max_thrust_n")
@@ -189,7 +192,7 @@ def recorded_velocity(message: messages.VelocityCommand, context: Context) -> An
     """Convert to geometry_msgs/TwistStamped in the map frame."""
     turn = vector((0.0, 0.0, message.yaw_rate_rad_s))
     twist = record("geometry_msgs/msg/Twist")(vector(message.velocity), turn)
-    head = header(message.stamp_ns, frames.WORLD, context)
+    head = header(message.stamp_ns or _AT_START_NS, frames.WORLD, context)
     return record("geometry_msgs/msg/TwistStamped")(head, twist)
 
 
@@ -198,7 +201,8 @@ def recorded_pose(message: messages.PoseCommand, context: Context) -> Any:
     """Convert to geometry_msgs/PoseStamped in the map frame, level."""
     half = 0.5 * message.yaw_rad
     place = pose_of(message.position, (0.0, 0.0, math.sin(half), math.cos(half)))
-    return record("geometry_msgs/msg/PoseStamped")(header(message.stamp_ns, frames.WORLD, context), place)
+    head = header(message.stamp_ns or _AT_START_NS, frames.WORLD, context)
+    return record("geometry_msgs/msg/PoseStamped")(head, place)
 
 
 @request(messages.Reset, "std_msgs/Empty")

@@ -107,18 +107,9 @@ def pose_stamped(message: messages.Odometry, context: Context) -> Any:
 def odometry_transform(message: messages.Odometry, context: Context) -> Any:
     """Convert to tf2_msgs/TFMessage: from the odom frame to the body frame."""
     _check_pose(message)
-    names = context.frames
-    return _transforms(
-        [
-            transform_record(
-                message.stamp_ns,
-                names.odom_of(context.vehicle),
-                names.body_of(context.vehicle),
-                message.position,
-                message.orientation,
-            )
-        ]
-    )
+    ends = context.frames.odom_of(context.vehicle), context.frames.body_of(context.vehicle)
+    pose = message.position, message.orientation
+    return _transforms([transform_record(message.stamp_ns, *ends, *pose)])
 
 
 @standard(messages.Transform, "tf2_msgs/TFMessage", "/tf_static", LATCHED)
@@ -182,17 +173,12 @@ def transform_of(message: messages.Transform, names: FrameNames) -> Any:
     check_finite(what, message.translation, message.rotation)
     if not message.child or not message.parent:
         raise ConvertError(f"a transform from {message.parent!r} to {message.child!r}")
-    if names.ros(message.parent) == names.ros(message.child):
+    parent, child = names.ros(message.parent), names.ros(message.child)
+    if parent == child:
         raise ConvertError(f"{what}: its parent is itself, which tf2 refuses")
     if not np.any(message.rotation):
         raise ConvertError(f"{what}: its rotation is zero")
-    return transform_record(
-        message.stamp_ns,
-        names.ros(message.parent),
-        names.ros(message.child),
-        message.translation,
-        message.rotation,
-    )
+    return transform_record(message.stamp_ns, parent, child, message.translation, message.rotation)
 
 
 def _transforms(records: list[Any]) -> Any:

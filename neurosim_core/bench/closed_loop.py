@@ -13,14 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.bench.engine import (
-    ProbeError,
-    SimulationConfig,
-    answer_images,
-    load_config,
-    scene_settings,
-    set_options,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Series, Table, panel
@@ -29,14 +22,6 @@ RATES_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 TRANSPORT_MS = 0.5
 """What the transport of an image may take in the median."""
 _CAMERA = "camera"
-_NAMES = {
-    f"sensors.{_CAMERA}.lens.width": "--width",
-    f"sensors.{_CAMERA}.lens.height": "--height",
-    "device": "--device",
-    f"sensors.{_CAMERA}.rate_hz": "--rates",
-    "control.rate_hz": "--rates",
-}
-"""What the command line calls settings, for error messages."""
 
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
@@ -46,7 +31,8 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         raise ValueError(f"seconds must be > 0 and <= 3600, got {seconds}")
     rates = options.rates or ((100.0, 1000.0) if options.quick else RATES_HZ)
     width, height = options.width or 640, options.height or 480
-    names = _NAMES | set_options(options.settings)
+    names = engine.option_names(_CAMERA, rate_hz="--rates") | {"control.rate_hz": "--rates"}
+    names |= engine.set_options(options.settings)
     configs = []
     for mode, rate_hz in itertools.product(("lockstep", "streaming"), rates):
         lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
@@ -59,9 +45,9 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             "control": {"rate_hz": rate_hz},
             "sensors": {_CAMERA: {"kind": "rgb", "rate_hz": rate_hz, "lens": lens}},
             "live": {"mode": mode, "command_timeout_s": 60.0, "fail_safe": "hold"},
-            **scene_settings(options.scene),
+            **engine.scene_settings(options.scene),
         }
-        configs.append(load_config(case, overrides=options.settings, options=names))
+        configs.append(engine.load_config(case, overrides=options.settings, options=names))
     rows = []
     for config in configs:  # all are checked before the first is flown
         progress(f"{config.live.mode}, {config.control.rate_hz:g} Hz")
@@ -69,12 +55,12 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     return _chapter(rows, f"RGB {width}x{height}, {options.renderer} renderer")
 
 
-def measure_loop(config: SimulationConfig, *, seconds: float) -> Row:
+def measure_loop(config: engine.SimulationConfig, *, seconds: float) -> Row:
     """Fly a simulator from this process, and return a row of what was measured; times are wall-clock."""
     airframe = config.vehicle.airframe()
     with own_runtime() as folder, NeurosimProcess("serve", config, log=folder / "serve.log") as simulator:
         try:
-            trace = answer_images(
+            trace = engine.answer_images(
                 vehicle=next(iter(config.vehicles)),
                 camera=_CAMERA,
                 speed_rad_s=np.full(airframe.rotor_count, airframe.hover_rotor_speed_rad_s),
@@ -83,8 +69,8 @@ def measure_loop(config: SimulationConfig, *, seconds: float) -> Row:
                 check=simulator.check,
                 spin_s=1e-3 if config.live.mode == "lockstep" else 0.0,
             )
-        except ProbeError as error:
-            raise ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
+        except engine.ProbeError as error:
+            raise engine.ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
     transport_s = 1e-9 * (trace.received_ns - trace.published_ns)
     row: Row = {"mode": config.live.mode, "requested [Hz]": config.control.rate_hz}
     row["received [Hz]"] = 1e9 * (len(trace.received_ns) - 1) / float(np.ptp(trace.received_ns))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from neurosim_core.bench.report import Chapter
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Question:
     """A question that one module answers with one chapter."""
 
@@ -47,72 +47,55 @@ class Question:
 _VIEW = ("scene", "device", "width", "height")
 
 QUESTIONS: Sequence[Question] = (
+    Question("dynamics", "error against run time of the flight dynamics, and stiff and extreme flights"),
     Question(
-        name="dynamics",
-        help="error against run time of the flight dynamics, and stiff and extreme flights",
+        "replay",
+        "logs of real flights of a Crazyflie against the vehicle model, in open loop",
+        ("logs",),
+        False,
     ),
     Question(
-        name="replay",
-        help="logs of real flights of a Crazyflie against the vehicle model, in open loop",
-        options=("logs",),
-        in_all=False,
+        "events",
+        "error against run time of events, over renders a second and rays per pixel",
+        (*_VIEW, "samples"),
+    ),
+    Question("pixel", "a test bench of the event pixel: ramp, step, sine, noise of the presets", ("device",)),
+    Question("render", "error against run time of rendering", ("scene", "device", "samples")),
+    Question(
+        "throughput",
+        "whole steps a second, where their time goes, and a naive event camera on the same frames",
+        ("scene", "device", "samples"),
     ),
     Question(
-        name="events",
-        help="error against run time of events, over renders a second and rays per pixel",
-        options=(*_VIEW, "samples"),
+        "worlds",
+        "many worlds stepped together for learning: renders a second of all",
+        (*_VIEW, "worlds", "seconds"),
+    ),
+    Question("data", "windows a second from a recording, and event files of all formats there and back"),
+    Question("leave-out", "what a scene does not need is not computed: kernels, memory, libraries, time"),
+    Question(
+        "step",
+        "whole steps a second with one event camera",
+        (*_VIEW, "instants", "steps", "max_displacement", "samples"),
+        False,
     ),
     Question(
-        name="pixel",
-        help="a test bench of the event pixel: ramp, step, sine, noise of the presets",
-        options=("device",),
+        "closed-loop",
+        "simulator and controller as processes: from command to image, images a second",
+        ("rates", "renderer", *_VIEW, "seconds", "settings"),
+        False,
     ),
     Question(
-        name="render",
-        help="error against run time of rendering",
-        options=("scene", "device", "samples"),
+        "streaming",
+        "a flight in real time: how punctual an IMU is beside an event camera",
+        (*_VIEW, "sampling_rate", "seconds", "settings"),
+        False,
     ),
     Question(
-        name="throughput",
-        help="whole steps a second, where their time goes, and a naive event camera on the same frames",
-        options=("scene", "device", "samples"),
-    ),
-    Question(
-        name="worlds",
-        help="many worlds stepped together for learning: renders a second of all",
-        options=(*_VIEW, "worlds", "seconds"),
-    ),
-    Question(
-        name="data",
-        help="windows a second from a recording, and event files of all formats there and back",
-    ),
-    Question(
-        name="leave-out",
-        help="what a scene does not need is not computed: kernels, memory, libraries, time",
-    ),
-    Question(
-        name="step",
-        help="whole steps a second with one event camera",
-        options=(*_VIEW, "instants", "steps", "max_displacement", "samples"),
-        in_all=False,
-    ),
-    Question(
-        name="closed-loop",
-        help="simulator and controller as processes: from command to image, images a second",
-        options=("rates", "renderer", *_VIEW, "seconds", "settings"),
-        in_all=False,
-    ),
-    Question(
-        name="streaming",
-        help="a flight in real time: how punctual an IMU is beside an event camera",
-        options=(*_VIEW, "sampling_rate", "seconds", "settings"),
-        in_all=False,
-    ),
-    Question(
-        name="delay",
-        help="a slow controller in real time against the same delay in lockstep",
-        options=("delays", "tours", "mode", "seconds", "factor", "settings"),
-        in_all=False,
+        "delay",
+        "a slow controller in real time against the same delay in lockstep",
+        ("delays", "tours", "mode", "seconds", "factor", "settings"),
+        False,
     ),
 )
 """All questions; `bench all` asks in this order."""

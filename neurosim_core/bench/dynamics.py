@@ -30,6 +30,7 @@ from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, panel
 
 RKMK4, DORMAND_PRINCE, CALLED = "RKMK4 (ours)", "Dormand-Prince (ours)", "ours, called from Python"
+ROTORPY = "RotorPy RK45"
 STEPS_S = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
 """Steps [s]."""
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
@@ -44,19 +45,18 @@ _STEPS_PER_LAUNCH = 250
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Measure, and return the chapter."""
-    quick, flights, references = options.quick, [], {}
+    quick = options.quick
+    samples: list[Row] = []
+    peers: list[Row] = []
     for name, make in FLIGHTS.items():
-        progress(f"reference of {name}")
-        flights.append(make())
-        cross_check = name in ("rotor step", "flip") and not quick
-        references[name] = make_reference(flights[-1], cross_check=cross_check)
-    samples = _sweep(flights, references, quick, progress)
-    peers = _peers(flights, references, quick, progress)
-    lagging = {
-        f"{tau_s:g} s": partial(short_flight, "hummingbird", motor_time_constant_s=tau_s)
-        for tau_s in MOTORS_S
-    }
-    motors = _hard({name: (make, False) for name, make in lagging.items()}, quick, progress)
+        progress(name)
+        flight = make()
+        known = make_reference(flight, cross_check=name in ("rotor step", "flip") and not quick)
+        samples += _sweep(flight, known, quick)
+        if not quick or name in ("rotor step", "figure eight"):
+            peers += _peers(flight, known)
+    lagging = {tau_s: partial(short_flight, "hummingbird", motor_time_constant_s=tau_s) for tau_s in MOTORS_S}
+    motors = _hard({f"{tau_s:g} s": (make, False) for tau_s, make in lagging.items()}, quick, progress)
     extremes = _hard(EXTREMES, quick, progress)
     claims = [
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
@@ -64,7 +64,8 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         _hard_claim("every extreme flight that is flown", extremes, 1e-5),
         _peer_claim(peers),
     ]
-    errors = {row["method"]: cell(_error_m(row)) for row in _at_one_ms(samples, "figure eight")}
+    at_one_ms = [row for row in samples if row[STEP] == 1.0 or row["rtol"] == 1e-6]
+    errors = {row["method"]: cell(_error_m(row)) for row in at_one_ms if row["flight"] == "figure eight"}
     sampled = (
         "Largest errors over the ends of all holds of 10 ms. CPU is that of the launches per simulated "
         "second and vehicle."
@@ -82,7 +83,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-2].measured}.",
         claims=claims,
         tables=[
-            Table("dynamics-1-ms", "Error at steps of 1 ms, or at rtol 1e-6", _at_one_ms(samples), sampled),
+            Table("dynamics-1-ms", "Error at steps of 1 ms, or at rtol 1e-6", at_one_ms, sampled),
             Table("dynamics-rotorpy", "RotorPy on the same flights", peers, "Ratios of CPU times."),
             Table("dynamics-motor", "Stiff motors, 0.2 s", _pivot(motors), hard),
             Table("dynamics-extremes", "Extreme flights, 0.2 s", _pivot(extremes), hard),
@@ -118,15 +119,9 @@ def _fly(
         vehicle.check()
     except DynamicsError:
         outcome = "DynamicsError"
-    redone, evaluations = (
-        int(count[0]) for count in (vehicle.effort.redone_count, vehicle.effort.evaluation_count)
-    )
-    return states, {
-        CPU: best_s / flight.duration_s,
-        "outcome": outcome,
-        "redone holds": redone,
-        "evaluations": evaluations,
-    }
+    row: Row = {CPU: best_s / flight.duration_s, "outcome": outcome}
+    row["redone holds"] = int(vehicle.effort.redone_count[0])
+    return states, row | {"evaluations": int(vehicle.effort.evaluation_count[0])}
 
 
 def _row(flight: str, method: str, setting: float, states: Array, reference: Reference, **known: Any) -> Row:
@@ -154,42 +149,25 @@ def _ours(flight: Flight, name: str, method: str, setting: float, known: Referen
     return _row(name, method, setting, states, known, **measured)
 
 
-def _sweep(
-    flights: Sequence[Flight], references: Mapping[str, Reference], quick: bool, progress: Progress
-) -> list[Row]:
-    """Fly every flight with every method and setting."""
-    rows = []
+def _sweep(flight: Flight, known: Reference, quick: bool) -> list[Row]:
+    """Fly a flight with every method and setting."""
     settings = [(RKMK4, step_s) for step_s in (STEPS_S[:5] if quick else STEPS_S)]
     settings += [(DORMAND_PRINCE, rtol) for rtol in (TOLERANCES[1:6:2] if quick else TOLERANCES)]
-    for flight in flights:
-        progress(f"{flight.name} with our integrators")
-        known = references[flight.name]
-        rows += [
-            _ours(flight, flight.name, method, value, known, 3 if quick else 5) for method, value in settings
-        ]
-    return sorted(rows, key=lambda row: list(FLIGHTS).index(row["flight"]))
+    return [_ours(flight, flight.name, method, value, known, 3 if quick else 5) for method, value in settings]
 
 
-def _peers(
-    flights: Sequence[Flight], references: Mapping[str, Reference], quick: bool, progress: Progress
-) -> list[Row]:
+def _peers(flight: Flight, known: Reference) -> list[Row]:
     """Fly RotorPy, and one vehicle of ours that is called from Python: once a command."""
     rows = []
-    for flight in flights:
-        if quick and flight.name not in ("rotor step", "figure eight"):
-            continue
-        known, ours = references[flight.name], []
-        for step_s in (1e-3, 1e-2):
-            states, measured = _fly(flight, repetitions=3, called=True, max_step_ns=round(1e9 * step_s))
-            ours.append(_row(flight.name, CALLED, step_s, states, known, **{CPU: measured[CPU]}))
-        rows += ours
-        for step_s in (1e-3, 1e-2) if rotorpy_peer.rotorpy_version() else ():
-            progress(f"{flight.name} with RotorPy, {1e3 * step_s:g} ms")
-            states, cpu_s = rotorpy_peer.fly_rotorpy(flight, step_s)
-            row = _row(flight.name, "RotorPy RK45", step_s, states, known, **{CPU: cpu_s / flight.duration_s})
-            exacter = [mine[CPU] for mine in ours if _error_m(mine) <= _error_m(row)]
-            row["ratio to ours, no less exact"] = row[CPU] / min(exacter) if exacter else None
-            rows.append(row)
+    for step_s in (1e-3, 1e-2):
+        states, measured = _fly(flight, repetitions=3, called=True, max_step_ns=round(1e9 * step_s))
+        rows.append(_row(flight.name, CALLED, step_s, states, known, **{CPU: measured[CPU]}))
+    for step_s in (1e-3, 1e-2) if rotorpy_peer.rotorpy_version() else ():
+        states, cpu_s = rotorpy_peer.fly_rotorpy(flight, step_s)
+        row = _row(flight.name, ROTORPY, step_s, states, known, **{CPU: cpu_s / flight.duration_s})
+        exacter = [mine[CPU] for mine in rows[:2] if _error_m(mine) <= _error_m(row)]
+        row["ratio to ours, no less exact"] = row[CPU] / min(exacter) if exacter else None
+        rows.append(row)
     return rows
 
 
@@ -198,24 +176,22 @@ def _hard(
 ) -> list[Row]:
     """Fly stiff and extreme flights by all methods, at 1 ms or rtol 1e-6; what is refused says why."""
     rows: list[Row] = []
-    flights: dict[str, Flight] = {}
-    for name, (make, _) in cases.items():
+    for name, (make, stiff) in cases.items():
+        progress(name)
         try:
-            flights[name] = make()
+            flight = make()
         except ValueError as error:
             why = next(line for line in str(error).splitlines() if "Value error" in line)
             rows.append({"flight": name, "method": RKMK4, "outcome": f"refused: {why.strip()}"})
-    for name, flight in flights.items():
-        progress(name)
-        known = make_reference(flight, stiff=cases[name][1])
-        rows += [
-            _ours(flight, name, m, value, known, 1) for m, value in ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6))
-        ]
+            continue
+        known = make_reference(flight, stiff=stiff)
+        for method, setting in ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6)):
+            rows.append(_ours(flight, name, method, setting, known, 1))
         if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
             states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
             outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"
-            rows.append(_row(name, "RotorPy RK45", 1e-3, states, known, outcome=outcome))
-    return sorted(rows, key=lambda row: list(cases).index(row["flight"]))
+            rows.append(_row(name, ROTORPY, 1e-3, states, known, outcome=outcome))
+    return rows
 
 
 def _precision_claim(samples: Sequence[Row], flight: str, limit_m: float) -> Claim:
@@ -228,26 +204,24 @@ def _hard_claim(what: str, rows: Sequence[Row], limit_m: float) -> Claim:
     """Judge the vehicle: it flies within the limit, refuses, or raises; it is never silently wrong."""
     ours = [row for row in rows if row["method"] == RKMK4]
     flown = [row for row in ours if row["outcome"] == "flown"]
-    raised = [row for row in ours if row["outcome"].startswith(("DynamicsError", "refused"))]
+    raised = [row["flight"] for row in ours if row["outcome"].startswith(("DynamicsError", "refused"))]
     worst = max(flown, key=_error_m)
     redone = sum(row["redone holds"] > 0 for row in flown)
-    return Claim(
-        f"{what}: the position error is <= {cell(limit_m)} m after 0.2 s at 1 ms; others raise errors",
-        _ORACLE,
+    text = f"{what}: the position error is <= {cell(limit_m)} m after 0.2 s at 1 ms; others raise errors"
+    said = (
         f"{len(flown)} flown, at most {cell(_error_m(worst))} m ({worst['flight']}), {redone} of them with "
-        "adaptive steps where fixed ones tripped the guard"
-        + (f"; errors raised: {', '.join(row['flight'] for row in raised)}" if raised else ""),
-        _error_m(worst) <= limit_m and len(flown) + len(raised) == len(ours),
     )
+    said += "adaptive steps where fixed ones tripped the guard"
+    said += f"; errors raised: {', '.join(raised)}" if raised else ""
+    return Claim(text, _ORACLE, said, _error_m(worst) <= limit_m and len(flown) + len(raised) == len(ours))
 
 
 def _peer_claim(peers: Sequence[Row]) -> Claim:
-    text = "figure eight, called from Python once a command: >= 10 times as fast as RotorPy at 1 ms, no "
-    "less exact"
+    text = "figure eight, called from Python once a command: >= 10 times as fast as RotorPy at 1 ms, as exact"
     reference = "RotorPy 3.0, arXiv 2306.04485, in the same run"
     if rotorpy_peer.rotorpy_version() is None:
         return Claim(text, reference, rotorpy_peer.INSTALL, None)
-    ours, theirs = (_find(peers, "figure eight", method) for method in (CALLED, "RotorPy RK45"))
+    ours, theirs = (_find(peers, "figure eight", method) for method in (CALLED, ROTORPY))
     ratio, exact = theirs[CPU] / ours[CPU], _error_m(ours) <= _error_m(theirs)
     said = f"{ratio:,.0f} times, {cell(_error_m(ours))} m against {cell(_error_m(theirs))} m"
     return Claim(text, reference, said, ratio >= 10.0 and exact)
@@ -260,11 +234,6 @@ def _find(rows: Iterable[Row], flight: str, method: str) -> Row:
 
 def _error_m(row: Row) -> float:
     return float(row.get(POSITION_M, math.inf))
-
-
-def _at_one_ms(samples: Sequence[Row], flight: str = "") -> list[Row]:
-    flights = [flight] if flight else list(FLIGHTS)
-    return [row for row in samples if row["flight"] in flights and (row[STEP] == 1.0 or row["rtol"] == 1e-6)]
 
 
 def _pivot(rows: Sequence[Row]) -> list[Row]:

@@ -11,15 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.bench.engine import (
-    FigureEightConfig,
-    Multirotor,
-    MultirotorConfig,
-    MultirotorState,
-    PathFollower,
-    figure_eight,
-    preset,
-)
+from neurosim_core.bench import engine
 
 Array = NDArray[np.float64]
 
@@ -32,8 +24,8 @@ class Flight:
     """One open-loop flight of one vehicle."""
 
     name: str
-    config: MultirotorConfig
-    start: MultirotorState
+    config: engine.MultirotorConfig
+    start: engine.MultirotorState
     """State at time 0, of one vehicle."""
     commands: Array
     """Rotor speeds [rad/s], shape [K, R]; command k holds from k to k + 1 times `HOLD_NS`."""
@@ -50,14 +42,16 @@ class Flight:
         return np.asarray(np.clip(self.commands[hold], *limits))
 
 
-def at_rest(config: MultirotorConfig, **changes: Any) -> MultirotorState:
+def at_rest(config: engine.MultirotorConfig, **changes: Any) -> engine.MultirotorState:
     """Return the state of one hovering vehicle at the origin, with the given fields replaced."""
     hover = np.full(config.rotor_count, config.hover_rotor_speed_rad_s)
-    state = MultirotorState(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), hover)
+    state = engine.MultirotorState(
+        np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), hover
+    )
     return state._replace(**{name: np.asarray(value, dtype=np.float64) for name, value in changes.items()})
 
 
-def _commands(config: MultirotorConfig, count: int, *, share: float, seed: int) -> Array:
+def _commands(config: engine.MultirotorConfig, count: int, *, share: float, seed: int) -> Array:
     """Return commands within a share of hover, evenly distributed, shape [count, R]."""
     noise = np.random.default_rng(seed).uniform(-share, share, (count, config.rotor_count))
     return np.asarray(config.hover_rotor_speed_rad_s * (1.0 + noise))
@@ -68,21 +62,21 @@ def _commands(config: MultirotorConfig, count: int, *, share: float, seed: int) 
 
 def hover() -> Flight:
     """Return 2 s of hover, which every method should keep to rounding."""
-    config = preset("crazyflie")
+    config = engine.preset("crazyflie")
     commands = np.full((200, 4), config.hover_rotor_speed_rad_s)
     return Flight(name="hover", config=config, start=at_rest(config), commands=commands)
 
 
 def rotor_step() -> Flight:
     """Return 0.6 s after a step of 5 % in the command of one rotor."""
-    config = preset("crazyflie")
+    config = engine.preset("crazyflie")
     command = config.hover_rotor_speed_rad_s * np.array([1.05, 1.0, 1.0, 1.0])
     return Flight(name="rotor step", config=config, start=at_rest(config), commands=np.tile(command, (60, 1)))
 
 
 def flip() -> Flight:
     """Return a roll of 0.75 s that reaches 700 deg/s: a torque, its opposite, and hover thrust between."""
-    config = preset("crazyflie")
+    config = engine.preset("crazyflie")
     left, share = np.array([1.0, -1.0, -1.0, 1.0]), np.zeros(75)
     share[5:20], share[55:70] = -0.072, 0.072
     commands = config.hover_rotor_speed_rad_s * (1.0 + share[:, None] * left)
@@ -91,7 +85,7 @@ def flip() -> Flight:
 
 def tumble() -> Flight:
     """Return 2 s that begin at 20 rad/s about three axes at once, with commands that change by 20 %."""
-    config = preset("hummingbird")
+    config = engine.preset("hummingbird")
     start = at_rest(config, velocity=(2.0, -1.0, 1.0), body_rate=(12.0, -11.0, 11.6))
     return Flight(
         name="tumble", config=config, start=start, commands=_commands(config, 200, share=0.2, seed=4)
@@ -100,13 +94,13 @@ def tumble() -> Flight:
 
 def figure_eight_flight() -> Flight:
     """Return 5 s of a figure eight at 9 m/s, with the commands of the SE(3) controller in closed loop."""
-    config = preset("hummingbird")
-    shape = FigureEightConfig(length_m=6.0, width_m=3.0, speed_max_m_s=9.0, laps=4.0, ramp_s=2.0)
-    follower = PathFollower(figure_eight(shape, center=np.zeros(3)), config)
-    vehicle = Multirotor(config)
+    config = engine.preset("hummingbird")
+    shape = engine.FigureEightConfig(length_m=6.0, width_m=3.0, speed_max_m_s=9.0, laps=4.0, ramp_s=2.0)
+    follower = engine.PathFollower(engine.figure_eight(shape, center=np.zeros(3)), config)
+    vehicle = engine.Multirotor(config)
     commands = []
     for k in range(500):
-        state = MultirotorState(*(rows[0] for rows in vehicle.state))
+        state = engine.MultirotorState(*(rows[0] for rows in vehicle.state))
         commands.append(follower.command(stamp_ns=k * HOLD_NS, **state._asdict()))
         vehicle.step(commands[-1], HOLD_NS)
     return Flight(name="figure eight", config=config, start=at_rest(config), commands=np.array(commands))
@@ -144,7 +138,7 @@ def short_flight(
     if inertia is not None:
         matrix = np.diag(inertia) if np.ndim(inertia) == 1 else inertia
         changes["inertia_kg_m2"] = tuple(map(tuple, matrix.tolist()))
-    config = preset(airframe, **changes)
+    config = engine.preset(airframe, **changes)
     commands = _commands(config, 20, share=0.1, seed=7)
     if bang_bang:
         commands = np.random.default_rng(3).choice([0.0, config.rotor_speed_max_rad_s], (20, 4))
@@ -162,9 +156,9 @@ MOTORS_S = (1e-1, 1e-2, 5e-3, 1e-3, 5e-4, 3e-4, 1e-4, 1e-5, 1e-6, 0.0)
 _FAST = 200.0 / math.sqrt(3.0)
 _STORM: dict[str, Any] = {
     "wind_m_s": (100.0, 0.0, 0.0),
-    "parasitic_drag_kg_m": preset("hummingbird").parasitic_drag_kg_m,
+    "parasitic_drag_kg_m": engine.preset("hummingbird").parasitic_drag_kg_m,
 }
-_INERTIA = np.array(preset("crazyflie").inertia_kg_m2)
+_INERTIA = np.array(engine.preset("crazyflie").inertia_kg_m2)
 _MASSES_KG = {"30 g": 3e-2, "5.3 g": 5.3e-3, "3 g": 3e-3, "0.3 g": 3e-4, "30 mg": 3e-5, "3 mg": 3e-6}
 _RATIOS = {"1:10:100": (1.0, 10.0, 100.0), "1:10:10.9": (1.0, 10.0, 10.9), "1:100:100.9": (1.0, 100.0, 100.9)}
 EXTREMES: dict[str, tuple[Callable[[], Flight], bool]] = {

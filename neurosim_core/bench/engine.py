@@ -36,7 +36,7 @@ from neurosim_core.sim.model import Model, find_device, make_model, refit
 from neurosim_core.sim.rollout import run_model, step
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.sim.state import StartState, make_state
-from neurosim_core.trajectory import FigureEightConfig, figure_eight
+from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 Poses = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -60,6 +60,17 @@ def load_scene(file: Path | None, *, rooms: int | None = None) -> Scene:
     if file is not None:
         return load_mesh_scene(MeshSceneConfig(file=file.resolve()))
     return make_apartment(ApartmentConfig() if rooms is None else ApartmentConfig(rooms=rooms))
+
+
+def option_names(camera: str, **more: str) -> dict[str, str]:
+    """Return what the command line calls settings, for error messages: setting -> option.
+
+    Args:
+        camera: Name of the camera that the options are about.
+        more: Options of further settings of it.
+    """
+    names = {"lens.width": "--width", "lens.height": "--height", **more}
+    return {"device": "--device", **{f"sensors.{camera}.{key}": name for key, name in names.items()}}
 
 
 def free_views(scene: Scene, count: int, *, device: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -22,26 +22,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.bench.engine import (
-    EventArrays,
-    EventCamera,
-    EventCameraConfig,
-    Flown,
-    PinholeConfig,
-    Poses,
-    View,
-    adaptive_ticks,
-    busy_s,
-    find_device,
-    fly,
-    join_events,
-    load_config,
-    scene_settings,
-    upload_scene,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.events_space import (
     REFERENCE_SAMPLES,
     SAMPLES,
+    case_of,
     sample_in_space,
     space_claims,
     space_plot,
@@ -66,15 +51,15 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     Raises:
         ValueError: The scene cannot be loaded, the device is not there, or samples are out of range.
     """
-    device, quick = find_device(options.device), options.quick
+    device, quick = engine.find_device(options.device), options.quick
     samples = options.samples or (SAMPLES[::2] if quick else SAMPLES)
     if not all(1 <= count <= REFERENCE_SAMPLES for count in samples):
         raise ValueError(f"samples must be in [1, {REFERENCE_SAMPLES}], got {list(samples)}")
     on_cuda = wp.get_device(device).is_cuda
 
-    def lens(columns: int) -> PinholeConfig:
+    def lens(columns: int) -> engine.PinholeConfig:
         rows = options.height or round((9 / 16 if columns == 1280 else 3 / 4) * columns)
-        return PinholeConfig(width=columns, height=rows, horizontal_fov_rad=1.5)
+        return engine.PinholeConfig(width=columns, height=rows, horizontal_fov_rad=1.5)
 
     columns = options.width or (346 if on_cuda else 32 if quick else 64)
     time_rows = _sample_in_time(lens(columns), options.scene, device, quick, progress)
@@ -96,7 +81,7 @@ class _Candidate:
     ticks: NDArray[np.int64]
     choice_s: float = 0.0
     camera: Any = None
-    parts: list[EventArrays] = field(default_factory=list)
+    parts: list[engine.EventArrays] = field(default_factory=list)
 
     def see(self, frames: Any, stamps_ns: NDArray[np.int64], begin: int) -> None:
         """Take those of consecutive frames that are its own; the very first is its reference."""
@@ -128,7 +113,7 @@ def _dodge(airframe: Any, share: float) -> tuple[tuple[float, ...], str]:
 
 
 def _sample_in_time(
-    lens: PinholeConfig, scene: Path | None, device: str, quick: bool, progress: Progress
+    lens: engine.PinholeConfig, scene: Path | None, device: str, quick: bool, progress: Progress
 ) -> list[Row]:
     """Return a row for each candidate."""
     progress("fly")
@@ -137,29 +122,31 @@ def _sample_in_time(
         "device": device,
         "path": {"kind": "hover"},
         "render": {"samples_per_pixel": 8},
-        **scene_settings(scene, quick=quick),
+        **engine.scene_settings(scene, quick=quick),
     }
     rate_hz = 10_000.0 if quick else 100_000.0
-    flown = fly(load_config(settings), rate_hz, pilot=_dodge, velocity=(0.12, 0.05, 0.0))
-    arrays = upload_scene(flown.model.scene, flown.model.config.render, device=device)
+    flown = engine.fly(engine.load_config(settings), rate_hz, pilot=_dodge, velocity=(0.12, 0.05, 0.0))
+    arrays = engine.upload_scene(flown.model.scene, flown.model.config.render, device=device)
     progress("choose the renders of adaptive sampling")
     everything = np.arange(len(flown.stamps_ns))
     reference = _Candidate(scheme="reference", setting=rate_hz, ticks=everything)
     candidates = list(_candidates(flown, arrays, lens, quick))
-    view, poses = View(arrays, lens, count=_STACK), flown.poses()
+    view, poses = engine.View(arrays, lens, count=_STACK), flown.poses()
     render_s = _time_renders(view, poses, candidates, progress)
-    pixel = EventCameraConfig()
+    pixel = engine.EventCameraConfig()
     size: dict[str, Any] = {"width": lens.width, "height": lens.height, "device": device}
     thresholds: dict[str, Any] = {"threshold_on": pixel.threshold_on, "threshold_off": pixel.threshold_off}
     for candidate in (reference, *candidates):
         naive = candidate.scheme == "naive"
-        candidate.camera = NaiveEventCamera(**size, **thresholds) if naive else EventCamera(pixel, **size)
+        candidate.camera = (
+            NaiveEventCamera(**size, **thresholds) if naive else engine.EventCamera(pixel, **size)
+        )
     for rows, frames in view.stacks(poses):
         if rows.start % (_STACK * 32) == 0:
             progress(f"render {rows.start:,} of {len(everything):,}")
         for candidate in (reference, *candidates):
             candidate.see(frames, flown.stamps_ns[rows], rows.start)
-    truth = join_events(reference.parts)
+    truth = engine.join_events(reference.parts)
     found = []
     for candidate, seconds in zip(candidates, render_s, strict=True):
         progress(f"compare {candidate.scheme} {candidate.setting:g}")
@@ -167,7 +154,9 @@ def _sample_in_time(
     return found
 
 
-def _candidates(flown: Flown, arrays: Any, lens: PinholeConfig, quick: bool) -> Iterator[_Candidate]:
+def _candidates(
+    flown: engine.Flown, arrays: Any, lens: engine.PinholeConfig, quick: bool
+) -> Iterator[_Candidate]:
     """Yield who sees which ticks of the reference."""
     for rate_hz in FIXED_HZ[:5] if quick else FIXED_HZ:
         ticks = _ticks(flown, rate_hz)
@@ -177,17 +166,17 @@ def _candidates(flown: Flown, arrays: Any, lens: PinholeConfig, quick: bool) -> 
     forced[_ticks(flown, 100.0)] = True  # ends of packets
     forced[-1] = True
     for limit_px in ADAPTIVE_PX[1:] if quick else ADAPTIVE_PX:
-        ticks, choice_s = adaptive_ticks(flown, arrays, lens, limit_px, forced)
+        ticks, choice_s = engine.adaptive_ticks(flown, arrays, lens, limit_px, forced)
         yield _Candidate(scheme="adaptive", setting=limit_px, ticks=ticks, choice_s=choice_s)
 
 
-def _ticks(flown: Flown, rate_hz: float) -> NDArray[np.int64]:
+def _ticks(flown: engine.Flown, rate_hz: float) -> NDArray[np.int64]:
     """Return the ticks of the reference at which a slower clock ticks."""
     return np.arange(0, len(flown.stamps_ns), round(flown.rate.rate_hz / rate_hz))
 
 
 def _time_renders(
-    view: View, poses: Poses, candidates: Sequence[_Candidate], progress: Progress
+    view: engine.View, poses: engine.Poses, candidates: Sequence[_Candidate], progress: Progress
 ) -> list[float]:
     """Return what the renders of each candidate take [s]; equal ticks are timed once, and some of many."""
     known: dict[bytes, float] = {}
@@ -197,15 +186,17 @@ def _time_renders(
         if key not in known:
             progress(f"time the renders of {candidate.scheme} {candidate.setting:g}")
             some = candidate.ticks[:: -(-len(candidate.ticks) // _TIMED_MAX)]
-            begin_s = busy_s(view.device)
+            begin_s = engine.busy_s(view.device)
             for _ in view.stacks((poses[0][some], poses[1][some])):
                 pass
-            known[key] = (busy_s(view.device) - begin_s) * len(candidate.ticks) / len(some)
+            known[key] = (engine.busy_s(view.device) - begin_s) * len(candidate.ticks) / len(some)
     return [known[candidate.ticks.tobytes()] for candidate in candidates]
 
 
-def _time_row(candidate: _Candidate, truth: EventArrays, flown: Flown, width: int, render_s: float) -> Row:
-    events, total = join_events(candidate.parts), len(truth.t)
+def _time_row(
+    candidate: _Candidate, truth: engine.EventArrays, flown: engine.Flown, width: int, render_s: float
+) -> Row:
+    events, total = engine.join_events(candidate.parts), len(truth.t)
     window: dict[str, Any] = {"window_us": 1e3 * WINDOW_MS, "shift_cost": 2.0}
     aligned = match(truth, events, width=width, device=flown.model.device, **window)
     shifts = np.abs(aligned.error_us[~np.isnan(aligned.error_us)])
@@ -263,11 +254,10 @@ def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapte
         f"rate, and {_span(faster)} times less time to choose and render them."
     ]
     for row in (row for row in space_rows if row["rays per pixel"].endswith("(default)")):
+        spurious, missed = (f"{row[f'{kind}, 20 ms [%]']:.0f} %" for kind in ("spurious", "missed"))
         said.append(
-            f"In space, {row['scene']}, {row['motion']}, {row['pixels']}: by default "
-            f"{row['spurious, 20 ms [%]']:.0f} % of the events are spurious and "
-            f"{row['missed, 20 ms [%]']:.0f} % are missed within 20 ms, against {REFERENCE_SAMPLES} rays per "
-            "pixel."
+            f"In space, {', '.join(case_of(row))}: by default {spurious} of the events are spurious and "
+            f"{missed} are missed within 20 ms, against {REFERENCE_SAMPLES} rays per pixel."
         )
     time_note = (
         "Matched within 10 ms (Victor and Purpura, q = 200/s). Seconds are CPU time of all threads, or "
@@ -277,6 +267,7 @@ def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapte
         "Spurious events are a share of those of the row, missed ones of those of the reference. Rendered at "
         "500 Hz. The row with another pattern is the floor."
     )
+    by_rays = f"Events by rays per pixel, against {REFERENCE_SAMPLES}"
     return Chapter(
         name="events",
         title="Events: error against run time, over renders a second and rays per pixel",
@@ -284,12 +275,7 @@ def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapte
         claims=[*_time_claims(time_rows, fewer, quick), *space_claims(space_rows)],
         tables=[
             Table("events-time", "Events by how a flight was sampled in time", time_rows, time_note),
-            Table(
-                "events-space",
-                f"Events by rays per pixel, against {REFERENCE_SAMPLES}",
-                space_rows,
-                space_note,
-            ),
+            Table("events-space", by_rays, space_rows, space_note),
         ],
         plots=[_time_plot(time_rows), space_plot(space_rows)],
     )
@@ -300,38 +286,27 @@ def _time_claims(rows: Sequence[Row], fewer: dict[float, float], quick: bool) ->
     small, median = " (quick: too small to judge)" if quick else "", "timing error, median [us]"
     rows = sorted(rows, key=lambda r: r["renders"])
     curves = {scheme: [r for r in rows if r["scheme"] == scheme] for scheme in ("fixed", "adaptive", "naive")}
-    ours = curves["adaptive"]
-    renders = np.log([row["renders"] for row in ours])
-    errors = np.log([max(row[median], 1.0) for row in ours])
+    renders = np.log([row["renders"] for row in curves["adaptive"]])
+    errors = np.log([max(row[median], 1.0) for row in curves["adaptive"]])
     gains = {
         row["Hz or px"]: row[median] / math.exp(np.interp(math.log(row["renders"]), renders, errors))
         for row in curves["naive"]
         if renders[0] <= math.log(row["renders"]) <= renders[-1]
     }
-    falling = [
-        all(a["distance per event"] > b["distance per event"] for a, b in itertools.pairwise(curves[scheme]))
-        for scheme in ("fixed", "adaptive")
-    ]
+    distances = ([row["distance per event"] for row in curves[scheme]] for scheme in ("fixed", "adaptive"))
+    falling = [all(a > b for a, b in itertools.pairwise(each)) for each in distances]
+    half = "for the same error adaptive sampling needs at most half the renders of the best fixed rate"
+    fifth = "at as many renders the median timing error of a naive camera is at least 5 times that of "
+    less = "the error falls with every further render, at fixed rates and adaptively"
+    naive = "one event per pixel and frame, stamped at the frame, as in many simulators"
+    said = f"{_span(fewer)} times fewer, at {', '.join(f'{px:g}' for px in fewer)} px{small}"
+    both = f"fixed: {cell(falling[0])}, adaptive: {cell(falling[1])}"
+    saved = None if quick or not fewer else min(fewer.values()) >= 2.0
+    gained = None if quick or not gains else min(gains.values()) >= 5.0
     return [
-        Claim(
-            "for the same error adaptive sampling needs at most half the renders of the best fixed rate",
-            reference,
-            f"{_span(fewer)} times fewer, at {', '.join(f'{px:g}' for px in fewer)} px{small}",
-            None if quick or not fewer else min(fewer.values()) >= 2.0,
-        ),
-        Claim(
-            "at as many renders the median timing error of a naive camera is at least 5 times that of "
-            "adaptive sampling",
-            "one event per pixel and frame, stamped at the frame, as in many simulators",
-            f"{_span(gains)} times{small}",
-            None if quick or not gains else min(gains.values()) >= 5.0,
-        ),
-        Claim(
-            "the error falls with every further render, at fixed rates and adaptively",
-            reference,
-            f"fixed: {cell(falling[0])}, adaptive: {cell(falling[1])}",
-            all(falling),
-        ),
+        Claim(half, reference, said, saved),
+        Claim(fifth + "adaptive sampling", naive, f"{_span(gains)} times{small}", gained),
+        Claim(less, reference, both, all(falling)),
     ]
 
 

@@ -20,14 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from neurosim_core.bench.engine import (
-    PRESETS,
-    EventArrays,
-    EventCamera,
-    EventCameraConfig,
-    device_title,
-    find_device,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table
 
@@ -66,7 +59,7 @@ _CLAIMS = {
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Measure, and return the chapter."""
-    bench = TestBench(device=find_device(options.device), quick=options.quick)
+    bench = TestBench(device=engine.find_device(options.device), quick=options.quick)
     curves: list[Curve] = []
     for pattern in (ramp, s_curves, latency, gain):
         progress(pattern.__name__.replace("_", " "))
@@ -89,8 +82,9 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     return Chapter(
         name="pixel",
         title="A test bench for event pixels",
-        summary=f"Patterns of light as in a laboratory, shown to pixels on {device_title(bench.device)}; "
-        f"{met} of {len(claims)} claims are met. Marks are measured, lines are the closed form.",
+        summary="Patterns of light as in a laboratory, shown to pixels on "
+        f"{engine.device_title(bench.device)}; {met} of {len(claims)} claims are met. "
+        "Marks are measured, lines are the closed form.",
         claims=claims,
         tables=[
             Table("pixel-noise", "Noise of presets beside their sources", figures, noise),
@@ -160,25 +154,27 @@ class TestBench:
         """Return a size that depends on how much is measured."""
         return quick if self.quick else full
 
-    def expose(self, config: EventCameraConfig, log: Floats, time_s: Sequence[float] | Floats) -> EventArrays:
+    def expose(
+        self, config: engine.EventCameraConfig, log: Floats, time_s: Sequence[float] | Floats
+    ) -> engine.EventArrays:
         """Return the events of pixels that begin at the first frame: log radiance [K, H, W] at times [K]."""
         _, height, width = log.shape
-        camera = EventCamera(config, width=width, height=height, device=self.device, sensor="bench")
+        camera = engine.EventCamera(config, width=width, height=height, device=self.device, sensor="bench")
         stamps = np.rint(1e9 * np.asarray(time_s)).astype(np.int64)
         frames = log.astype(np.float32)
         camera.reset(frames[0], int(stamps[0]))
         return camera.feed(frames[1:], stamps[1:]).numpy()
 
 
-def make_pixel(**settings: Any) -> EventCameraConfig:
+def make_pixel(**settings: Any) -> engine.EventCameraConfig:
     """Return pixels with both thresholds 0.2 and whatever else is asked for."""
     thresholds = {"threshold_on": THRESHOLD, "threshold_off": THRESHOLD}
-    return EventCameraConfig.model_validate({**thresholds, **settings})
+    return engine.EventCameraConfig.model_validate({**thresholds, **settings})
 
 
-def make_preset(name: str, **settings: Any) -> EventCameraConfig:
+def make_preset(name: str, **settings: Any) -> engine.EventCameraConfig:
     """Return the pixels of a preset, with some settings in place of its own."""
-    return EventCameraConfig.model_validate({"preset": name, **settings})
+    return engine.EventCameraConfig.model_validate({"preset": name, **settings})
 
 
 def still(level: float, side: int) -> Floats:
@@ -186,12 +182,12 @@ def still(level: float, side: int) -> Floats:
     return np.full((2, side, side), level)
 
 
-def events_per_pixel(events: EventArrays, width: int, count: int) -> NDArray[np.int64]:
+def events_per_pixel(events: engine.EventArrays, width: int, count: int) -> NDArray[np.int64]:
     """Return the number of events of each pixel, shape [count]."""
     return np.bincount(events.y.astype(np.int64) * width + events.x, minlength=count)
 
 
-def rates_hz(events: EventArrays, width: int, count: int) -> Floats:
+def rates_hz(events: engine.EventArrays, width: int, count: int) -> Floats:
     """Return the rate of each pixel from its first to its last event, shape [count]; nan if it has one."""
     pixel = events.y.astype(np.int64) * width + events.x
     order = np.argsort(pixel, kind="stable")
@@ -210,7 +206,7 @@ def ramp(bench: TestBench) -> list[Curve]:
     """Return rates over the slope of a ramp: ideal, with a refractory time, with a leak."""
     slopes = np.logspace(-1.0, 4.0, bench.pick(21, 6))
     leak = {"rate_hz": 10.0, "spread_decades": 0.0}
-    models: dict[str, tuple[EventCameraConfig, Floats]] = {
+    models: dict[str, tuple[engine.EventCameraConfig, Floats]] = {
         "ideal": (make_pixel(), slopes / THRESHOLD),
         "refractory 1 ms": (make_pixel(refractory_s=1e-3), 1.0 / (1e-3 + THRESHOLD / slopes)),
         "refractory 10 ms": (make_pixel(refractory_s=1e-2), 1.0 / (1e-2 + THRESHOLD / slopes)),
@@ -283,7 +279,7 @@ def latency(bench: TestBench) -> list[Curve]:
     return curves
 
 
-def corner_hz(config: EventCameraConfig, radiance: Floats) -> Floats:
+def corner_hz(config: engine.EventCameraConfig, radiance: Floats) -> Floats:
     """Return the 3 dB frequency of the photoreceptor at a radiance [Hz]."""
     assert config.low_pass is not None
     dark, white = config.low_pass.dark_radiance, config.white_radiance
@@ -318,7 +314,7 @@ def gain(bench: TestBench) -> list[Curve]:
 
 
 def _sine_gain(
-    bench: TestBench, config: EventCameraConfig, radiance: float, corner: float, ratio: float
+    bench: TestBench, config: engine.EventCameraConfig, radiance: float, corner: float, ratio: float
 ) -> float:
     """Return the gain at one radiance and `ratio` times the 3 dB frequency [Hz]."""
     pixel_count, counted = 16, 4
@@ -339,14 +335,18 @@ def _sine_gain(
 
 def measure_noise_figures(bench: TestBench) -> list[Row]:
     """Return a row for each figure that the source of a preset has of noise, beside what the preset does."""
-    names = ("davis346", "gen3") if bench.quick else tuple(name for name in PRESETS if PRESETS[name].noise)
+    names = (
+        ("davis346", "gen3")
+        if bench.quick
+        else tuple(name for name in engine.PRESETS if engine.PRESETS[name].noise)
+    )
     side, seconds = bench.pick(96, 48), bench.pick(60, 20)
     rows: list[Row] = []
     for name in names:
         found: dict[float, dict[str, float]] = {}
         config = make_preset(name, readout=None)
         white_lux = config.measured_noise.white_lux if config.measured_noise else 1000.0
-        for figure in PRESETS[name].noise:
+        for figure in engine.PRESETS[name].noise:
             if figure.lux not in found:
                 log = still(math.log(config.white_radiance * figure.lux / white_lux), side)
                 events = bench.expose(config, log, [0.0, float(seconds)])
@@ -358,7 +358,7 @@ def measure_noise_figures(bench: TestBench) -> list[Row]:
     return rows
 
 
-def _noise_statistics(events: EventArrays, side: int, seconds: float) -> dict[str, float]:
+def _noise_statistics(events: engine.EventArrays, side: int, seconds: float) -> dict[str, float]:
     count = events_per_pixel(events, side, side * side)
     on = int(events.polarity.sum())
     fires = count[count > 0]

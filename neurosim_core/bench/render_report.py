@@ -171,8 +171,6 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         look |= {"linewidth": 1.0} if law else {"label": series.label, "marker": marker}
         x, y = (np.array([math.nan if v is None else v for v in values]) for values in (series.x, series.y))
         axes.plot(x, y, **look)
-        for name, place in zip(series.names, zip(x, y, strict=True), strict=False):
-            axes.annotate(name, place, (4, 4), textcoords="offset points", fontsize=7)
     for draw, marks in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
         for label, at in marks.items():
             draw(at, color="0.45", linestyle=":", linewidth=1.2, label=label)

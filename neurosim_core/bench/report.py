@@ -57,8 +57,6 @@ class Series:
     y: Values
     style: Style = "line"
     """`law`: a thin line in the colour of the series before it, which the legend does not name."""
-    names: Sequence[str] = ()
-    """Text beside each point; empty: none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,38 +8,23 @@ from typing import Any, cast
 
 import numpy as np
 
-from neurosim_core.bench.engine import (
-    Events,
-    Model,
-    device_title,
-    event_settings,
-    load_config,
-    make_model,
-    make_state,
-    run_model,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Row, Table
 
 RATE_HZ = 1000.0
 """Steps per simulated second."""
-_NAMES = {
-    "sensors.events.lens.width": "--width",
-    "sensors.events.lens.height": "--height",
-    "sensors.events.max_displacement_px": "--max-displacement",
-    "render.samples_per_pixel": "--samples",
-    "device": "--device",
-}
-"""What the command line calls settings, for error messages."""
 
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Fly with one event camera and nothing else, and time it."""
     count = options.steps // 10 if options.quick else options.steps
+    names = engine.option_names("events", max_displacement_px="--max-displacement")
+    names["render.samples_per_pixel"] = "--samples"
     rows = []
     for rays in options.samples or (None,):
         progress("set-up" if rays is None else f"{rays} rays per pixel")
-        settings = event_settings(
+        settings = engine.event_settings(
             width=options.width or 640,
             height=options.height or 480,
             rate_hz=RATE_HZ,
@@ -50,20 +35,21 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             samples=rays,
             max_displacement_px=options.max_displacement,
         )
-        model = make_model(load_config(settings, options=_NAMES))
+        model = engine.make_model(engine.load_config(settings, options=names))
         rows.append(time_steps(model, warm_up=count // 2, count=count, repetitions=5))
     best = max(rows, key=lambda row: row["whole steps/s"])
     return Chapter(
         name="step",
         title="Whole steps a second",
-        summary=f"{best['whole steps/s']:,.0f} whole steps a second on {device_title(options.device)}, "
-        f"{best['times real time']:.3g} times real time at {RATE_HZ:g} steps a second.",
+        summary=f"{best['whole steps/s']:,.0f} whole steps a second on "
+        f"{engine.device_title(options.device)}, {best['times real time']:.3g} times real time at "
+        f"{RATE_HZ:g} steps a second.",
         tables=[Table("step", "Whole steps a second", rows, "Medians of five repetitions.")],
     )
 
 
 def time_steps(
-    model: Model, *, warm_up: int, count: int, repetitions: int, repetition_s: float = float("inf")
+    model: engine.Model, *, warm_up: int, count: int, repetitions: int, repetition_s: float = float("inf")
 ) -> Row:
     """Fly a model with one event camera and nothing else, and return a row of what was measured.
 
@@ -77,7 +63,7 @@ def time_steps(
     camera: Any
     (camera,) = model.config.sensors.values()
     instants = model.config.instants_per_launch
-    packets = run_model(model, make_state(model))
+    packets = engine.run_model(model, engine.make_state(model))
     for _ in islice(packets, 1 + warm_up // instants):
         pass
     rates, events, steps, last_ns = [], 0, 0, None
@@ -87,7 +73,7 @@ def time_steps(
             if last_ns is not None:
                 flown += round(1e-9 * (packet.stamp_ns - last_ns) * RATE_HZ)
             last_ns = packet.stamp_ns
-            events += len(cast(Events, packet).numpy().t)
+            events += len(cast(engine.Events, packet).numpy().t)
             if flown >= count or (flown and time.perf_counter() - begin_s > repetition_s):
                 break
         rates.append(flown / (time.perf_counter() - begin_s))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.bench.engine import ProbeError, StreamProbe, load_config, scene_settings, set_options
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table
@@ -24,13 +24,6 @@ _SAMPLING_RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 25.0, 20.0, 10.0
 _IMU, _CAMERA, _IMU_RATE_HZ = "imu", "events", 1000.0
 _GROWTH_MAX_MIB = 4.0
 _SETTLED_S = 10.0
-_NAMES = {
-    f"sensors.{_CAMERA}.lens.width": "--width",
-    f"sensors.{_CAMERA}.lens.height": "--height",
-    "device": "--device",
-    f"sensors.{_CAMERA}.sampling_rate_hz": "--sampling-rate",
-}
-"""What the command line calls settings, for error messages."""
 
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
@@ -55,15 +48,17 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             _CAMERA: {"kind": "event_camera", "lens": lens, "sampling_rate_hz": rate_hz},
         },
         "live": {"mode": "streaming", "real_time_factor": 1.0},
-        **scene_settings(options.scene),
+        **engine.scene_settings(options.scene),
     }
-    config = load_config(base, overrides=options.settings, options=_NAMES | set_options(options.settings))
+    names = engine.option_names(_CAMERA, sampling_rate_hz="--sampling-rate")
+    names |= engine.set_options(options.settings)
+    config = engine.load_config(base, overrides=options.settings, options=names)
     progress(f"streaming for {seconds:g} s, {rate_hz:g} renders a second")
     vehicle = next(iter(config.vehicles))
     with (
         own_runtime() as folder,
         NeurosimProcess("serve", config, log=folder / "serve.log") as simulator,
-        StreamProbe(vehicle=vehicle, imu=_IMU, camera=_CAMERA) as probe,
+        engine.StreamProbe(vehicle=vehicle, imu=_IMU, camera=_CAMERA) as probe,
         NeurosimProcess("fly", config, log=folder / "fly.log") as controller,
     ):
         processes = (simulator, controller)
@@ -76,8 +71,8 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             trace = probe.listen(
                 seconds, resident=lambda: [p.resident_bytes() for p in processes], check=check
             )
-        except ProbeError as error:
-            raise ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
+        except engine.ProbeError as error:
+            raise engine.ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
     return summarise(trace, rate_hz, f"{view.width}x{view.height}")
 
 

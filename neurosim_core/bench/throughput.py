@@ -16,20 +16,7 @@ from typing import Any, cast
 import numpy as np
 import warp as wp
 
-from neurosim_core.bench.engine import (
-    EventCamera,
-    EventCameraConfig,
-    Model,
-    View,
-    device_title,
-    event_settings,
-    find_device,
-    fly,
-    load_config,
-    make_model,
-    refit,
-    upload_scene,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, cell, panel
@@ -48,7 +35,7 @@ _STAMPS_NS = 1_000_000
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Measure, and return the chapter."""
-    device, quick = find_device(options.device), options.quick
+    device, quick = engine.find_device(options.device), options.quick
     on_cuda = bool(wp.get_device(device).is_cuda)
     sizes = ((48, 36), (96, 72)) if quick else ((128, 128), _DAVIS, _VGA, (1280, 720))
     size = sizes[0] if quick else _VGA if on_cuda else _DAVIS
@@ -64,20 +51,20 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
             "scene": options.scene,
             "quick": quick,
         }
-        return event_settings(rate_hz=RATE_HZ, instants=launch, duration_s=duration_s, **view, **more)
+        return engine.event_settings(rate_hz=RATE_HZ, instants=launch, duration_s=duration_s, **view, **more)
 
     progress("the scene, its light and the path")
-    base = make_model(load_config(settings()))
+    base = engine.make_model(engine.load_config(settings()))
 
-    def model(**more: Any) -> Model:
-        return refit(base, load_config(settings(**more)))
+    def model(**more: Any) -> engine.Model:
+        return engine.refit(base, engine.load_config(settings(**more)))
 
-    def with_rays(count: int) -> Model:
-        config = load_config(settings(samples=count))
-        uploaded = upload_scene(base.scene, config.render, device=device)
-        return refit(dataclasses.replace(base, config=config, scene_on_device=uploaded), config)
+    def with_rays(count: int) -> engine.Model:
+        config = engine.load_config(settings(samples=count))
+        uploaded = engine.upload_scene(base.scene, config.render, device=device)
+        return engine.refit(dataclasses.replace(base, config=config, scene_on_device=uploaded), config)
 
-    cases: list[tuple[str, str, Callable[[], Model]]] = []
+    cases: list[tuple[str, str, Callable[[], engine.Model]]] = []
     for pixels in sizes:
         cases.append(("resolution", EXACT, partial(model, pixels=pixels)))
         cases.append(("resolution", ADAPTIVE, partial(model, pixels=pixels, max_displacement_px=0.5)))
@@ -102,7 +89,7 @@ def _try(measure: Callable[[], Row]) -> Row:
         gc.collect()  # states refer to themselves, and hold memory of the device
 
 
-def _steps(make: Callable[[], Model], quick: bool) -> Row:
+def _steps(make: Callable[[], engine.Model], quick: bool) -> Row:
     """Time whole steps from 1 s of the flight on: it begins at rest."""
     model = make()
     warm_up = 100 if quick else 1000
@@ -128,7 +115,7 @@ def _seconds(call: Callable[[], object], device: str, seconds: float) -> float:
         count = math.ceil(count * min(10.0, seconds / max(elapsed_s, 1e-6)))
 
 
-def _parts(model: Model, quick: bool, progress: Progress) -> list[Row]:
+def _parts(model: engine.Model, quick: bool, progress: Progress) -> list[Row]:
     """Time the render and the event camera alone, and a naive camera on the same frames.
 
     Frames of a flight are shown forth and back, so that the picture never jumps.
@@ -137,25 +124,25 @@ def _parts(model: Model, quick: bool, progress: Progress) -> list[Row]:
     (sensor,) = model.config.sensors.values()
     lens, seconds = cast(Any, sensor).lens, 0.1 if quick else 0.5
     settings = model.config.model_copy(update={"duration_s": 1.5})
-    flown = fly(settings, RATE_HZ)
+    flown = engine.fly(settings, RATE_HZ)
     position, orientation = (values[-instants:] for values in flown.poses())
     rows: list[Row] = []
     for output, name in (("depth", "cast: rays alone"), ("log_radiance", "render: log radiance")):
         progress(name)
-        view = View(model.scene_on_device, lens, count=instants, output=output)
+        view = engine.View(model.scene_on_device, lens, count=instants, output=output)
         taken_s = _seconds(partial(view.render, (position, orientation)), device, seconds)
         rows.append({"part": name, "us per frame": 1e6 * taken_s / instants})
     stack = view.render((position, orientation)).numpy()
     forth_and_back = np.concatenate([stack, stack[::-1]])
     frames: Any = wp.array(forth_and_back, dtype=float, device=device)
-    count, pixel = len(forth_and_back), EventCameraConfig()
+    count, pixel = len(forth_and_back), engine.EventCameraConfig()
     size: dict[str, Any] = {"width": lens.width, "height": lens.height, "device": device}
     stamps = np.arange(1, count + 1, dtype=np.int64) * _STAMPS_NS
 
     each = [frames[index] for index in range(count)]
 
     def whole_stacks() -> Row:
-        camera = EventCamera(pixel, **size)
+        camera = engine.EventCamera(pixel, **size)
         camera.reset(each[0], 0)
         calls = found = 0
 
@@ -181,7 +168,7 @@ def _parts(model: Model, quick: bool, progress: Progress) -> list[Row]:
         return {"part": title, "us per frame": 1e6 * taken_s, "events per frame": found / shown}
 
     def drop_in() -> Row:
-        camera = EventCamera(pixel, **size)
+        camera = engine.EventCamera(pixel, **size)
         return one_by_one(DROP_IN, camera, lambda frame, stamp_ns: len(camera.step(frame, stamp_ns)))
 
     def naive() -> Row:
@@ -212,8 +199,9 @@ def _chapter(rows: list[Row], parts: list[Row], device: str, on_cuda: bool) -> C
     return Chapter(
         name="throughput",
         title="Whole steps a second, and where their time goes",
-        summary=f"On {device_title(device)} at most {best[y]:,.0f} whole steps a second ({best['pixels']}, "
-        f"{best['mode']}); a step is physics, control, render, event scan and packets on the host.",
+        summary=f"On {engine.device_title(device)} at most {best[y]:,.0f} whole steps a second "
+        f"({best['pixels']}, {best['mode']}); a step is physics, control, render, event scan and "
+        "packets on the host.",
         claims=[
             Claim(
                 "640x480, every step rendered: >= 2,700 whole steps a second on a CUDA device",

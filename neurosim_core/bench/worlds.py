@@ -10,18 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from neurosim_core.bench.engine import (
-    Model,
-    Simulation,
-    device_title,
-    find_device,
-    load_config,
-    make_model,
-    make_state,
-    refit,
-    scene_settings,
-    step,
-)
+from neurosim_core.bench import engine
 from neurosim_core.bench.options import Options, Progress, silent
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
@@ -32,18 +21,18 @@ _ROUNDS = 3
 
 def measure(options: Options, progress: Progress = silent) -> Chapter:
     """Turn on the spot in many worlds with one event camera each, and in single simulations beside them."""
-    device = find_device(options.device)
+    device = engine.find_device(options.device)
     columns, rows_px = options.width or options.height, options.height or options.width
     sizes = [(columns, rows_px)] if columns and rows_px else [(64, 64), (128, 128)]
     counts = options.worlds or ((1, 16, 128, 1024, 4096) if wp.get_device(device).is_cuda else (1, 16, 128))
     if options.quick:
         sizes, counts = sizes[:1], options.worlds or (1, 4)
     budget_s = (options.seconds or (0.3 if options.quick else 3.0)) / _ROUNDS
-    base, rows = make_model(load_config(_settings(options, device, (32, 32)))), []
+    base, rows = engine.make_model(engine.load_config(_settings(options, device, (32, 32)))), []
     for size, count in itertools.product(sizes, counts):
         pixels = f"{size[0]}x{size[1]}"
         progress(f"{count} worlds of {pixels} px")
-        model = refit(base, load_config(_settings(options, device, size)))
+        model = engine.refit(base, engine.load_config(_settings(options, device, size)))
         rows.append({"pixels": pixels, "worlds": count, **_case(model, count, budget_s)})
     return _chapter(rows, base, device)
 
@@ -62,16 +51,16 @@ def _settings(options: Options, device: str, size: tuple[int, int]) -> dict[str,
                 "packet_rate_hz": CONTROL_HZ,
             }
         },
-        **scene_settings(options.scene, quick=options.quick),
+        **engine.scene_settings(options.scene, quick=options.quick),
     }
 
 
-def _case(model: Model, count: int, budget_s: float) -> Row:
-    together = Simulation(model.config, worlds=count, models=[model])
+def _case(model: engine.Model, count: int, budget_s: float) -> Row:
+    together = engine.Simulation(model.config, worlds=count, models=[model])
     together.reset()
     turning = np.zeros((count, 4))
     turning[:, 3] = np.linspace(0.5, 1.5, count)  # yaw rates of their own: no two worlds see the same
-    singles = [make_state(model) for _ in range(min(count, 4))]
+    singles = [engine.make_state(model) for _ in range(min(count, 4))]
     flown = 0
 
     def step_together() -> None:
@@ -80,7 +69,7 @@ def _case(model: Model, count: int, budget_s: float) -> Row:
     def step_alone() -> None:
         nonlocal flown
         index = flown % len(singles)
-        step(model, singles[index], turning[index], mode="velocity")
+        engine.step(model, singles[index], turning[index], mode="velocity")
         flown += 1
 
     for _ in range(3):
@@ -106,7 +95,7 @@ def _case(model: Model, count: int, budget_s: float) -> Row:
 
 
 def _pace(
-    advance: Callable[[], None], worlds: Simulation | None, budget_s: float, count: int
+    advance: Callable[[], None], worlds: engine.Simulation | None, budget_s: float, count: int
 ) -> tuple[float, float]:
     """Return steps of worlds a second, and the CPU time of each [s]; a CUDA device is waited for."""
     begin_s, cpu_s, flown = time.perf_counter(), time.process_time(), 0
@@ -120,7 +109,7 @@ def _pace(
     return flown / (time.perf_counter() - begin_s), (time.process_time() - cpu_s) / flown
 
 
-def _chapter(rows: list[Row], base: Model, device: str) -> Chapter:
+def _chapter(rows: list[Row], base: engine.Model, device: str) -> Chapter:
     most = max(rows, key=lambda row: row["renders/s"])
     plotted = [{**row, "what": row["pixels"]} for row in rows]
     plotted += [
@@ -136,10 +125,10 @@ def _chapter(rows: list[Row], base: Model, device: str) -> Chapter:
     return Chapter(
         name="worlds",
         title="Many worlds together",
-        summary=f"On {device_title(device)}, in {base.scene.name} of {len(base.scene.faces):,} triangles, "
-        f"{most['worlds']:,} worlds with an event camera of {most['pixels']} px give "
-        f"{most['renders/s']:,.0f} "
-        f"renders a second in total, {most['ratio']:.2f} times as many as single simulations.",
+        summary=f"On {engine.device_title(device)}, in {base.scene.name} of {len(base.scene.faces):,} "
+        f"triangles, {most['worlds']:,} worlds with an event camera of {most['pixels']} px give "
+        f"{most['renders/s']:,.0f} renders a second in total, {most['ratio']:.2f} times as many as "
+        "single simulations.",
         claims=[
             Claim(
                 "16 worlds and more, stepped together, render at least as often as single simulations",

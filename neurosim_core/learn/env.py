@@ -27,6 +27,7 @@ from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.scene_table import SceneSource
 from neurosim_core.sim.simulation import Simulation
+from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
 
 CAMERA = "front"
 """Name of the event camera."""
@@ -157,6 +158,7 @@ class Env:
         self.view = self._make_view()
         self._seed = seed
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
+        self._thrown = torch.zeros((worlds, len(task.bodies), 6), dtype=torch.float64, device=self.device)
         self._status: torch.Tensor | None = None
         self._last_surface: torch.Tensor | None = None
         self._started = False
@@ -258,6 +260,8 @@ class Env:
         """Begin episodes in the worlds of the mask."""
         episodes, view = self._episodes, self.view
         episodes.begin(self._mask_array)
+        if self.task.bodies:
+            self._throw()
         drawn = self.randomisation
         if self._surface is not None and drawn.threshold_factor != (1.0, 1.0):
             thresholds = self.sim.thresholds(CAMERA)
@@ -283,6 +287,16 @@ class Env:
             self._surface.forget(wp.from_torch(self._mask_int))
         self._look(observation)
         self.task.begin(view, self._mask)
+
+    def _throw(self) -> None:
+        """Throw the bodies of all worlds, as before where no episode begins."""
+        position, orientation = (
+            wp.to_torch(self._episodes.start[name]) for name in ("position", "orientation")
+        )
+        thrown = torch.cat(self.task.throw(position, orientation, self.view.draws), dim=2)
+        self._thrown = torch.where(self._mask[:, None, None], thrown, self._thrown)
+        rows = (self._thrown[..., :3].contiguous(), self._thrown[..., 3:].contiguous())
+        self.sim.throw_bodies(*(wp.from_torch(each, dtype=wp.vec3d) for each in rows))
 
     def _keep(self, surface: torch.Tensor) -> torch.Tensor:
         """Return the surfaces where episodes have ended, in memory that the next such step overwrites."""
@@ -334,6 +348,12 @@ class Env:
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)
+        if self.task.bodies:
+            time_s = 1e-9 * wp.to_torch(observation.clock_ns).double()[:, None, None]
+            fallen = time_s * torch.tensor([0.0, 0.0, -GRAVITY_M_S2], device=self.device)
+            position, velocity = self._thrown.split(3, dim=2)
+            moved = position + time_s * (velocity + 0.5 * fallen)
+            self.view.bodies.copy_(torch.cat([moved, velocity + fallen], dim=2))
 
     def _make_view(self) -> View:
         rows = wp.to_torch(self._rows)
@@ -349,6 +369,7 @@ class Env:
             crashed=torch.zeros(worlds, dtype=torch.bool, device=self.device),
             elapsed_s=torch.zeros(worlds, device=self.device),
             draws=wp.to_torch(self._episodes.draws),
+            bodies=torch.zeros((worlds, len(self.task.bodies), 6), device=self.device),
             step_s=1.0 / self.task.rate_hz,
             vehicle=self.sim.model.airframe,
         )
@@ -383,4 +404,5 @@ def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, A
         "path": {"kind": "hover"},
         "vehicle": vehicle,
         "sensors": {CAMERA: camera} if sees else {},
+        "bodies": dict(task.bodies),
     }

@@ -22,7 +22,7 @@ from neurosim_core.vehicle.aerodynamics import Airframe
 
 wp.set_module_options({"enable_backward": False})
 
-DRAW_COUNT = 8
+DRAW_COUNT = 16
 """Uniform numbers of each episode that a task may use."""
 COLUMNS = {
     "position": (0, 3),

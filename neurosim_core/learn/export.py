@@ -42,7 +42,12 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
     inputs = graph.add("Concat", [features, estimate], axis=1)
     after = graph.gru(policy.memory, inputs, before)
     change = graph.add("Mul", [graph.layer(policy.change, after), graph.constant(np.float32(0.1))])
-    memory = graph.add("Concat", [after, graph.add("Add", [estimate, change])], output="memory_out", axis=1)
+    one = graph.constant(np.ones((1, 1), np.float32))
+    measured, known = (graph.add("Concat", [name, one], axis=1) for name in ("vector", estimate))
+    products = graph.add("Flatten", [graph.add("Gemm", [measured, known], transA=1)], axis=0)
+    moved = graph.add("Gemm", [products, graph.weights(policy.motion.weight)], transB=1)
+    estimate = graph.add("Add", [graph.add("Add", [estimate, moved]), change])
+    memory = graph.add("Concat", [after, estimate], output="memory_out", axis=1)
     action = graph.add("Concat", [memory, "vector"], axis=1)
     for layer in policy.head:
         action = graph.layer(layer, action)
@@ -94,13 +99,15 @@ class _Graph:
         bounds = [self.constant(np.array([n], np.int64)) for n in (begin, end, 1)]
         return self.add("Slice", [x, *bounds])
 
+    def weights(self, values: Any) -> str:
+        return self.constant(values.detach().cpu().numpy())
+
     def linear(self, weight: Any, bias: Any, x: str) -> str:
-        values = [self.constant(each.detach().cpu().numpy()) for each in (weight, bias)]
-        return self.add("Gemm", [x, *values], transB=1)
+        return self.add("Gemm", [x, self.weights(weight), self.weights(bias)], transB=1)
 
     def layer(self, layer: nn.Module, x: str) -> str:
         if isinstance(layer, nn.Conv2d):
-            values = [self.constant(each.detach().cpu().numpy()) for each in layer.parameters()]
+            values = [self.weights(each) for each in layer.parameters()]
             pads, strides = (int(layer.padding[0]),) * 4, layer.stride  # type: ignore[arg-type]
             return self.add("Conv", [x, *values], pads=pads, strides=strides)
         if isinstance(layer, nn.Linear):

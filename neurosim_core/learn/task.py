@@ -64,7 +64,9 @@ class View:
     elapsed_s: torch.Tensor
     """Time since the episode began [s], [N]."""
     draws: torch.Tensor
-    """Uniform numbers in (0, 1) of the episode, for what a task draws itself, [N, 8]."""
+    """Uniform numbers in (0, 1) of the episode, [N, 16]; the last three are used, the others are a task's."""
+    bodies: torch.Tensor
+    """Where the bodies are that were thrown, and their velocities, in W [m, m/s], [N, B, 6]."""
     step_s: float
     """Length of a step [s]."""
     vehicle: MultirotorConfig
@@ -105,9 +107,16 @@ class Task:
     """Body rates of an action of 1 [rad/s]."""
     thrust_span: float = 0.6
     """Change of thrust of an action of 1, as a share of the hover thrust."""
+    bodies: Mapping[str, Any] = {}
+    """Settings of bodies that are thrown in each world as `throw` says; there can be one scene then."""
     probes: Sequence[tuple[float, float, float]] = ()
     """Points whose distance to the scene is seen [m]: ahead, to the left and above, in a level frame."""
-    groups: Mapping[str, Sequence[str]] = {}
+    groups: Mapping[str, Sequence[str]] = {
+        "actor": ("state",),
+        "critic": ("state",),
+        "teacher": ("state",),
+        "student": ("proprioception", "events"),
+    }
     """Names of observations that each group sees: actor, critic, teacher, student."""
     teacher: Mapping[str, Any] = {}
     """Settings of `PpoConfig` for the teacher, where they differ from those that hover needs."""
@@ -126,6 +135,21 @@ class Task:
     def routes(self, scene: SceneConfig) -> Routes | None:
         """Return where episodes in a scene begin and lead to; None: anywhere, as `start` says."""
         return None
+
+    def throw(
+        self, position: torch.Tensor, orientation: torch.Tensor, draws: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return where `bodies` are when an episode begins, and their velocities; then they fall freely.
+
+        Args:
+            position: p_WB where the vehicle begins [m], float64, [N, 3].
+            orientation: q_WB there, xyzw, float64, [N, 4].
+            draws: `View.draws` of the episode.
+
+        Returns:
+            p_WO [m] and the velocity in W [m/s], [N, B, 3].
+        """
+        raise NotImplementedError
 
     def command(self, view: View) -> torch.Tensor:
         """Return collective thrust [N] and body rate [rad/s] of the last actions, [N, 4]."""
@@ -155,3 +179,10 @@ class Task:
     def metrics(self, view: View) -> dict[str, torch.Tensor]:
         """Return what tells how an episode goes, [N] each; read at its end. `success` is 1 or 0."""
         return {}
+
+
+def turn(q: torch.Tensor, vectors: torch.Tensor, *, back: bool = False) -> torch.Tensor:
+    """Return vectors in B turned to W by q_WB (xyzw), or back to B, [N, 3]."""
+    xyz, w = (-q[:, :3] if back else q[:, :3]), q[:, 3:]
+    across = 2.0 * torch.linalg.cross(xyz, vectors)
+    return vectors + w * across + torch.linalg.cross(xyz, across)

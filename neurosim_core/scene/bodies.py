@@ -5,7 +5,8 @@
 A body is rigid and has a frame O. With t the time since the start of the episode [s], and what is not given
 left out:
 
-    p_WO(t) = position + velocity t + amplitude sin(2 pi f t + phase)             sway, along a line
+    p_WO(t) = position + velocity t + acceleration t^2 / 2
+              + amplitude sin(2 pi f t + phase)                                   sway, along a line
               + radius (cos(2 pi n t + phase) e1 + sin(2 pi n t + phase) e2)      orbit, around its centre
     q_WO(t) = q_rest * exp(spin t)                                                spin, about an axis of O
 
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -83,7 +84,9 @@ class MotionConfig(Settings):
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw at t = 0 [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     velocity_m_s: Vector3 = (0.0, 0.0, 0.0)
-    """Constant velocity in W [m/s]."""
+    """Velocity in W at t = 0, but for sway and orbit [m/s]."""
+    acceleration_m_s2: Vector3 = (0.0, 0.0, 0.0)
+    """Constant acceleration in W [m/s^2]; (0, 0, -9.81): the body was thrown."""
     sway: SwayConfig | None = None
     """A sinusoid along a line; null: none."""
     orbit: OrbitConfig | None = None
@@ -161,6 +164,7 @@ class Motion:
     position: wp.vec3d
     orientation: wp.quatd
     velocity: wp.vec3d
+    acceleration: wp.vec3d
     sway: wp.vec3d
     sway_hz: wp.float64
     sway_rad: wp.float64
@@ -172,10 +176,12 @@ class Motion:
     spin: wp.vec3d
 
 
-def upload_motions(bodies: Mapping[str, BodyConfig], device: str) -> wp.array[Motion]:
-    """Return the motions of bodies on a device, shape [B]."""
+def upload_motions(
+    bodies: Mapping[str, BodyConfig], device: str, *, world_count: int = 1
+) -> wp.array[Motion]:
+    """Return the motions of bodies on a device, world by world, shape [world B]."""
     motions = [_motion(body.motion if body.present else _ABSENT) for body in bodies.values()]
-    return wp.array(motions, dtype=Motion, device=device)
+    return wp.array(world_count * motions, dtype=Motion, device=device)
 
 
 def _motion(config: MotionConfig) -> Motion:
@@ -183,6 +189,7 @@ def _motion(config: MotionConfig) -> Motion:
     motion.position = wp.vec3d(*config.position_m)
     motion.orientation = wp.quatd(*Rotation.from_euler("xyz", config.rpy_rad).as_quat())
     motion.velocity = wp.vec3d(*config.velocity_m_s)
+    motion.acceleration = wp.vec3d(*config.acceleration_m_s2)
     motion.spin = wp.vec3d(*config.spin_rad_s)
     if config.sway is not None:
         motion.sway = wp.vec3d(*config.sway.amplitude_m)
@@ -231,6 +238,7 @@ def body_position(motion: Motion, stamp_ns: wp.int64) -> wp.vec3d:
     return (
         motion.position
         + time_s * motion.velocity
+        + wp.float64(0.5) * time_s * time_s * motion.acceleration
         + wp.sin(sway) * motion.sway
         + wp.cos(orbit) * motion.orbit_e1
         + wp.sin(orbit) * motion.orbit_e2
@@ -252,6 +260,7 @@ def body_velocity(motion: Motion, stamp_ns: wp.int64) -> wp.vec3d:
     orbit = orbit_rate * time_s + motion.orbit_rad
     return (
         motion.velocity
+        + time_s * motion.acceleration
         + sway_rate * wp.cos(sway) * motion.sway
         + orbit_rate * (wp.cos(orbit) * motion.orbit_e2 - wp.sin(orbit) * motion.orbit_e1)
     )
@@ -265,14 +274,16 @@ def _pose_bodies(
     stamps_ns: wp.array2d[wp.int64],
     vehicle: int,
     slots: wp.array[int],
+    instants_per_world: int,
     # Out:
     p_WO_out: wp.array2d[wp.vec3d],
     q_WO_out: wp.array2d[wp.quatd],
 ) -> None:
     instant, body = wp.tid()
     stamp_ns = stamps_ns[slots[instant], vehicle]
-    p_WO_out[instant, body] = body_position(motions[body], stamp_ns)
-    q_WO_out[instant, body] = body_orientation(motions[body], stamp_ns)
+    motion = motions[instant / instants_per_world * p_WO_out.shape[1] + body]
+    p_WO_out[instant, body] = body_position(motion, stamp_ns)
+    q_WO_out[instant, body] = body_orientation(motion, stamp_ns)
 
 
 def pose_bodies(
@@ -287,20 +298,52 @@ def pose_bodies(
     """Write where bodies are at the first `count` of the given slots; launches one kernel.
 
     Args:
-        motions: `upload_motions`.
+        motions: `upload_motions`; of several worlds, which share the instants out in their order.
         stamps_ns: Stamps [ns], shape [slot, vehicle]: `Trace.stamps`.
         slots: Slots of the instants, shape [K].
         count: How many of them to use.
         poses: Overwritten.
         vehicle: Whose stamps count.
     """
+    body_count = poses.p_WO.shape[1]
+    worlds = motions.shape[0] // max(body_count, 1)
     wp.launch(
         _pose_bodies,
-        dim=(count, motions.shape[0]),
-        inputs=[motions, stamps_ns, vehicle, slots],
+        dim=(count, body_count),
+        inputs=[motions, stamps_ns, vehicle, slots, max(count // max(worlds, 1), 1)],
         outputs=[poses.p_WO, poses.q_WO],
         device=motions.device,
     )
+
+
+@wp.kernel
+def _throw_bodies(
+    # In:
+    position: wp.array2d[wp.vec3d],
+    velocity: wp.array2d[wp.vec3d],
+    acceleration: wp.vec3d,
+    # In/out:
+    motions: wp.array[Motion],
+) -> None:
+    world, body = wp.tid()
+    motion = motions[world * position.shape[1] + body]
+    motion.position = position[world, body]
+    motion.velocity = velocity[world, body]
+    motion.acceleration = acceleration
+    motions[world * position.shape[1] + body] = motion
+
+
+def throw_bodies(motions: wp.array[Motion], position: Any, velocity: Any, acceleration: Vector3) -> None:
+    """Let the bodies of each world fly from where they are at t = 0; launches one kernel.
+
+    Args:
+        motions: `upload_motions`; overwritten, but for what turns and swings.
+        position: p_WO at t = 0 [m], device array of vec3d, shape [world, B].
+        velocity: Velocity then in W [m/s], likewise.
+        acceleration: Of all of them, in W [m/s^2].
+    """
+    inputs = [position, velocity, wp.vec3d(*acceleration)]
+    wp.launch(_throw_bodies, dim=position.shape, inputs=inputs, outputs=[motions], device=motions.device)
 
 
 def body_poses(

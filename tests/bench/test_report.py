@@ -36,7 +36,7 @@ def chapter(name: str = "flight") -> Chapter:
     errors = panel(
         ROWS, "step [ms]", "error [m]", by="method", title="errors", log="xy", y_lines={"limit": 1e-6}
     )
-    points = Series(label="n", x=["one", "two"], y=[0, 1], style="points", names=["first"])
+    points = Series(label="n", x=["one", "two"], y=[0, 1], style="points")
     marks = Panel(series=[points, Series(label="law", x=["one", "two"], y=[0, 1], style="law")])
     return Chapter(
         name=name,

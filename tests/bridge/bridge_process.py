@@ -14,14 +14,14 @@ from processes import ROOT, SOON_S
 
 
 class BridgeProcess:
-    """The command in a process, with its standard error."""
+    """The command in a process, with its standard error; `path` is where its Python looks for packages."""
 
     backend = ""
 
-    def __init__(self, *arguments: str, python: str = sys.executable) -> None:
+    def __init__(self, *arguments: str, python: str = sys.executable, path: str = str(ROOT)) -> None:
         self.process = subprocess.Popen(
             [python, "-m", "cortex_ros2_bridge", *arguments],
-            env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
             stderr=subprocess.PIPE,
         )
         self.said = ""

@@ -5,14 +5,13 @@ Nodes of the same domain reach each other. Messages are carried as they are seri
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import inspect
 import sys
 import threading
 import types
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -20,10 +19,6 @@ import pytest
 
 class InvalidHandle(Exception):
     """Something destroyed was used."""
-
-
-class ExternalShutdownException(Exception):
-    """The context was shut down."""
 
 
 class HistoryPolicy(enum.IntEnum):
@@ -128,7 +123,8 @@ class Context:
         self.args: list[str] | None = None
         self._ok = False
         self.wake = threading.Condition()
-        self.nodes: list[Node] = []
+        self.handle = types.SimpleNamespace(context=self)
+        self._callbacks: list[Callable[[], None]] = []
 
     def init(
         self, args: list[str] | None = None, *, initialize_logging: bool = True, domain_id: int | None = None
@@ -144,9 +140,12 @@ class Context:
     def shutdown(self) -> None:
         if self.domain is None:
             raise RuntimeError("Context must be initialized before it can be shutdown")
-        with self.wake:
-            self._ok = False
-            self.wake.notify_all()
+        self._ok = False
+        for callback in self._callbacks:
+            callback()
+
+    def on_shutdown(self, callback: Callable[[], None]) -> None:
+        self._callbacks.append(callback)
 
     def try_shutdown(self) -> None:
         if self._ok:
@@ -203,30 +202,51 @@ class Subscription:
         assert raw, "the fake does not deserialise"
         self.node, self.msg_type, self.topic, self.callback = node, msg_type, topic, callback
         self.qos_profile = qos
-        self.waiting: deque[bytes] = deque(maxlen=qos.depth)
-        self.handle = Taker(self)
-
-    destroyed = False
+        self.handle = Handle(node.context, qos.depth)
 
     def push(self, msg: bytes) -> None:
-        with self.node.context.wake:
-            self.waiting.append(msg)
-            self.node.context.wake.notify_all()
+        self.handle.push(msg)
 
 
-class Taker(contextlib.nullcontext[None]):
-    """What a subscription takes its messages from; nothing destroys it within a `with`."""
+class Handle:
+    """What a wait set waits for, with what waits in it."""
 
-    def __init__(self, subscription: Subscription) -> None:
-        super().__init__()
-        self.subscription = subscription
+    def __init__(self, context: Context, depth: int | None = None) -> None:
+        self.is_destroyed = False
+        self.waiting: deque[Any] = deque(maxlen=depth)
+        self._context = context
+
+    def push(self, item: Any) -> None:
+        with self._context.wake:
+            self.waiting.append(item)
+            self._context.wake.notify_all()
+
+    def destroy(self) -> None:
+        with self._context.wake:
+            self.is_destroyed = True
+            self._context.wake.notify_all()
+
+    def is_ready(self) -> bool:
+        return bool(self.waiting)
 
     def take_message(self, msg_type: type, raw: bool) -> tuple[bytes, dict[str, int]] | None:
         """Return the oldest message that waits, and what is known about it."""
         assert raw, "the fake does not deserialise"
-        assert msg_type is self.subscription.msg_type
-        with self.subscription.node.context.wake:
-            return (self.subscription.waiting.popleft(), {}) if self.subscription.waiting else None
+        with self._context.wake:
+            return (self.waiting.popleft(), {}) if self.waiting else None
+
+    def service_take_request(self, request_type: type) -> tuple[Any, Any]:
+        """Return the oldest request that waits, and what its answer goes to."""
+        with self._context.wake:
+            return self.waiting.popleft() if self.waiting else (None, None)
+
+
+class GuardCondition:
+    def __init__(self, context: Context) -> None:
+        self.handle = Handle(context, 1)
+
+    def trigger(self) -> None:
+        self.handle.push(True)
 
 
 class Service:
@@ -235,8 +255,11 @@ class Service:
     ) -> None:
         self.node, self.srv_type, self.srv_name, self.callback = node, srv_type, srv_name, callback
         self.callback_group = callback_group
-        self.waiting: deque[tuple[Any, Callable[[Any], None]]] = deque()
-        self.destroyed = False
+        self.handle = Handle(node.context)
+
+    def send_response(self, response: Any, header: Callable[[Any], None]) -> None:
+        assert isinstance(response, self.srv_type.Response)
+        header(response)
 
 
 def _info(end: Publisher | Subscription) -> Any:
@@ -314,6 +337,15 @@ class Node:
         self.services.append(Service(self, srv_type, srv_name, callback, callback_group))
         return self.services[-1]
 
+    def create_guard_condition(
+        self, callback: Callable[[], Any], callback_group: Any = None
+    ) -> GuardCondition:
+        return GuardCondition(self.context)
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        yield from self.subs
+
     def destroy_publisher(self, publisher: Publisher) -> bool:
         publisher.destroyed = True
         self.pubs.remove(publisher)
@@ -328,10 +360,8 @@ class Node:
     def _destroy(self, among: list[Any], one: Any) -> bool:
         if one not in among:
             return False
-        with self.context.wake:
-            among.remove(one)
-            one.destroyed = True
-            self.context.wake.notify_all()
+        among.remove(one)
+        one.handle.destroy()
         return True
 
     def count_publishers(self, topic_name: str) -> int:
@@ -371,11 +401,9 @@ class Node:
         service = next(one for node in self.world for one in node.services if one.srv_name == srv_name)
         done: list[Any] = []
         answered = threading.Event()
-        with service.node.context.wake:
-            service.waiting.append(
-                (service.srv_type.Request(), lambda response: (done.append(response), answered.set()))
-            )
-            service.node.context.wake.notify_all()
+        service.handle.push(
+            (service.srv_type.Request(), lambda response: (done.append(response), answered.set()))
+        )
         assert answered.wait(60.0)
         return done[0]
 
@@ -397,64 +425,61 @@ def create_node(
     return Node(node_name, context, namespace)
 
 
-class SingleThreadedExecutor:
-    """Waits for tasks, subscriptions and services of its nodes, as that of Humble does.
+class WaitSet:
+    """Waits for guard conditions, subscriptions and services, as that of Humble to Rolling does.
 
-    What is destroyed by another thread while it waits ends `spin_once` with `InvalidHandle`, and the executor
-    is of no more use.
+    What is destroyed by another thread while it waits ends `wait` with `InvalidHandle`.
     """
 
-    def __init__(self, *, context: Context | None = None) -> None:
-        assert context is not None, "the fake has no default context"
-        self._context = context
-        self._nodes: list[Node] = []
-        self._tasks: deque[Callable[[], object]] = deque()
-        self._is_shutdown = False
-        self.broken = False
+    def __init__(
+        self,
+        subscriptions: int,
+        guards: int,
+        timers: int,
+        clients: int,
+        services: int,
+        events: int,
+        context: Any,
+    ) -> None:
+        assert (timers, clients, events) == (0, 0, 0)
+        self._sizes = {"subscription": subscriptions, "guard_condition": guards, "service": services}
+        self._context = context.context
+        self._handles: dict[str, list[Handle]] = {}
+        self._ready: dict[str, list[bool]] = {}
 
-    def add_node(self, node: Node) -> bool:
-        self._nodes.append(node)
-        return True
+    def clear_entities(self) -> None:
+        self._handles = {kind: [] for kind in self._sizes}
 
-    def create_task(self, callback: Callable[[], object]) -> None:
+    def add_subscription(self, handle: Handle) -> None:
+        self._add("subscription", handle)
+
+    def add_guard_condition(self, handle: Handle) -> None:
+        self._add("guard_condition", handle)
+
+    def add_service(self, handle: Handle) -> None:
+        self._add("service", handle)
+
+    def wait(self, timeout_ns: int) -> None:
+        assert timeout_ns < 0
+        handles = [handle for each in self._handles.values() for handle in each]
         with self._context.wake:
-            assert not self._is_shutdown
-            self._tasks.append(callback)
-            self._context.wake.notify_all()
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run one callback; what it raises ends the call."""
-        with self._context.wake:
-            if self.broken:
-                self._context.wake.wait()  # deaf
-            waited_for = [one for node in self._nodes for one in (*node.subs, *node.services)]
-            while (job := self._job()) is None:
-                if not self._context.ok():
-                    raise ExternalShutdownException()
+            while not any(handle.is_ready() for handle in handles):
                 self._context.wake.wait()
-                if any(one.destroyed for one in waited_for):
-                    self.broken = True
+                if any(handle.is_destroyed for handle in handles):
                     raise InvalidHandle("cannot use Destroyable because destruction was requested")
-        job()
+            self._ready = {
+                kind: [handle.is_ready() for handle in each] for kind, each in self._handles.items()
+            }
+            for handle in self._handles["guard_condition"]:
+                handle.waiting.clear()
 
-    def _job(self) -> Callable[[], object] | None:
-        if self._tasks:
-            return self._tasks.popleft()
-        for node in self._nodes:
-            for subscription in node.subs:
-                if subscription.waiting:
-                    message = subscription.waiting.popleft()
-                    return lambda s=subscription, m=message: s.callback(m)
-            for service in node.services:
-                if service.waiting:
-                    request, answer = service.waiting.popleft()
-                    return lambda s=service, r=request, a=answer: a(s.callback(r, s.srv_type.Response()))
-        return None
+    def is_ready(self, kind: str, index: int) -> bool:
+        return self._ready[kind][index]
 
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
-        with self._context.wake:
-            self._is_shutdown = True
-            return True
+    def _add(self, kind: str, handle: Handle) -> None:
+        assert not handle.is_destroyed
+        assert len(self._handles[kind]) < self._sizes[kind], f"no room for another {kind}"
+        self._handles[kind].append(handle)
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -463,9 +488,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": create_node},
         "rclpy.context": {"Context": Context},
-        "rclpy.executors": {
-            "SingleThreadedExecutor": SingleThreadedExecutor,
-            "ExternalShutdownException": ExternalShutdownException,
+        "rclpy.impl": {},
+        "rclpy.impl.implementation_singleton": {
+            "rclpy_implementation": types.SimpleNamespace(WaitSet=WaitSet)
         },
         "rclpy.qos": {
             "QoSProfile": QoSProfile,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -204,9 +205,9 @@ def test_a_topic_that_comes_back_goes_on(tmp_path: Path) -> None:
 
 def test_nobody_else_is_there(tmp_path: Path) -> None:
     bag = BagBackend(tmp_path / "bag")
-    with pytest.raises(BackendError, match="nobody publishes into a bag"):
+    with pytest.raises(BackendError, match="/cmd_vel: nobody else is there in a bag"):
         bag.subscription("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), print)
-    with pytest.raises(BackendError, match="nobody asks a bag"):
+    with pytest.raises(BackendError, match="nobody else is there in a bag"):
         bag.service("/reset", "std_srvs/srv/Trigger", lambda request, response: None)
     assert bag.topics() == []
     bag.close()
@@ -273,6 +274,20 @@ def test_commands_there_and_back(tmp_path: Path) -> None:
                 assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-6), name
     assert read_back[3].yaw_rate_rad_s == -0.25
     assert read_back[4].yaw_rad == pytest.approx(1.25)
+
+
+def test_commands_for_the_first_state_stay_so(tmp_path: Path) -> None:
+    """In ROS a stamp of 0 means now: played again later, they would answer another state."""
+    with contextlib.closing(BagWriter(tmp_path / "flight.mcap")) as bag:
+        for mode, command in COMMANDS.items():
+            bag.write(f"/drone/command/{mode}", dataclasses.replace(command, stamp_ns=0))
+    with Reader(tmp_path / "flight.mcap") as reader:
+        stamps = [
+            STORE.deserialize_cdr(data, each.msgtype).header.stamp for each, _, data in reader.messages()
+        ]
+    assert [(each.sec, each.nanosec) for each in stamps] == [(0, 1)] * len(COMMANDS)
+    with contextlib.closing(BagReader(tmp_path / "flight.mcap")) as found:
+        assert [command.stamp_ns for _, command in found.messages(*found.commands)] == [0] * len(COMMANDS)
 
 
 def test_the_bridge_records_the_commands_of_others(monkeypatch: pytest.MonkeyPatch) -> None:

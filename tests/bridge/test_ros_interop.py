@@ -38,6 +38,8 @@ INSTALL = "no rclpy: source a ROS installation, or name a Python that has it in 
 ROS_PYTHON = os.environ.get("NEUROSIM_ROS_PYTHON") or (
     sys.executable if importlib.util.find_spec("rclpy") is not None else ""
 )
+ROS_PATH = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+"""Where that Python finds Neurosim, and rclpy: the setup file of a ROS installation sets PYTHONPATH."""
 pytestmark = pytest.mark.skipif(not ROS_PYTHON, reason=INSTALL)
 DISTRO = os.environ.get("ROS_DISTRO") or DEFAULT_DISTRO
 THIS_HOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
@@ -52,7 +54,7 @@ class RosNode(Child):
         self._rest = b""
         self.process = subprocess.Popen(
             [ROS_PYTHON, str(Path(__file__).with_name("ros_peer.py"))],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            env={**os.environ, "PYTHONPATH": ROS_PATH},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -94,8 +96,8 @@ def bridge(request: pytest.FixtureRequest, ros_domain: None) -> Iterator[BridgeP
     """A bridge through DDS, in this Python without ROS; or through rclpy."""
     if request.param == "dds" and importlib.util.find_spec("cyclonedds") is None:
         pytest.skip("cyclonedds is not installed")
-    python = sys.executable if request.param == "dds" else ROS_PYTHON
-    with BridgeProcess("--verbose", "--backend", request.param, python=python) as process:
+    python, path = (sys.executable, str(ROOT)) if request.param == "dds" else (ROS_PYTHON, ROS_PATH)
+    with BridgeProcess("--verbose", "--backend", request.param, python=python, path=path) as process:
         process.wait_for("waiting for Cortex topics")
         process.backend = request.param
         yield process

@@ -1,5 +1,5 @@
 """The tasks that come with the simulator; importing this registers them."""
 
-from neurosim_core.learn.tasks import avoid, gates, hover, hover_paper
+from neurosim_core.learn.tasks import avoid, dodge, gates, hover, hover_paper, throw_recover
 
-__all__ = ["avoid", "gates", "hover", "hover_paper"]
+__all__ = ["avoid", "dodge", "gates", "hover", "hover_paper", "throw_recover"]

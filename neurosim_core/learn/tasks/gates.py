@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import TimeSurface
-from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
+from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View, turn
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 
@@ -44,12 +44,6 @@ class Gates(Task):
     camera: Mapping[str, Any] = {"width": 48, "height": 48, "horizontal_fov_rad": 1.6}
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03), "rpy_rad": (0.0, -0.3, 0.0)}
     surface = TimeSurface(tau_s=(0.01, 0.03, 0.1))
-    groups: Mapping[str, Sequence[str]] = {
-        "actor": ("state",),
-        "critic": ("state",),
-        "teacher": ("state",),
-        "student": ("proprioception", "events"),
-    }
     teacher: Mapping[str, Any] = {"worlds": 512, "iterations": 250, "reward_scale": 0.1}
     student: Mapping[str, Any] = {"iterations": 120, "disturbance": 0.1, "hint_weight": 0.2}
     hint = "next_gate"
@@ -78,7 +72,7 @@ class Gates(Task):
             self._way, self._passed, self._before, self._path_m = torch.zeros(
                 (4, len(mask)), device=mask.device
             )
-        goal = view.position + _turned(view.orientation, view.goal_B)
+        goal = view.position + turn(view.orientation, view.goal_B)
         gates = self._tracks[view.scene]
         nearest = (gates[:, :, :3] - goal[:, None]).norm(dim=2).argmin(dim=1)
         torch.where(mask, nearest, self._index, out=self._index)
@@ -107,7 +101,7 @@ class Gates(Task):
     def observe(self, view: View) -> Observations:
         """Return state (30), proprioception (13), next_gate (3) and events (surfaces)."""
         ways = (self._offset, self._normal, *self._gate(view, 1))
-        gate, normal, after, later = (_turned(view.orientation, way, back=True) for way in ways)
+        gate, normal, after, later = (turn(view.orientation, way, back=True) for way in ways)
         speed = view.velocity_B / _SPEED_M_S
         vectors = [speed, view.gravity_B, 0.3 * view.body_rate, view.action, view.last_action]
         thrust = 2.0 * view.draws[:, -1:] - 1.0  # that factor of the episode which a student has to find out
@@ -125,7 +119,7 @@ class Gates(Task):
         towards = self._offset / self._offset.norm(dim=1, keepdim=True).clamp(min=0.1)
         ahead = (view.velocity * towards).sum(1) / _SPEED_M_S
         excess = (view.velocity.norm(dim=1) / _SPEED_M_S - 1.0).clamp(min=0.0)
-        aim = _turned(view.orientation, towards, back=True)
+        aim = turn(view.orientation, towards, back=True)
         aside = self._offset - self._before[:, None] * self._normal
         change = (view.action - view.last_action).norm(dim=1)
         cost = 2.0 * excess + 0.5 * aim[:, 1].square() + 0.05 * view.body_rate.norm(dim=1) + 0.1 * change
@@ -187,10 +181,3 @@ def _hall(seed: int) -> dict[str, Any]:
         ):
             boxes.append({"position_m": (gate + offset).tolist(), "size_m": size, "yaw_rad": float(yaw)})
     return {"kind": "hall", "size_m": _HALL_M, "boxes": boxes, "seed": seed, "inside_m": (0.0, 0.0, 2.0)}
-
-
-def _turned(q: torch.Tensor, vectors: torch.Tensor, *, back: bool = False) -> torch.Tensor:
-    """Return vectors in B turned to W by q_WB (xyzw), or back to B, [N, 3]."""
-    xyz, w = (-q[:, :3] if back else q[:, :3]), q[:, 3:]
-    turn = 2.0 * torch.linalg.cross(xyz, vectors)
-    return vectors + w * turn + torch.linalg.cross(xyz, turn)

@@ -33,12 +33,6 @@ class Hover(Task):
     training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 3.0))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
-    groups: Mapping[str, Sequence[str]] = {
-        "actor": ("state",),
-        "critic": ("state",),
-        "teacher": ("state",),
-        "student": ("proprioception", "events"),
-    }
     camera: Mapping[str, Any] = {"width": 48, "height": 48, "horizontal_fov_rad": 1.6}
     surface = LeakySurface(tau_s=(0.02, 0.06, 0.3))
     mirror: Mapping[str, Sequence[float]] = {

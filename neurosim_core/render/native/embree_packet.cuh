@@ -4,6 +4,8 @@
 constexpr float NEAR_M = 1e-5f; // a surface that the rays begin in is not seen
 alignas(64) float ts[16], us[16], vs[16], normal[3][16];
 alignas(64) int faces[16];
+const float corners = ray[0][0] * ray[0][15] + ray[1][0] * ray[1][15] + ray[2][0] * ray[2][15]; // cosine; 0: cut off
+const bool coherent = corners <= 0.0f || corners > 0.98f; // rays of coarse pictures part soon: then each on its own
 for (int begin = 0; begin < 16; begin += WIDTH) {
     struct alignas(4 * WIDTH) {
         float origin[3][WIDTH], near_t[WIDTH], ray[3][WIDTH], time[WIDTH], far_t[WIDTH];
@@ -15,7 +17,7 @@ for (int begin = 0; begin < 16; begin += WIDTH) {
     struct {
         int flags, features;
         void *context, *filter, *intersect;
-    } arguments = {1 << 16, -1, nullptr, nullptr, nullptr}; // coherent, all features
+    } arguments = {coherent << 16, -1, nullptr, nullptr, nullptr}; // all features
     for (int lane = 0; lane < WIDTH; ++lane) {
         const int from = begin + lane;
         valid[lane] = ray[0][from] != 0.0f || ray[1][from] != 0.0f || ray[2][from] != 0.0f ? -1 : 0;

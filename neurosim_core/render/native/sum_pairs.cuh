@@ -4,6 +4,7 @@ wp::vec3 sum(0.0f, 0.0f, 0.0f);
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
 __syncwarp();
+#pragma unroll 1
 for (int pair = wp::max(first, 32 * step); pair < wp::min(first + count, 32 * step + 32); ++pair)
     for (int channel = 0; channel < 3; ++channel) sum[channel] += block.light[channel][pair % 32];
 __syncwarp();
