@@ -6,8 +6,8 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block in two instants, which see nearly the same (or two blocks side by side, of a single
-   instant); a thread is a pixel. The threads prepare the faces, look at the edges that cross pixels and shade
+2. A warp is a listed block in two instants, which see nearly the same (of a single instant: two blocks side
+   by side); a thread is a pixel. The threads prepare the faces, look at the edges that cross pixels and shade
    the surfaces together. Blocks with many faces are taken one by one. Pixels that need rays are listed.
 3. A thread is a ray of such a pixel.
 """
