@@ -9,6 +9,7 @@ what it would have done without the interruption, to the bit on a CPU.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import resource
@@ -59,6 +60,8 @@ class TrainConfig:
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
+    wandb: bool = False
+    """Send what TensorBoard gets to Weights & Biases, too (package `wandb`)."""
 
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
@@ -174,6 +177,11 @@ class Training:
         config = self.config
         wholes = {"teacher": config.teacher.iterations, "student": config.student.iterations}
         limits = wholes if until is None else dict(zip(wholes, until, strict=True))
+        if config.wandb and ranks.rank() == 0:
+            settings = {"dir": str(self.folder), "config": dataclasses.asdict(config)}
+            importlib.import_module("wandb").init(
+                project="neurosim", name=self.folder.name, sync_tensorboard=True, **settings
+            )
         with SummaryWriter(str(self.folder)) if ranks.rank() == 0 else nullcontext() as writer:
             for stage, trainer in self._trainers.items():
                 while self._done[stage] < min(limits[stage], wholes[stage]):

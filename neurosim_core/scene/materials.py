@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -38,11 +39,11 @@ def srgb_to_linear(srgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return _LINEAR[srgb]
 
 
-def linear_to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return linear light as 8-bit sRGB (IEC 61966-2-1); what is above 1 is white."""
-    light = np.clip(linear, 0.0, 1.0)
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return np.asarray(np.rint(255.0 * code), dtype=np.uint8)
+def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
+    """Encode linear light in [0, 1] as 8-bit sRGB, rounded. Reference: IEC 61966-2-1."""
+    value = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
+    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
+    return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
 def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
