@@ -14,7 +14,6 @@ from neurosim_core.live import topics
 from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.pacing import Timings
 from neurosim_core.live.vehicle import VehicleNode
-from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.command_ranges import command_ranges
 
 STATUS_INTERVAL_S = 0.2
@@ -53,7 +52,7 @@ class StatusPublisher:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
-                thrust_max_n=[_thrust_max_n(airframe) for airframe in airframes],
+                thrust_max_n=[airframe.thrust_max_n for airframe in airframes],
                 command_ranges=[CommandRanges(**dataclasses.asdict(each)) for each in ranges],
             )
         )
@@ -247,7 +246,3 @@ def _vehicle(vehicle: VehicleNode, stamp_ns: int) -> VehicleStatus:
         clamped_reason=vehicle.subscriber.clamping if counts.clamped else "",
         command_source="" if hold.command is None else vehicle.subscriber.senders(hold.command.mode),
     )
-
-
-def _thrust_max_n(airframe: MultirotorConfig) -> float:
-    return float(airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2)

@@ -21,7 +21,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
@@ -29,7 +29,7 @@ from neurosim_core.sim.integrate import checked_command, command_buffer, plan_ba
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples
 from neurosim_core.sim.parameters import WorldSettings, lenses_differ, vary_sensors
-from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows, take_seeds
+from neurosim_core.sim.reset import begin_of_paths, normalise, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, make_state, reset_vehicles

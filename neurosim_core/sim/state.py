@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from neurosim_core.clock import to_ns
 from neurosim_core.control import CommandMode, Controller, make_controller
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.packets import Odometry
 from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy, make_stream
 from neurosim_core.sensors.base import (
@@ -31,7 +31,7 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
 from neurosim_core.sim.render_job import Choice, Instants, RenderJob
-from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
+from neurosim_core.sim.reset import Start, begin_of_paths, restart
 from neurosim_core.sim.scene_table import single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
 from neurosim_core.sim.trace import Fleet, Trace, make_surfaces

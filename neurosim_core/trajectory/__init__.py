@@ -85,8 +85,7 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
-    thrust = airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2
-    weight = airframe.mass_kg * airframe.gravity_m_s2
+    thrust, weight = airframe.thrust_max_n, airframe.hover_thrust_n
     if limits.thrust_to_weight_max * weight > thrust:
         raise PlanningError(
             f"limits.thrust_to_weight_max = {limits.thrust_to_weight_max:g} is more than the vehicle has: "

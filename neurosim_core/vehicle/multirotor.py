@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
 from neurosim_core.vehicle.arrays import allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
@@ -225,10 +225,6 @@ class Multirotor:
         """
         config, arrays = self.config, self.arrays
         q = self._rows((0.0, 0.0, 0.0, 1.0) if orientation is None else orientation, "orientation", 4)
-        with np.errstate(over="ignore"):
-            norm = np.linalg.norm(q, axis=1, keepdims=True)
-        if not ((norm > 1e-6) & (norm < np.inf)).all():
-            raise ValueError(f"orientation must not be 0, nor too large to be normalised, got {q.tolist()}")
         rotors = config.rotor_count
         hover = np.full(rotors, config.hover_rotor_speed_rad_s)
         speed = self._rows(hover if rotor_speed is None else rotor_speed, "rotor_speed", rotors)
@@ -240,7 +236,7 @@ class Multirotor:
         rows = [
             (arrays.position, self._rows(zero if position is None else position, "position", 3)),
             (arrays.velocity, self._rows(zero if velocity is None else velocity, "velocity", 3)),
-            (arrays.orientation, q / norm),
+            (arrays.orientation, normalised(q)),
             (arrays.body_rate, self._rows(zero if body_rate is None else body_rate, "body_rate", 3)),
             (arrays.rotor_speed, speed),
             (arrays.rotor_speed_command, speed),

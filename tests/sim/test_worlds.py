@@ -679,7 +679,7 @@ def test_worlds_that_follow_the_path_fly_as_a_run_does():
         {
             "duration_s": 0.1,
             "device": "cpu",
-            "scene": {"kind": "apartment", "rooms": 1},
+            "scene": {"kind": "hall", "size_m": [8, 6, 3]},
             "sensors": {"odometry": {"kind": "odometry"}},
         }
     )

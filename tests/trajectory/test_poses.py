@@ -44,7 +44,8 @@ def write(folder, kind):
 
 
 def settings(path, **more):
-    return {"duration_s": 1.0, "device": "cpu", "path": {"kind": "poses", **path}, "sensors": SENSORS, **more}
+    common = {"duration_s": 1.0, "device": "cpu", "scene": {"kind": "hall", "size_m": [8, 6, 3]}}
+    return {**common, "path": {"kind": "poses", **path}, "sensors": SENSORS, **more}
 
 
 @pytest.mark.parametrize("kind", ["tum", "euroc", "csv"])

@@ -347,7 +347,7 @@ def test_a_further_sensor_does_not_change_the_wind():
     settings = {
         "device": "cpu",
         "duration_s": 1.0,
-        "scene": {"kind": "apartment", "rooms": 1},
+        "scene": {"kind": "hall", "size_m": [8, 6, 3]},
         "vehicle": {"parameters": {"turbulence": {"wind_20ft_m_s": 15.4}, "wind_m_s": [2.0, 0.0, 0.0]}},
         "control": {"rate_hz": 125},
         "path": {"kind": "hover"},
@@ -436,7 +436,7 @@ def test_redone_intervals_meet_the_same_wind(device):
 def test_a_run_has_the_wind_of_its_seed():
     settings = {
         "device": "cpu",
-        "scene": {"kind": "apartment", "rooms": 1},
+        "scene": {"kind": "hall", "size_m": [8, 6, 3]},
         "vehicle": {"parameters": {"turbulence": {"wind_20ft_m_s": 5.0}}},
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
         "path": {"kind": "hover"},
