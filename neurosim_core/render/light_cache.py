@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +45,7 @@ def cached_arrays(
     made = compute()
     with contextlib.suppress(OSError):  # a folder that cannot be written to, a full disk
         entry.parent.mkdir(parents=True, exist_ok=True)
-        part_file = entry.with_suffix(f".{os.getpid()}")
+        part_file = entry.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
         try:
             with part_file.open("wb") as file:
                 np.savez(file, **cast(Any, made))
@@ -56,7 +57,7 @@ def cached_arrays(
 
 
 def _remove_oldest(folder: Path) -> None:
-    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*.npz")), reverse=True)
+    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*")), reverse=True)
     total = 0
     for _, file in entries:
         total += file.stat().st_size
