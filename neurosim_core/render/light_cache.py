@@ -34,13 +34,17 @@ def cached_arrays(
     """
     digest = hashlib.blake2b(digest_size=16)
     for part in inputs:
-        array = isinstance(part, np.ndarray)
-        digest.update(np.ascontiguousarray(part).data if array else repr(part).encode())
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype} {part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        else:
+            digest.update(repr(part).encode())
     entry = Path(str(wp.config.kernel_cache_dir), "light", f"{digest.hexdigest()}.npz")
     with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):  # not there, or damaged
         with entry.open("rb") as source, np.load(source) as kept:
             found = dict(kept)
-        os.utime(entry)
+        with contextlib.suppress(OSError):  # a cache that cannot be written to is read all the same
+            os.utime(entry)
         return found
     made = compute()
     with contextlib.suppress(OSError):  # a folder that cannot be written to, a full disk
