@@ -6,9 +6,9 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block in two instants, which see nearly the same; a thread is a pixel. The threads
-   prepare the faces, look at the edges that cross pixels, and shade the surfaces that pixels show together.
-   Instants that show many faces are taken one by one. Pixels that have to be rendered by rays are listed.
+2. A warp is a listed block in two instants, which see nearly the same (of a single instant: two blocks side
+   by side); a thread is a pixel. The threads prepare the faces, look at the edges that cross pixels and shade
+   the surfaces together. Blocks with many faces are taken one by one. Pixels that need rays are listed.
 3. A thread is a ray of such a pixel.
 """
 
@@ -59,7 +59,7 @@ class BlockLists:
 
     uneven: wp.array[wp.vec3i]
     """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
-    its blocks; the first instant; a bit for each of the two."""
+    its blocks; the first instant; a bit for each of the two. Of a single instant: one of two side by side."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
@@ -330,12 +330,19 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     SHARPNESS * ray_C[3],
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
-        for pair in range(_INSTANTS // 2):
-            bits = (uneven >> (2 * pair)) & 3
-            if lane == 0 and in_picture and bits != 0:
-                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(
-                    4 * tile + quarter, begin + 2 * pair, bits
-                )
+        uneven = wp.where(in_picture, uneven, 0)
+        if view.instant_count == 1:
+            votes = _warp_votes(uneven != 0)
+            bits = (votes & 1) | ((votes >> 15) & 2)
+            if bits != 0 and (first + wp.tid()) % 32 == 0:
+                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(4 * tile + quarter, 0, bits)
+        else:
+            for pair in range(_INSTANTS // 2):
+                bits = (uneven >> (2 * pair)) & 3
+                if lane == 0 and bits != 0:
+                    lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(
+                        4 * tile + quarter, begin + 2 * pair, bits
+                    )
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
@@ -358,8 +365,11 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             listed = lists.uneven[entry]
             bits = wp.where(waiting != 0, waiting & -waiting, listed[2])
             alone = bits != 3
-            instant = listed[1] + wp.where(alone, bits // 2, lane // 16)
-            at = locate_pixel(listed[0] // 4, instant, listed[0] % 4, lane % 16, view, worlds)
+            second = wp.where(alone, bits // 2, lane // 16)
+            several = view.instant_count > 1
+            instant = listed[1] + wp.where(several, second, 0)
+            quarter = listed[0] % 4 + wp.where(several, 0, second)
+            at = locate_pixel(listed[0] // 4, instant, quarter, lane % 16, view, worlds)
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
             unwanted = at.outside or (alone and lane >= 16)
@@ -424,7 +434,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 write_radiance(scene, total / whole, 1, at.instant, at.slot, at.row, at.col, out)
             unresolved = _warp_votes(not unwanted and covered[3] < 0) >> (lane // 16 * 16) & 0xFFFF
             if unresolved != 0 and lane % 16 == 0:
-                block = 4 * (listed[0] // 4 * view.instant_count + instant) + listed[0] % 4
+                block = 4 * (listed[0] // 4 * view.instant_count + instant) + quarter
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
             waiting = waiting & ~bits
             if waiting == 0:
