@@ -306,7 +306,11 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    policy.load_state_dict(state["weights"])
+    weights = {
+        "motion.weight": policy.motion.weight,
+        **state["weights"],
+    }  # runs of old have no such layer: zeros
+    policy.load_state_dict(weights)
     return policy
 
 
