@@ -10,8 +10,8 @@ SUBJECTS = [
     "broadcast",
     "coder",
     "construct",
-    "gate",
-    "inlet",
+    "fast_send",
+    "fast_receive",
     "items",
     "native",
     "pack",
@@ -28,7 +28,10 @@ setup(
             [f"cortex/_{name}.c" for name in SUBJECTS],
             depends=[
                 *(f"cortex/_{name}.h" for name in HEADERS),
-                *(f"cortex/cpp/include/cortex/{name}.h" for name in ("broadcast", "broadcast_os")),
+                *(
+                    f"cortex/cpp/include/cortex/{name}.h"
+                    for name in ("broadcast", "broadcast_os", "broadcast_slots")
+                ),
             ],
             libraries=["dl"] if sys.platform == "linux" else [],
             include_dirs=[numpy.get_include()],

@@ -31,7 +31,7 @@ from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
-from neurosim_core.trajectory import HoverConfig, hover
+from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS

@@ -312,10 +312,11 @@ static PyObject *cast_commit(Broadcast *cast, PyObject *const *arguments, Py_ssi
 }
 
 static PyObject *cast_provide(Broadcast *cast, PyObject *arguments) {
-    unsigned long long slots, slot_bytes;
-    if (!PyArg_ParseTuple(arguments, "KK:provide", &slots, &slot_bytes) || !cast_is_open(cast)) return NULL;
-    if (cortex_writer_grow(&cast->writer, cast->writer.capacity, slots, slot_bytes) < 0) return PyErr_SetFromErrno(PyExc_OSError);
-    Py_CLEAR(cast->memory);
+    unsigned long long size;
+    int exact, deep;
+    if (!PyArg_ParseTuple(arguments, "Kpp:provide", &size, &exact, &deep) || !cast_is_open(cast)) return NULL;
+    if (cortex_writer_provide(&cast->writer, size, exact, deep) < 0) return PyErr_SetFromErrno(PyExc_OSError);
+    if (cast->memory != NULL && ((SlotMemory *)cast->memory)->map != cast->writer.map) Py_CLEAR(cast->memory);
     Py_RETURN_NONE;
 }
 
@@ -375,7 +376,7 @@ static PyMethodDef cast_methods[] = {
     {"dissolve", (PyCFunction)cast_dissolve, METH_NOARGS, "Send all readers another way, and close it; what is in it stays theirs."},
     {"in_the_way", (PyCFunction)cast_in_the_way, METH_O, "The reliable readers that have no room for so many bytes."},
     {"give_up", (PyCFunction)cast_give_up, METH_O, "Wait for a reader no more, until it has read half."},
-    {"provide", (PyCFunction)cast_provide, METH_VARARGS, "Go on in a ring with so many slots of so many bytes, a multiple of 4096."},
+    {"provide", (PyCFunction)cast_provide, METH_VARARGS, "Have slots for bodies of a size: whether all have it, whether a reader keeps many; OSError: no memory."},
     {"acquire", (PyCFunction)cast_acquire, METH_O, "A slot for so many bytes; None: none is free, or they are too small."},
     {"commit", (PyCFunction)(void (*)(void))cast_commit, METH_FASTCALL, "Send the frame of a slot that has been written, as `send`."},
     {"behind", (PyCFunction)cast_behind, METH_NOARGS, "The reliable readers that have not come to all slots."},

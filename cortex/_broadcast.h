@@ -1,4 +1,4 @@
-/* The ring of a publisher, for `_gate.c` and `_coder.c`; see `_broadcast.c`. */
+/* The ring of a publisher, for `_fast_send.c` and `_coder.c`; see `_broadcast.c`. */
 
 #ifndef CORTEX_NATIVE_BROADCAST_H
 #define CORTEX_NATIVE_BROADCAST_H

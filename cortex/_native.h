@@ -19,8 +19,8 @@ enum {
 int add_broadcast(PyObject *module);
 int add_coder(PyObject *module);
 int add_construct(PyObject *module);
-int add_gate(PyObject *module);
-int add_inlet(PyObject *module);
+int add_fast_send(PyObject *module);
+int add_fast_receive(PyObject *module);
 int add_ring_reader(PyObject *module);
 int add_socket(PyObject *module);
 

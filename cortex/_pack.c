@@ -160,7 +160,7 @@ static Py_ssize_t find_dtype(const Array *known, PyObject *value, npy_intp *dime
     return -1;
 }
 
-/* Whether an array lies just where it belongs: others are copied, without the GIL, and checked on the long way. */
+/* Whether an array lies just where it belongs: others are copied, without the GIL, and checked on the slow path. */
 static int is_placed(const Pack *pack, PyArrayObject *array, Py_ssize_t start) {
     return PyArray_NBYTES(array) == 0 || PyArray_BYTES(array) == pack->place + start;
 }

@@ -7,8 +7,6 @@
 
 #include <poll.h>
 
-static const uint64_t PRIVATE_BYTES = 64 << 20; /* most that a reader copies of what it may lease no more */
-
 static PyObject *dont_wait, *no_flags; /* of ZeroMQ, as ints */
 
 static PyTypeObject RingReaderType;
@@ -26,20 +24,11 @@ typedef struct {
 /* What keeps the body of one message: the lease of its slot, or a copy. */
 typedef struct {
     PyObject_HEAD
-    CortexLease lease; /* of a copy only the seat, where its bytes are counted */
-    char *data;
-    Py_ssize_t size;
-    int is_leased;
+    CortexBody body;
 } Body;
 
 static void body_dealloc(Body *body) {
-    if (body->is_leased) {
-        cortex_lease_end(&body->lease);
-    } else if (body->data != NULL) {
-        __atomic_fetch_sub(&body->lease.seat->private_bytes, (uint64_t)body->size, __ATOMIC_RELAXED);
-        cortex_seat_end(body->lease.seat);
-        PyMem_Free(body->data);
-    }
+    cortex_body_end(&body->body);
     Py_TYPE(body)->tp_free((PyObject *)body);
 }
 
@@ -52,42 +41,16 @@ static PyTypeObject BodyType = {
     .tp_dealloc = (destructor)body_dealloc,
 };
 
-/* Copy a message that may not be leased: CORTEX_COPY; CORTEX_FULL if too much is kept already; -1 with an error set. */
-static int copy_slot(RingReader *reader, Body *body, uint64_t sequence) {
-    CortexSeat *seat = reader->ring.seat;
-    const uint64_t size = (uint64_t)body->size;
-    if (seat->private_bytes + size > (size < PRIVATE_BYTES / 4 ? PRIVATE_BYTES : 4 * size)) return CORTEX_FULL;
-    body->data = PyMem_Malloc((size_t)size);
-    if (body->data == NULL) return PyErr_NoMemory(), -1;
-    body->lease.seat = seat;
-    __atomic_fetch_add(&seat->users, 1, __ATOMIC_RELAXED);
-    __atomic_fetch_add(&seat->private_bytes, size, __ATOMIC_RELAXED);
-    memcpy(body->data, cortex_slot_memory(reader->ring.map, (int)body->lease.slot), (size_t)size);
-    return cortex_reader_has(&reader->ring, body->lease.slot, sequence) ? CORTEX_COPY : CORTEX_OVERWRITTEN;
-}
-
-/* Take the body that a frame names into `reader->body`; 0 if the message is lost, 1 if it is there or the frame is wrong, -1
-   if it has to wait or with an error set. */
-static int take_slot(RingReader *reader, const char *frame) {
-    uint64_t rest[5];
-    memcpy(rest, frame + HEAD_SIZE, sizeof rest);
-    const uint64_t sequence = rest[0], size = rest[3], slot = rest[4];
+/* Keep a body in `reader->body`; 0 with an error set. */
+static int keep_body(RingReader *reader, CortexBody *found) {
     Body *body = (Body *)BodyType.tp_alloc(&BodyType, 0);
-    if (body == NULL) return -1;
-    int found = cortex_reader_lease(&reader->ring, slot, sequence, size, &body->lease);
-    body->size = (Py_ssize_t)size;
-    body->is_leased = found == CORTEX_LEASED;
-    if (body->is_leased) body->data = (char *)cortex_slot_memory(body->lease.map, (int)slot);
-    if (found == CORTEX_COPY) {
-        found = copy_slot(reader, body, sequence);
-        reader->is_crowded = found == CORTEX_FULL;
+    if (body == NULL) {
+        cortex_body_end(found);
+        return 0;
     }
-    if (found == CORTEX_LEASED || found == CORTEX_COPY) {
-        reader->body = (PyObject *)body;
-        return 1;
-    }
-    Py_DECREF(body);
-    return found < 0 || reader->is_crowded ? -1 : found == CORTEX_NO_SLOT;
+    body->body = *found;
+    reader->body = (PyObject *)body;
+    return 1;
 }
 
 /* The next frame as bytes; NULL if there is none, perhaps with an error. Then the bell rings when one comes. */
@@ -100,19 +63,16 @@ static PyObject *next_frame(RingReader *reader) {
     while ((size = cortex_reader_peek(&reader->ring, &data)) > 0) {
         PyObject *frame = PyBytes_FromStringAndSize((const char *)data, (Py_ssize_t)size);
         if (frame == NULL) return NULL;
-        int found = cortex_reader_is_whole(&reader->ring);
-        if (found && size == HEADER_SIZE && PyBytes_AS_STRING(frame)[3] == 'S') {
-            found = take_slot(reader, PyBytes_AS_STRING(frame));
-            if (found >= 0) cortex_reader_move(&reader->ring, reader->ring.tail + cortex_entry_bytes((uint64_t)size));
-        } else if (found) {
-            found = cortex_reader_take(&reader->ring, size);
-        }
-        if (found > 0) {
+        CortexBody body;
+        const int found = cortex_reader_finish(&reader->ring, (const uint8_t *)PyBytes_AS_STRING(frame), size, &body);
+        const int kept = body.data == NULL || keep_body(reader, &body);
+        reader->is_crowded = found < 0;
+        if (found > 0 && kept) {
             cortex_reader_disarm(&reader->ring);
             return frame;
         }
         Py_DECREF(frame);
-        if (found < 0) return NULL;
+        if (found < 0 || !kept) return NULL;
     }
     if (size == 0 || reader->told) return NULL;
     reader->told = 1;
@@ -123,8 +83,8 @@ PyObject *reader_body(PyObject *object, const char **data, Py_ssize_t *size) {
     if (object == NULL || !Py_IS_TYPE(object, &RingReaderType)) return NULL;
     RingReader *reader = (RingReader *)object;
     if (reader->body == NULL) return NULL;
-    *data = ((Body *)reader->body)->data;
-    *size = ((Body *)reader->body)->size;
+    *data = (const char *)((Body *)reader->body)->body.data;
+    *size = (Py_ssize_t)((Body *)reader->body)->body.size;
     return reader->body;
 }
 
@@ -135,8 +95,8 @@ static PyObject *reader_take_body(RingReader *reader, PyObject *unused) {
     PyObject *body = reader->body;
     reader->body = NULL;
     if (body == NULL) Py_RETURN_NONE;
-    npy_intp shape = (npy_intp)((Body *)body)->size;
-    PyObject *array = PyArray_New(&PyArray_Type, 1, &shape, NPY_UINT8, NULL, ((Body *)body)->data, 0, 0, NULL);
+    npy_intp shape = (npy_intp)((Body *)body)->body.size;
+    PyObject *array = PyArray_New(&PyArray_Type, 1, &shape, NPY_UINT8, NULL, ((Body *)body)->body.data, 0, 0, NULL);
     if (array == NULL) {
         Py_DECREF(body);
         return NULL;
@@ -229,7 +189,7 @@ static PyObject *reader_welcomed(RingReader *reader, PyObject *unused) {
 
 static PyObject *reader_pass_over(RingReader *reader, PyObject *unused) {
     (void)unused;
-    if (reader->is_crowded) cortex_reader_move(&reader->ring, reader->ring.tail + cortex_entry_bytes(HEADER_SIZE));
+    if (reader->is_crowded) cortex_reader_pass_over(&reader->ring);
     reader->is_crowded = 0;
     Py_RETURN_NONE;
 }

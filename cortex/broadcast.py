@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import zmq
 
+from cortex.back_pressure import BackPressure
 from cortex.compiled import native
-from cortex.patience import Patience
 from cortex.pub_socket import PubSocket
 from cortex.wire import AttachKey
 
@@ -29,18 +29,8 @@ logger = logging.getLogger(__name__)
 WAITING_MAX = 256
 """Readers that have asked and not attached; older ones are forgotten."""
 
-PAGE = 4096
-SLOTS_BYTES = 4 << 20
-"""Small slots take this much in all, so that they stay in cache."""
-GROWTH_BYTES = 4 << 20
-"""What slots that replace ones for smaller messages have to spare, at most: to make them takes a millisecond
-or more, and who publishes waits for it."""
-DEEP_BYTES = 16 << 20
-DEEP_SLOTS = 128
-"""What slots take, and how many there are, where a reader keeps more messages than by default."""
 DEEP_QUOTA = 67
 """A reader that may hold so many messages keeps more than by default, see `keep_last`."""
-SLOTS_BYTES_MAX = 2 << 30
 MOVE_S = 0.1
 """How long readers have at least to come to their sockets, where there is no memory for slots."""
 RETRY_S = 5.0
@@ -143,8 +133,8 @@ class Broadcast:
 
     Args:
         source: The publisher's number.
-        patience: Waits for readers; the lock is let go meanwhile.
-        await_room: As `patience.wait_for`; says so when a reader was too late.
+        back_pressure: Waits for readers; the lock is let go meanwhile.
+        await_room: As `back_pressure.wait_for`; says so when a reader was too late.
         reroute: Called when frames go another way to readers of the ring.
         note: Says that something goes wrong.
         expected_bytes: Make slots for messages of this size before the first reader is answered; 0: do not.
@@ -153,14 +143,14 @@ class Broadcast:
     def __init__(
         self,
         source: int,
-        patience: Patience,
+        back_pressure: BackPressure,
         await_room: Callable[[Callable[[], bool], float], bool],
         reroute: Callable[[], None],
         note: Callable[[str], None],
         expected_bytes: int = 0,
     ) -> None:
         self._source = source
-        self._patience = patience
+        self._back_pressure = back_pressure
         self._await_room = await_room
         self._reroute = reroute
         self._note = note
@@ -209,7 +199,7 @@ class Broadcast:
 
     @property
     def short_cut(self) -> Any:
-        """The ring in C, if it has readers and slots enough for them; see `gate.py`."""
+        """The ring in C, if it has readers and slots enough for them; see `fast_send.py`."""
         if not self._readers or self._ring.slots < 2 * len(self._readers) + 2:
             return None
         return self._ring
@@ -261,30 +251,16 @@ class Broadcast:
     def _provide(self, size: int, *, exact: bool) -> bool:
         """Make slots for bodies of a size, if need be; whether there are any."""
         ring, deep = self._ring, any(r.request.quota >= DEEP_QUOTA for r in self._readers.values())
-
-        def wanted(slot_bytes: int) -> int:
-            least = 2 * len(self._readers) + 2
-            return max(least, min(DEEP_SLOTS, DEEP_BYTES // slot_bytes)) if deep else least
-
-        fits = ring.slot_bytes >= size
-        if fits and ring.slots >= wanted(ring.slot_bytes):
+        if ring.slot_bytes >= size and time.monotonic() < self._unavailable_until_s:
             return True
-        slot_bytes = size if exact else size + size // 4
-        if ring.slots and not exact and not fits:  # messages grow: the next slots are to last
-            slot_bytes = max(slot_bytes, size + min(size, GROWTH_BYTES))
-        slot_bytes = -(-max(slot_bytes, ring.slot_bytes) // PAGE) * PAGE
-        slots = max(min(max(SLOTS_BYTES // slot_bytes, 4), 64), wanted(slot_bytes))
-        slots = max(4, min(slots, SLOTS_BYTES_MAX // slot_bytes))
-        if (fits and ring.slots >= slots) or time.monotonic() < self._unavailable_until_s:
-            return bool(fits)
         try:
-            ring.provide(slots, slot_bytes)
+            if time.monotonic() >= self._unavailable_until_s:
+                ring.provide(size, exact, deep)
         except OSError as error:
             self._unavailable_until_s = time.monotonic() + RETRY_S
-            if not fits:
-                self._note(f"no shared memory for slots of {slot_bytes} bytes: {error}")
-            return bool(fits)
-        return True
+            if ring.slot_bytes < size:
+                self._note(f"no shared memory for slots of {size} bytes: {error}")
+        return bool(ring.slot_bytes >= size)
 
     def _dissolve(self) -> None:
         """Send all readers to their sockets, for good, and wait a little until they are there."""
@@ -294,7 +270,7 @@ class Broadcast:
         self._forget()
         self._reroute()
         timeout_s = max(MOVE_S, *(reader.timeout_s for reader in self._moving))
-        self._patience.wait_for(lambda: not self._moving, timeout_s)
+        self._back_pressure.wait_for(lambda: not self._moving, timeout_s)
 
     @property
     def has_lost(self) -> bool:
@@ -328,7 +304,7 @@ class Broadcast:
             timeout_s = min(reader.timeout_s for reader in slow)
             if self._await_room(attempt, timeout_s - (time.monotonic() - begin_s)):
                 return
-            waited_s, is_over = time.monotonic() - begin_s, self._patience.is_over()
+            waited_s, is_over = time.monotonic() - begin_s, self._back_pressure.is_over()
             for member in in_the_way():
                 if is_over or self._readers[member].timeout_s <= waited_s:
                     self._ring.give_up(member)

@@ -8,10 +8,10 @@ from typing import Any
 
 import zmq
 
+from cortex.back_pressure import BackPressure
 from cortex.broadcast import Broadcast, Reader
-from cortex.gate import Gate
+from cortex.fast_send import FastSend
 from cortex.large import LargeSender
-from cortex.patience import Patience
 from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket, PubSockets
 from cortex.wire import (
     LARGE,
@@ -41,9 +41,9 @@ class Fanout:
         source: The publisher's number.
         fingerprint: Of its type.
         stamped: Whether that has a stamp.
-        gate: Sends where this says, if nothing special is to be done.
+        fast_send: Sends where this says, if nothing special is to be done.
         sockets: Tell who has come and gone.
-        patience: Waits for reliable readers.
+        back_pressure: Waits for reliable readers.
         latching: Whether who comes gets the last message.
         max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
         expected_bytes: See `Broadcast`.
@@ -56,9 +56,9 @@ class Fanout:
         fingerprint: int,
         *,
         stamped: bool,
-        gate: Gate,
+        fast_send: FastSend,
         pub_sockets: PubSockets,
-        patience: Patience,
+        back_pressure: BackPressure,
         latching: bool,
         max_wait_s: float,
         expected_bytes: int,
@@ -67,16 +67,16 @@ class Fanout:
         self._message_head, self._next_head, self._slot_head, self._large_head = (
             message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, NEXT, SLOT, LARGE)
         )
-        self._gate = gate
+        self._fast_send = fast_send
         self._large = LargeSender()
         self._pub_sockets = pub_sockets
-        self._patience = patience
+        self._back_pressure = back_pressure
         self.latching = latching
         self._max_wait_ms = round(max_wait_s * 1000.0)
         self.readers: dict[bytes, Reader] = {}
         self.ring = Broadcast(
             source,
-            patience,
+            back_pressure,
             self._await_room,
             self.route,
             lambda text: pub_sockets.note(f"{topic}: {text}"),
@@ -96,7 +96,7 @@ class Fanout:
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_sockets: tuple[PubSocket, ...] = ()
         self._retries: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
-        """What to call where one of the gate's `sends` refuses."""
+        """What to call where one of the `sends` of the fast path refuses."""
         self._crowded = False
         self._told = 0
         self._tell_after_ns = SILENCE_NS
@@ -117,7 +117,7 @@ class Fanout:
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
-        sequence = self._gate.sequence
+        sequence = self._fast_send.sequence
         reader = self.readers[key] = Reader(key, request, pub_socket)
         if request.shared_memory and pub_socket.local:
             self.ring.admit(reader, sequence)
@@ -160,8 +160,8 @@ class Fanout:
         usual = not (self.latching or self.late or self.ring.has_lost)
         retries = {pub_socket.send: self._retry_strict(pub_socket) for pub_socket in self._strict_sockets}
         self._retries = retries | self.ring.sends
-        self._gate.sends = (*self._lossy_sends, *self._retries) if usual else ()
-        self._gate.ring = self.ring.short_cut if usual and not pub_sockets else None
+        self._fast_send.sends = (*self._lossy_sends, *self._retries) if usual else ()
+        self._fast_send.ring = self.ring.short_cut if usual and not pub_sockets else None
 
     @property
     def has_sockets(self) -> bool:
@@ -171,9 +171,9 @@ class Fanout:
     def tick(self, now_ns: int) -> None:
         """Let go of what was sent, and tell readers how many messages there were; called now and then."""
         self._large.prune()
-        if self._patience.is_waiting:
+        if self._back_pressure.is_waiting:
             return
-        sequence, silent_ns = self._gate.sequence, now_ns - self._gate.refresh_ns
+        sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
         if self.readers and silent_ns > self._tell_after_ns:
@@ -222,7 +222,7 @@ class Fanout:
         else:
             rest = REST.pack(sequence, stamp_ns, publish_ns, size, slot.number)
             on_time &= self.ring.commit(slot, self._slot_head + rest)
-        if self._gate.ring is None:  # there may be slots now
+        if self._fast_send.ring is None:  # there may be slots now
             self.route()
         self.timeouts += not on_time
         return on_time
@@ -252,7 +252,7 @@ class Fanout:
         return max((reader.timeout_s for reader in readers), default=0.0)
 
     def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
-        """Send what one of the gate's `sends` refused, waiting; False if a reliable reader lost it."""
+        """Send what one of the fast path's `sends` refused, waiting; False if a reliable reader lost it."""
         retry = self._retries.get(send)  # None: it has left since
         on_time = retry is None or retry(frame)
         if not on_time:
@@ -270,14 +270,14 @@ class Fanout:
 
         if send() or self._await_room(send, self._timeout_s(pub_socket)):
             return True
-        self.late[pub_socket] = self._gate.sequence
+        self.late[pub_socket] = self._fast_send.sequence
         self.route()
         pub_socket.send_anyway(frame, flags)
         return False
 
     def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
         """Try to send until it works, or for so long [s]."""
-        if self._patience.wait_for(send, timeout_s):
+        if self._back_pressure.wait_for(send, timeout_s):
             return True
         if not self.timeouts:
             self._pub_sockets.note(f"{self._topic}: a reliable subscriber was too late and lost a message")
@@ -291,7 +291,7 @@ class Fanout:
 
     def tell(self) -> None:
         """Tell all that have room which sequence comes next, so that they learn of a loss before it."""
-        frame = self._news(self._gate.sequence)
+        frame = self._news(self._fast_send.sequence)
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
         for pub_socket in self._strict_sockets:
@@ -301,7 +301,7 @@ class Fanout:
     def stop(self) -> None:
         """Take in no reader any more, and end the ring; `finish` follows."""
         self.closed = True
-        self.ring.end(self._news(self._gate.sequence))
+        self.ring.end(self._news(self._fast_send.sequence))
         self._untold = list(self._strict_sockets)
 
     def finish(self, waited_s: float, linger_s: float) -> bool:
@@ -314,7 +314,7 @@ class Fanout:
         Returns:
             Whether each has all of it, or has had its time.
         """
-        last = self._news(self._gate.sequence)
+        last = self._news(self._fast_send.sequence)
         # Libzmq drops it while a reader is late: it is sent now and then, until that one says that it reads.
         if waited_s >= self._tell_again_s:
             self._tell_again_s = waited_s + TELL_AGAIN_S
@@ -330,11 +330,11 @@ class Fanout:
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
         confirms = reader.request.confirms and reader.member is None
-        return confirms and reader.confirmed < self._gate.sequence
+        return confirms and reader.confirmed < self._fast_send.sequence
 
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""
-        sequence = self._gate.sequence
+        sequence = self._fast_send.sequence
         for pub_socket in self._untold:
             pub_socket.send_anyway(self._news(sequence))
         count = sum(reader.pub_socket.strict and self._owes(reader) for reader in self.readers.values())

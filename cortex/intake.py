@@ -9,12 +9,12 @@ from typing import Any
 import zmq
 
 from cortex.codec import MalformedMessage
-from cortex.inlet import make_inlet
+from cortex.fast_receive import make_fast_receive
 from cortex.link import Item, Link, make
 from cortex.policy import Policy
 from cortex.pub_socket import DONTWAIT
+from cortex.receive_lock import ReceiveLock
 from cortex.stats import SubscriberCounters, note_latency
-from cortex.turn import Turn
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST
 
 monotonic_ns = time.monotonic_ns
@@ -27,14 +27,14 @@ DRAIN_LOSSY_MAX = 4096
 
 
 class Intake:
-    """Reads the sockets of one subscriber. Every method runs under the lock of its turn."""
+    """Reads the sockets of one subscriber. Every method runs under its lock."""
 
-    def __init__(self, policy: Policy, counters: SubscriberCounters, turn: Turn) -> None:
+    def __init__(self, policy: Policy, counters: SubscriberCounters, receive_lock: ReceiveLock) -> None:
         self.links: list[Link] = []
         """To all publishers; always this list."""
         self.queue: deque[Item] = deque()
         """What has been read and not been asked for; always this one."""
-        self.inlet = make_inlet(turn, self.queue, counters, self._accept_timed)
+        self.fast_receive = make_fast_receive(receive_lock, self.queue, counters, self._accept_timed)
         """The short way past all this."""
         self.drained_ns = 0
         """When the sockets were last read as a whole."""
@@ -42,7 +42,7 @@ class Intake:
         """Links of publishers that have left, and when they are closed, on the monotonic clock."""
         self._policy = policy
         self._counters = counters
-        self._turn = turn
+        self._receive_lock = receive_lock
         self._first = 0
 
     def receive_one(self, *, block: bool = False) -> None:
@@ -52,14 +52,14 @@ class Intake:
         Waiting in the socket itself costs half of what waiting for its descriptor does.
         """
         links = self.links
-        flags = 0 if block and len(links) == 1 and not self._turn.waiting else DONTWAIT
-        self.inlet.exhausted = True
+        flags = 0 if block and len(links) == 1 and not self._receive_lock.waiting else DONTWAIT
+        self.fast_receive.exhausted = True
         for link in links if len(links) == 1 else self._rotated():
             try:
                 frame = link.receive(flags)
             except zmq.Again:
                 continue
-            self.inlet.exhausted = False
+            self.fast_receive.exhausted = False
             self.accept(link, frame, timed=True)
             if self.queue:
                 return
@@ -97,7 +97,7 @@ class Intake:
                     break
             else:
                 unread.append(link)
-        self.inlet.exhausted = not unread
+        self.fast_receive.exhausted = not unread
         self.drained_ns = monotonic_ns()
         return unread
 
@@ -125,7 +125,7 @@ class Intake:
                 self.receive_one(block=True)
             self.drain()
             return
-        may_wait = may_wait and len(links) == 1 and not self._turn.waiting
+        may_wait = may_wait and len(links) == 1 and not self._receive_lock.waiting
         exhausted = True
         self.drained_ns = monotonic_ns()
         for link in links:
@@ -153,7 +153,7 @@ class Intake:
                 exhausted = False
             if self.queue:
                 break
-        self.inlet.exhausted = exhausted
+        self.fast_receive.exhausted = exhausted
 
     def _take_decoded(self, link: Link, frame: bytes, messages: deque[Any]) -> None:
         """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
@@ -195,7 +195,7 @@ class Intake:
         for link in left:
             self.leaving[link] = until_ns
             link.leave()
-            self.inlet.exhausted = False
+            self.fast_receive.exhausted = False
         return bool(left)
 
     def revive(self, source: int) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any, TypeVar
 
 from cortex.context import Closed
-from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS
+from cortex.fast_receive import NOTHING, PAUSE_COUNT, PAUSE_NS
 from cortex.intake import Intake
 from cortex.wakeup import Wakeup
 
@@ -134,7 +134,7 @@ class AsyncReceiver(AsyncIterator[T]):
         watched: Callable[[], tuple[int, list[int]]],
         generation: Callable[[], int],
     ) -> None:
-        self._inlet, self._queue = intake.inlet, intake.queue
+        self._fast_receive, self._queue = intake.fast_receive, intake.queue
         self._wakeup = wakeup
         self._take = take
         self._watched = watched
@@ -142,11 +142,11 @@ class AsyncReceiver(AsyncIterator[T]):
         self._reader: LoopReader | None = None
 
     async def __anext__(self) -> T:
-        message: T = self._inlet.soon()
+        message: T = self._fast_receive.soon()
         if message is not NOTHING:
             return message
         try:
-            found_nothing = self._inlet.is_open and self._inlet.exhausted and not self._queue
+            found_nothing = self._fast_receive.is_open and self._fast_receive.exhausted and not self._queue
             return await self._wait(None, look=not found_nothing)
         except Closed:
             raise StopAsyncIteration from None
@@ -157,8 +157,8 @@ class AsyncReceiver(AsyncIterator[T]):
         Raises:
             TimeoutError: None came in time.
         """
-        self._inlet.left -= 1
-        if self._inlet.left >= 0 and monotonic_ns() < self._inlet.until_ns:
+        self._fast_receive.left -= 1
+        if self._fast_receive.left >= 0 and monotonic_ns() < self._fast_receive.until_ns:
             message: T = self._take()
             if message is not NOTHING:
                 return message
@@ -166,13 +166,15 @@ class AsyncReceiver(AsyncIterator[T]):
 
     async def _wait(self, timeout_s: float | None, *, look: bool) -> T:
         """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
-        inlet = self._inlet
+        fast_receive = self._fast_receive
         reader: LoopReader | None = None
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            if look and (inlet.left <= 0 or monotonic_ns() >= inlet.until_ns):  # others want to run, too
+            if look and (
+                fast_receive.left <= 0 or monotonic_ns() >= fast_receive.until_ns
+            ):  # others want to run, too
                 await asyncio.sleep(0)
-                inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+                fast_receive.left, fast_receive.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
             message: T = self._take() if look else NOTHING
             if message is not NOTHING:
                 return message
@@ -180,13 +182,13 @@ class AsyncReceiver(AsyncIterator[T]):
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError
-            if self._queue or not inlet.exhausted:  # what came could not be read
+            if self._queue or not fast_receive.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
             if reader is None:  # not before: other tasks of the loop may have made it meanwhile
                 reader = self._reader_of_loop()
             await reader.wait(min(left_s, WAIT_MAX_S))
-            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+            fast_receive.left, fast_receive.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
 
     def _reader_of_loop(self) -> LoopReader:
         reader = self._reader

@@ -35,10 +35,10 @@ from cortex.layout import (
 from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 
 _Coder: Any = native and native.Coder
-NativeGate: Any = native and native.Gate
-"""Sends small messages; see `gate.py`. There is one wherever `make_coder` returns something."""
-NativeInlet: Any = native and native.Inlet
-"""Takes messages one at a time; see `inlet.py`."""
+NativeFastSend: Any = native and native.FastSend
+"""Sends small messages; see `fast_send.py`. There is one wherever `make_coder` returns something."""
+NativeFastReceive: Any = native and native.FastReceive
+"""Takes messages one at a time; see `fast_receive.py`."""
 _NUMBER, _BOOL, _ENUM, _FIXED, _VARIABLE, _STR, _BYTES, _OPTIONAL, _LIST, _MESSAGE = range(10)
 _NAMES_MAX = 64
 """More dimensions of one message that must agree are left to Python."""

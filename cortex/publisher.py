@@ -13,12 +13,12 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from cortex.back_pressure import BackPressure
 from cortex.codec import Codec, coder_of
 from cortex.context import Closed
 from cortex.fanout import Fanout
-from cortex.gate import Gate, make_gate
+from cortex.fast_send import FastSend, make_fast_send
 from cortex.loan import Loan
-from cortex.patience import Patience
 from cortex.pub_socket import Backoff, PubSockets
 from cortex.stats import PublisherCounters
 from cortex.wire import MESSAGE, REST, message_head
@@ -64,7 +64,7 @@ class Publisher(Generic[T]):
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._pub_sockets = pub_sockets
         self._lock = pub_sockets.lock
-        self._gate: Gate = make_gate(
+        self._fast_send: FastSend = make_fast_send(
             coder_of(codec, self._head),
             pub_sockets.lock,
             slowly=self._publish_slowly,
@@ -72,19 +72,19 @@ class Publisher(Generic[T]):
             limit=inline_max,
         )
         """Sends small messages if nothing special is to be done."""
-        self._gate.prepare, self._gate.finish = self._prepare, self._finish
+        self._fast_send.prepare, self._fast_send.finish = self._prepare, self._finish
         self._large_lock = threading.Lock()
-        self._gate.large_acquire = self._large_lock.acquire
-        self._gate.large_release = self._large_lock.release
-        self._patience = Patience(pub_sockets, self._gate, self._check_open)
+        self._fast_send.large_acquire = self._large_lock.acquire
+        self._fast_send.large_release = self._large_lock.release
+        self._back_pressure = BackPressure(pub_sockets, self._fast_send, self._check_open)
         self._fanout = Fanout(
             topic,
             self.source,
             codec.fingerprint,
             stamped=stamped,
-            gate=self._gate,
+            fast_send=self._fast_send,
             pub_sockets=pub_sockets,
-            patience=self._patience,
+            back_pressure=self._back_pressure,
             latching=latch,
             max_wait_s=max_wait_s,
             expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
@@ -109,19 +109,19 @@ class Publisher(Generic[T]):
             ValueError: A field's value does not fit its type.
             Closed: The publisher was closed.
         """
-        return self._gate(message)
+        return self._fast_send(message)
 
     def _publish_slowly(self, message: T) -> bool:
-        """Send a message that the gate cannot."""
+        """Send a message that the fast path cannot."""
         self._lock.acquire()
         try:
             now_ns = monotonic_ns()
-            if now_ns >= self._gate.refresh_ns:
+            if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._fanout.readers and not self.latch:
-                self._gate.sequence += 1
+                self._fast_send.sequence += 1
                 return True
             prepared: Any = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
@@ -143,7 +143,7 @@ class Publisher(Generic[T]):
 
     def _acquire(self, size: int, now_ns: int, *, may_wait: bool = False) -> Any:
         """A slot for a large message; None if there is none. The lock is held."""
-        if self._patience.is_waiting:
+        if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
         exact = self.codec.fixed_size is not None
@@ -236,9 +236,9 @@ class Publisher(Generic[T]):
         """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
         with self._lock:
             now_ns = monotonic_ns()
-            if now_ns >= self._gate.refresh_ns:
+            if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
-            return self._gate.send_slot(message, slot)
+            return self._fast_send.send_slot(message, slot)
 
     def _finish_draft(self, draft: Any, message: Any) -> tuple[int, int]:
         """Write what is not in its place yet; the size of the body, and its stamp [ns]."""
@@ -251,25 +251,25 @@ class Publisher(Generic[T]):
 
     def _send_written(self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
         """Send a large message that lies in a slot, or in memory of its own; both locks are held."""
-        if self._patience.is_waiting:
+        if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
         body = buffer[:size].data
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current
             body = memoryview(body.tobytes() if wanted else b"")
-        sequence = self._gate.sequence
-        self._gate.sequence += 1
-        self._gate.bytes += size
+        sequence = self._fast_send.sequence
+        self._fast_send.sequence += 1
+        self._fast_send.bytes += size
         slot = slot if slot is not None and slot.is_current else None
         return self._fanout.send_large(body, slot, sequence, stamp_ns, now_ns, size)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send a small message; the lock is held."""
         size = len(body)
-        self._gate.bytes += size
-        sequence = self._gate.sequence
-        self._gate.sequence = sequence + 1
+        self._fast_send.bytes += size
+        sequence = self._fast_send.sequence
+        self._fast_send.sequence = sequence + 1
         frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
         if self.latch:
             self._fanout.latched = frame
@@ -277,16 +277,16 @@ class Publisher(Generic[T]):
 
     def _skip(self) -> bool:
         """Count a message that finds no slot: its readers see the gap. The lock is held."""
-        self._gate.sequence += 1
+        self._fast_send.sequence += 1
         self._fanout.skipped += 1
         return False
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
-        while self._patience.is_waiting:
+        while self._back_pressure.is_waiting:
             self._sleep_unlocked()
         self._check_open()
-        self._gate.refresh_ns = now_ns + REFRESH_NS
+        self._fast_send.refresh_ns = now_ns + REFRESH_NS
         self._pub_sockets.refresh_if_older(now_ns - REFRESH_NS)
 
     def _sleep_unlocked(self) -> None:
@@ -301,7 +301,7 @@ class Publisher(Generic[T]):
             raise Closed(f"the publisher of {self.topic} is closed")
 
     def _finish(self, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
-        """Send a slot that the gate has written, but that needs more care; both locks are held."""
+        """Send a slot that the fast path has written, but that needs more care; both locks are held."""
         return self._send_written(np.frombuffer(slot, np.uint8), slot, size, stamp_ns, now_ns)
 
     def tick(self, now_ns: int) -> None:
@@ -318,7 +318,9 @@ class Publisher(Generic[T]):
         """What has been published so far."""
         with self._lock:
             fanout = self._fanout
-            return PublisherCounters(self._gate.sequence, self._gate.bytes, fanout.timeouts, fanout.skipped)
+            return PublisherCounters(
+                self._fast_send.sequence, self._fast_send.bytes, fanout.timeouts, fanout.skipped
+            )
 
     @property
     def subscriber_count(self) -> int:
@@ -342,8 +344,8 @@ class Publisher(Generic[T]):
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old ones may have been held at the fork
         self._large_lock = threading.Lock()
-        self._gate = Gate(self._publish_slowly)
-        self._patience.is_waiting = False  # who was held up at the fork is not here
+        self._fast_send = FastSend(self._publish_slowly)
+        self._back_pressure.is_waiting = False  # who was held up at the fork is not here
         self._closing = self._closed = True
 
     def stop_waiting(self) -> None:
@@ -351,7 +353,7 @@ class Publisher(Generic[T]):
 
         Ends a wait of another thread, too; to be called when the end is asked for. It takes no lock.
         """
-        self._patience.until_s = 0.0
+        self._back_pressure.until_s = 0.0
 
     def close(self, linger_s: float = LINGER_S) -> None:
         """Tell readers how many messages there were, and leave the topic.
@@ -373,14 +375,14 @@ class Publisher(Generic[T]):
     def _stop(self, by_s: float) -> None:
         """Publish no more; nobody is waited for after a time of the monotonic clock [s]."""
         with self._lock:
-            self._patience.until_s = min(self._patience.until_s, by_s)
+            self._back_pressure.until_s = min(self._back_pressure.until_s, by_s)
             try:
-                if not self._pub_sockets.closed and not self._patience.is_waiting:
+                if not self._pub_sockets.closed and not self._back_pressure.is_waiting:
                     self._fanout.tell()
             finally:
                 self._closed = True
                 self._fanout.stop()
-                self._gate.refresh_ns = 0  # so that `publish` looks
+                self._fast_send.refresh_ns = 0  # so that `publish` looks
 
     def _is_finished(self, waited_s: float, linger_s: float) -> bool:
         """Whether nobody is worth waiting for any more; writes what there is room for."""

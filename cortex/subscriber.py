@@ -19,14 +19,14 @@ import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
-from cortex.inlet import NOTHING
+from cortex.fast_receive import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Info, Item, Link
 from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver
 from cortex.policy import Policy
+from cortex.receive_lock import ReceiveLock
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
-from cortex.turn import Turn
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
@@ -62,12 +62,13 @@ class Subscriber(Generic[T]):
         self.policy = policy
         self.callback = callback
         self.counters = SubscriberCounters()
-        self._turn = Turn()
-        self._lock = self._turn.lock
+        self._receive_lock = ReceiveLock()
+        self._lock = self._receive_lock.lock
         self.wakeup = Wakeup()
         self._problems: deque[Exception] = deque()
-        self._intake = Intake(policy, self.counters, self._turn)
-        self._links, self._queue, self._inlet = self._intake.links, self._intake.queue, self._intake.inlet
+        self._intake = Intake(policy, self.counters, self._receive_lock)
+        self._links, self._queue = self._intake.links, self._intake.queue
+        self._fast_receive = self._intake.fast_receive
         self._leaving = self._intake.leaving
         self._on_close = on_close
         self._closed = False
@@ -94,7 +95,7 @@ class Subscriber(Generic[T]):
                 TimeoutError while there is no publisher of the right type.
             Closed: The subscriber was closed.
         """
-        message: T = self._inlet(timeout_s is None or timeout_s >= BLOCK_S)
+        message: T = self._fast_receive(timeout_s is None or timeout_s >= BLOCK_S)
         if message is NOTHING:
             message = self._receive(timeout_s, self._decode)
         return message
@@ -115,8 +116,8 @@ class Subscriber(Generic[T]):
         self._looks_left_out -= 1
         if self._looks_left_out > 0:
             return False
-        with self._turn:
-            if not (self._closed or self._queue or self._inlet.exhausted):
+        with self._receive_lock:
+            if not (self._closed or self._queue or self._fast_receive.exhausted):
                 self._intake.receive_one()  # descriptors show what comes after a look in vain
             if self._closed or self._queue:
                 return True
@@ -179,15 +180,15 @@ class Subscriber(Generic[T]):
 
     def _take_now(self) -> Any:
         """Take the next message if it is there; `NOTHING` if not, or if it could not be read."""
-        message = self._inlet(False)
-        if message is NOTHING and (self._queue or not self._inlet.is_open):
+        message = self._fast_receive(False)
+        if message is NOTHING and (self._queue or not self._fast_receive.is_open):
             item = self._take()
             if item is not None:
                 message = self._open(item, self._decode)
         return message
 
     def _watched(self) -> tuple[int, list[int]]:
-        with self._turn:
+        with self._receive_lock:
             return self._generation, [self.wakeup.fd, *(fd for link in self._links for fd in link.fds)]
 
     def _nothing_came(self, timeout_s: float | None) -> TimeoutError:
@@ -233,7 +234,7 @@ class Subscriber(Generic[T]):
                 raise Closed(f"the subscriber of {self.topic} is closed")
             if self._problems:
                 problem = self._problems.popleft()
-                self._open_inlet()
+                self._open_fast_receive()
                 raise problem
             if not self.policy.reliable:
                 is_old = monotonic_ns() - self._intake.drained_ns > FRESH_NS
@@ -252,7 +253,7 @@ class Subscriber(Generic[T]):
         try:
             return use(item)
         except MalformedMessage as error:
-            with self._turn:
+            with self._receive_lock:
                 self.counters.received -= 1
                 item.link.reject(str(error))
         return NOTHING
@@ -263,8 +264,8 @@ class Subscriber(Generic[T]):
 
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
-        with self._turn:
-            if self._closed or not self._inlet.exhausted:
+        with self._receive_lock:
+            if self._closed or not self._fast_receive.exhausted:
                 return
             poll = self._poll or self._new_poll()
             self._poll = None  # one thread at a time may use it
@@ -302,7 +303,7 @@ class Subscriber(Generic[T]):
             if self._problems:
                 problems, self._problems = self._problems, problems
             received = self._intake.take_all(messages, items, block=block)
-            more = not self._inlet.exhausted or (block and received > 0)
+            more = not self._fast_receive.exhausted or (block and received > 0)
         for problem in problems:
             logger.error("%s", problem)
         while messages and not self._closed:  # each gives back its slot as soon as its callback is done
@@ -334,13 +335,13 @@ class Subscriber(Generic[T]):
     @property
     def must_read(self) -> bool:
         """Whether the last look left something in a socket, which its descriptor may not show."""
-        return not self._inlet.exhausted and (
+        return not self._fast_receive.exhausted and (
             not self.policy.reliable or len(self._queue) < self.policy.depth
         )
 
     def fds(self) -> list[int]:
         """File descriptors that become readable when a message may have come."""
-        with self._turn:
+        with self._receive_lock:
             return [fd for link in self._links for fd in link.fds]
 
     def top_up(self, now_ns: int) -> None:
@@ -348,7 +349,7 @@ class Subscriber(Generic[T]):
 
         So the queue keeps the last messages, not the first that filled the sockets.
         """
-        read_ns = max(self._intake.drained_ns, self._inlet.taken_ns)
+        read_ns = max(self._intake.drained_ns, self._fast_receive.taken_ns)
         if now_ns - read_ns > TOP_UP_NS and self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
@@ -363,7 +364,7 @@ class Subscriber(Generic[T]):
         """Wait until a publisher has taken this subscriber in; False if none has in time."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            with self._turn:
+            with self._receive_lock:
                 if self._closed:
                     raise Closed(f"the subscriber of {self.topic} is closed")
                 if len(self._queue) < self.policy.depth:
@@ -371,42 +372,40 @@ class Subscriber(Generic[T]):
                 attached = any(link.attached for link in self._links)
                 if self._queue:
                     self.wakeup.set()  # whoever sleeps on the descriptors would not notice
-            if attached:
-                return True
-            if time.monotonic() >= deadline_s:
-                return False
+            if attached or time.monotonic() >= deadline_s:
+                return attached
             time.sleep(0.5e-3)
 
     @property
     def publisher_count(self) -> int:
         """Publishers that have taken this subscriber in."""
-        with self._turn:
+        with self._receive_lock:
             return sum(link.attached for link in self._links if link not in self._leaving)
 
     @property
     def carriers(self) -> list[str]:
         """How the messages of each publisher come, such as "ipc, shared memory" or "tcp"."""
-        with self._turn:
+        with self._receive_lock:
             return [link.carrier for link in self._links if link.attached]
 
     def connect(self, link: Link) -> None:
         """Add a publisher; for the node."""
-        with self._turn:
+        with self._receive_lock:
             if self._closed:
                 link.close()
                 return
             self._links.append(link)
-            self._inlet.exhausted = False  # a descriptor shows nothing until its socket was found empty once
+            self._fast_receive.exhausted = False  # its descriptor shows nothing until it was found empty
             self._links_changed()
 
     def sources(self) -> dict[int, int]:
         """The publishers that are connected and have not left, and the sequence that comes next of each."""
-        with self._turn:
+        with self._receive_lock:
             return {link.source: link.expected for link in self._links if link not in self._leaving}
 
     def revive(self, source: int) -> bool:
         """A publisher that had left is back: keep its connection; False if there is none. For the node."""
-        with self._turn:
+        with self._receive_lock:
             return self._intake.revive(source)
 
     def forget(self, source: int) -> None:
@@ -414,29 +413,29 @@ class Subscriber(Generic[T]):
 
         A reliable subscriber disconnects once it has read all of it, however long its user takes.
         """
-        with self._turn:
+        with self._receive_lock:
             if self._intake.leave(source, monotonic_ns() + LEAVING_NS):
                 self.wakeup.set()
 
     def complain(self, problem: TypeMismatch) -> None:
         """A publisher cannot be connected; the user hears of it at the next `recv`."""
-        with self._turn:
+        with self._receive_lock:
             self.counters.rejected += 1
             self._problems.append(problem)
             self._mismatch = problem
-            self._open_inlet()
+            self._open_fast_receive()
         self.wakeup.set()
 
-    def _open_inlet(self) -> None:
-        """Let the inlet read the only publisher, if there is nothing else to mind; the lock is held."""
+    def _open_fast_receive(self) -> None:
+        """Let the fast path read the only publisher, if there is nothing else to mind; the lock is held."""
         links = self._links if self.policy.reliable and self.callback is None and not self._closed else ()
         if len(links) == 1 and not self._problems:
-            self._inlet.open(links[0], links[0].coder)
+            self._fast_receive.open(links[0], links[0].coder)
         else:
-            self._inlet.open(None, None)
+            self._fast_receive.open(None, None)
 
     def _links_changed(self) -> None:
-        self._open_inlet()
+        self._open_fast_receive()
         self._poll = None
         self._generation += 1
         self.wakeup.set()
@@ -454,18 +453,18 @@ class Subscriber(Generic[T]):
 
     def disown(self) -> None:
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
-        self._turn = Turn()  # the old one may have been held at the fork
-        self._lock = self._turn.lock
+        self._receive_lock = ReceiveLock()  # the old one may have been held at the fork
+        self._lock = self._receive_lock.lock
         self._closed = True
-        self._inlet.open(None, None)
+        self._fast_receive.open(None, None)
 
     def close(self) -> None:
         """Stop receiving. Messages that the user still holds stay valid."""
-        with self._turn:
+        with self._receive_lock:
             if self._closed:
                 return
             self._closed = True
-            self._inlet.open(None, None)
+            self._fast_receive.open(None, None)
             self._queue.clear()
             links = list(self._links)
             self._links.clear()

@@ -19,11 +19,13 @@ from pydantic import BaseModel
 import neurosim_core as ns
 from neurosim_core import cli
 from neurosim_core.config import SimulationConfig
+from neurosim_core.lazy import homes_of
 
 ROOT = Path(__file__).resolve().parents[1]
 BESIDE = ("cortex/README.md", "cortex/WIRE.md", "cortex_ros2_bridge/README.md")
 BESIDE += ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 """Documents that do not lie in docs/."""
+PACKETS = "neurosim_core.packets"
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -160,16 +162,20 @@ def commands_page() -> str:
 def python_page() -> str:
     """The names of `import neurosim_core as ns`, from their docstrings."""
     lines = ["# Python", "", "`import neurosim_core as ns` offers these names; nothing else is public."]
-    for home, names in ns._HOMES.items():
-        if home != "neurosim_core.packets":  # they have a page of their own
-            lines += [line for name in names for line in entry(f"{home}.{name}", f"ns.{name}")]
+    lines += names_of(ns)
     lines += ["", "## ns.data", "", "Windows of events with ground truth: [data sets](../data.md)."]
-    for name, home in ns.data._HOME.items():
-        lines += entry(f"neurosim_core.data.{home}.{name}", f"ns.data.{name}")
+    lines += names_of(ns.data)
     lines += ["", "## ns.sensors", "", "What [sensors of your own](../tutorials/own-sensor.md) are made of."]
-    for name, home in ns.sensors._HOME.items():
-        lines += entry(f"{home}.{name}", f"ns.sensors.{name}")
+    lines += names_of(ns.sensors)
     return "\n".join(lines) + "\n"
+
+
+def names_of(package: types.ModuleType) -> list[str]:
+    """Return the lines for all names of a package, but for packets, which have a page of their own."""
+    short = package.__name__.replace("neurosim_core", "ns", 1)
+    homes = homes_of(str(package.__file__)).items()
+    shown = [(name, home) for name, (home, _) in homes if home not in (package.__name__, PACKETS)]
+    return [line for name, home in shown for line in entry(f"{home}.{name}", f"{short}.{name}")]
 
 
 def entry(place: str, heading: str) -> list[str]:

@@ -342,13 +342,17 @@ def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return overrides
 
 
+def _load(arguments: argparse.Namespace, overrides: dict[str, Any]) -> SimulationConfig:
+    from neurosim_core.config import load_config
+
+    return load_config(arguments.config, overrides=overrides, options=_options(arguments))
+
+
 def _run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     with Console(stderr=True).status("preparing: libraries"):  # on the screen before they are there
-        from neurosim_core.config import load_config
-
-        config = load_config(arguments.config, overrides=_overrides(arguments), options=_options(arguments))
+        config = _load(arguments, _overrides(arguments))
         if not arguments.print_config:
             from neurosim_core.flight import fly, new_folder
     if arguments.print_config:
@@ -366,9 +370,7 @@ def _print_config(config: SimulationConfig) -> int:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    from neurosim_core.config import load_config
-
-    config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
+    config = _load(arguments, _live_overrides(arguments))
     if arguments.print_config:
         return _print_config(config)
     from neurosim_core.live.serve import serve
@@ -381,21 +383,16 @@ def _fly(arguments: argparse.Namespace) -> int:
         return learn.fly_policy(arguments, _overrides(arguments))
     if arguments.save is not None:
         raise ValueError("--save goes with --policy; `neurosim serve --record DIR` records other flights")
-    from neurosim_core.config import load_config
     from neurosim_core.live.controller import fly
 
     overrides = _overrides(arguments)
-    given = arguments.config is not None or overrides
-    options = _options(arguments)
-    config = load_config(arguments.config, overrides=overrides, options=options) if given else None
+    config = _load(arguments, overrides) if arguments.config is not None or overrides else None
     with handle_signals(signal.default_int_handler):
         return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
 def _up(arguments: argparse.Namespace) -> int:
-    from neurosim_core.config import load_config
-
-    config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
+    config = _load(arguments, _live_overrides(arguments))
     if arguments.print_config:
         return _print_config(config)
     from neurosim_core.live.up import up
@@ -429,7 +426,7 @@ def _view(arguments: argparse.Namespace) -> int:
         from neurosim_core.live.viewer import view
 
         return view(
-            how="save" if arguments.save else "web" if arguments.web else "native",
+            web=arguments.web and arguments.save is None,
             save=arguments.save,
             only=None if arguments.only is None else arguments.only.split(","),
             event_window_s=arguments.event_window,

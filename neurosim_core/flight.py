@@ -355,8 +355,9 @@ class _Files:
     def _log_clearance(self, name: str, stamp_ns: NDArray[np.int64], position: NDArray[np.float64]) -> None:
         """Plot the distance to what is nearest."""
         assert self._rerun is not None
+        vehicle = next(iter(self._model.config.vehicles))
         for stamp, clearance_m in zip(stamp_ns, self._model.free_space.clearance(position), strict=True):
-            self._rerun.log_scalar(name, int(stamp), float(clearance_m))
+            self._rerun.log_values(f"plots/{vehicle}/{name}", int(stamp), {name: float(clearance_m)})
 
     def _check_disk(self) -> None:
         """Give flight.rrd up if it cannot be written, or takes the last room from flight.h5."""

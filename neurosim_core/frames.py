@@ -83,6 +83,21 @@ def heading_rad(q_WB: ArrayLike) -> float:
     return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
 
 
+def normalised(orientation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quaternions of unit length.
+
+    Raises:
+        ValueError: One is 0, or too large to be normalised.
+    """
+    with np.errstate(over="ignore"):
+        norm: NDArray[np.float64] = np.linalg.norm(orientation, axis=1, keepdims=True)
+    if not ((norm > 1e-6) & (norm < np.inf)).all():
+        raise ValueError(
+            f"orientation must not be 0, nor too large to be normalised, got {orientation.tolist()}"
+        )
+    return orientation / norm
+
+
 def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.float64]:
     """Return `value` as float64 [count, width], broadcasting one row to all.
 

@@ -9,6 +9,24 @@ from pathlib import Path
 from typing import Any
 
 
+def homes_of(file: str) -> dict[str, tuple[str, str]]:
+    """Return module and name there of each name that a package imports under `if TYPE_CHECKING:`.
+
+    Args:
+        file: `__file__` of the package.
+    """
+    tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+    (block,) = (
+        node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+    )
+    return {
+        alias.asname or alias.name: (str(node.module), alias.name)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
 def lazy_names(
     package: str, file: str, prepare: Callable[[], object] = lambda: None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
@@ -22,16 +40,7 @@ def lazy_names(
         file: Its `__file__`.
         prepare: Called before a name is imported; it may raise ImportError.
     """
-    tree = ast.parse(Path(file).read_text(encoding="utf-8"))
-    (block,) = (
-        node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-    )
-    homes = {
-        alias.asname or alias.name: (str(node.module), alias.name)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
+    homes = homes_of(file)
     names = sorted(homes)
 
     def find(name: str) -> Any:

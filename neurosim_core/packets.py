@@ -12,14 +12,11 @@ pictures, plots and messages are derived, so that no other file has to know the 
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
 import inspect
-import itertools
 import json
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -27,6 +24,8 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_
 
 import numpy as np
 from numpy.typing import NDArray
+
+from neurosim_core.docstrings import field_docs
 
 _UNITS = ("ns", "us", "s", "m", "px", "hz", "rad", "rad_s", "m_s", "m_s2", "n", "kg", "bytes")
 _SCALARS: dict[Any, str] = {int: "int64", float: "float64", bool: "bool", str: "str"}
@@ -174,7 +173,7 @@ def schema_of(cls: type[Packet]) -> PacketSchema:
 def _derived_schema(cls: Any) -> PacketSchema:
     header = {field.name for field in dataclasses.fields(Packet)}
     hints = get_type_hints(cls, include_extras=True)
-    docs = _field_docs(cls)
+    docs = field_docs(cls)
     fields = tuple(
         _field_schema(cls, field.name, hints[field.name], docs.get(field.name, ""))
         for field in dataclasses.fields(cls)
@@ -242,40 +241,6 @@ def _display(fields: tuple[FieldSchema, ...]) -> str:
     if any(f.varying and len(f.shape) == 1 for f in fields):
         return "bars"
     return "text" if any(f.dtype == "str" for f in fields) else "none"
-
-
-def _field_docs(cls: type) -> dict[str, str]:
-    """Return the docstrings on the lines after the fields of a class; none if its source is not there."""
-    docs: dict[str, str] = {}
-    for base in reversed(cls.__mro__[:-1]):
-        try:
-            node = _class_nodes(inspect.getsource(sys.modules[base.__module__])).get(base.__qualname__)
-        except (KeyError, OSError, TypeError, SyntaxError):
-            continue
-        body = [] if node is None else node.body
-        for field, text in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                docs[ast.unparse(field.target)] = inspect.cleandoc(str(ast.literal_eval(text.value)))
-    return docs
-
-
-@functools.cache
-def _class_nodes(source: str) -> dict[str, ast.ClassDef]:
-    """Return the classes of a module by qualified name; `inspect` would parse the module for each of them."""
-    found: dict[str, ast.ClassDef] = {}
-    todo: list[tuple[ast.AST, str]] = [(ast.parse(source), "")]
-    while todo:
-        parent, prefix = todo.pop()
-        for node in ast.iter_child_nodes(parent):
-            inner = prefix
-            if isinstance(node, ast.ClassDef):
-                found[prefix + node.name] = node
-                inner = f"{prefix}{node.name}."
-            elif isinstance(node, ast.FunctionDef):
-                inner = f"{prefix}{node.name}.<locals>."
-            if isinstance(node, ast.stmt):
-                todo.append((node, inner))
-    return found
 
 
 class EventArrays(NamedTuple):

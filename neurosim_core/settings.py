@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ast
-import contextlib
 import functools
-import inspect
-import itertools
-import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
+
+from neurosim_core.docstrings import field_docs
 
 
 class Settings(BaseModel):
@@ -36,19 +33,10 @@ def documentation(settings: type[BaseModel]) -> dict[str, str]:
 
     Read when it is asked for: pydantic's `use_attribute_docstrings` parses every class when it is imported.
     """
-    described: dict[str, str] = {}
-    for cls in reversed(settings.__mro__):
-        if cls in (object, BaseModel) or not issubclass(cls, BaseModel):
-            continue
-        with contextlib.suppress(OSError):  # typed in: there is no source
-            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-            assert isinstance(tree, ast.ClassDef)
-            for field, after in itertools.zip_longest(tree.body, tree.body[1:]):
-                if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                    text = after.value if isinstance(after, ast.Expr) else None
-                    said = str(text.value) if isinstance(text, ast.Constant) else ""
-                    described[field.target.id] = inspect.cleandoc(said)
-    return described | {n: f.description for n, f in settings.model_fields.items() if f.description}
+    described = {
+        name: field.description for name, field in settings.model_fields.items() if field.description
+    }
+    return field_docs(settings) | described
 
 
 def fill_from_preset(given: Any, presets: Mapping[str, Mapping[str, Any]]) -> Any:

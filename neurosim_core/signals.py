@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
 INTERRUPTED_LINE = "neurosim: interrupted"
 """What a command says that is interrupted."""
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of `prctl`
 
 
 @contextlib.contextmanager
@@ -51,3 +54,17 @@ def leave_at_once(_signal: int, _frame: FrameType | None) -> None:
     """End the process on the spot, as long as nothing is open; imports may swallow a `KeyboardInterrupt`."""
     os.write(2, f"{INTERRUPTED_LINE}\n".encode())
     os._exit(130)
+
+
+def end_with_parent(number: signal.Signals) -> Callable[[], None] | None:
+    """Return what a child process does first to get a signal when this process dies. Only Linux can."""
+    if sys.platform != "linux":
+        return None
+    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+
+    def ask_kernel() -> None:
+        prctl(_SET_PARENT_DEATH_SIGNAL, number)
+        if os.getppid() != parent:  # it has died meanwhile
+            os._exit(130)
+
+    return ask_kernel

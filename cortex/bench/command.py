@@ -18,7 +18,7 @@ from cortex.bench.cases import choose
 from cortex.bench.measure import CaseResult, Settings, run_case
 from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
-from cortex.bench.report import make_console, print_case, print_header, print_list, print_summary, write_csv
+from cortex.bench.report import make_console, print_case, print_header, print_summary, write_csv
 
 _AGAIN = 4
 """So many times as many repetitions are made at most, where a bar lies within the noise."""
@@ -34,7 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return the exit status (2: wrong arguments)."""
     parser = argparse.ArgumentParser("cortex bench", description="Cortex beside its peers on this machine.")
     add = parser.add_argument
-    add("case", nargs="*", help="cases to run, all by default; `tcp` stands for every `tcp-…`")
+    add(
+        "case",
+        nargs="*",
+        help="cases to run, all by default; `tcp` stands for every `tcp-…`; a wrong name lists them",
+    )
     add("--repeats", type=int, default=9, help=f"repetitions of each contestant (9), {_AGAIN} times as many "
         "where a bar lies within the noise")  # fmt: skip
     add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
@@ -43,7 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add("--quick", action="store_true", help="tiny runs: shows that it works, measures nothing")
     add("--csv", type=Path, metavar="FILE", help="write every figure there, too")
-    add("--list", action="store_true", help="name the cases and their bars")
     options = parser.parse_args(arguments)
     try:
         results = _run(options)
@@ -61,9 +64,6 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
     cases = choose(options.case)
     if options.against is not None:
         cases = [case.beside(str(options.against.resolve())) for case in cases]
-    if options.list:
-        print_list(console, cases)
-        return []
     if options.repeats < 1 or not 0.0 < options.seconds <= 600.0:  # also refuses nan
         raise ValueError(
             f"wants repeats >= 1 and 0 < seconds <= 600, got {options.repeats}, {options.seconds}"
@@ -87,7 +87,7 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
         try:
             for case in cases:
                 results.append(run_case(case, settings))
-                print_case(console, results[-1], judged=not quick)
+                print_case(console, results[-1])
         except KeyboardInterrupt:
             console.print("interrupted; what was measured until then:\n")
     print_summary(console, results, judged=not quick)

@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cortex.bench.cases import METRICS, Bar, Case
+from cortex.bench.cases import METRICS, Bar
 from cortex.bench.measure import CaseResult, Spread, Verdict, faults_of, spread_of, values_of
 
 WIDTH = 110
@@ -45,8 +45,8 @@ def print_header(console: Console) -> None:
     console.print(", ".join(versions))
 
 
-def print_case(console: Console, result: CaseResult, *, judged: bool) -> None:
-    """Print what each contestant of a case did, then the case's bars."""
+def print_case(console: Console, result: CaseResult) -> None:
+    """Print what each contestant of a case did."""
     case = result.case
     console.print(f"{case.name}: {case.title}; payload {4 * case.floats:,} B")
     table = Table(box=None, show_header=False, padding=(0, 3, 0, 0))
@@ -56,15 +56,6 @@ def print_case(console: Console, result: CaseResult, *, judged: bool) -> None:
         cells = [_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics]
         table.add_row(f"  {name}", *cells, faults_of(reports))
     console.print(table)
-    if case.bars:
-        bars = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-        for verdict in result.verdicts():
-            bars.add_row(
-                "  =>",
-                _measured(verdict),
-                f"{_what(verdict.bar, verdict.against)}; bar {_bound(verdict.bar)}: {_word(verdict, judged)}",
-            )
-        console.print(bars)
     console.print()
 
 
@@ -76,9 +67,7 @@ def print_summary(console: Console, results: list[CaseResult], *, judged: bool) 
     words = []
     for result in results:
         for verdict in result.verdicts():
-            words.append(
-                _word(verdict, judged).partition(" (")[0]
-            )  # the reason stands in the case's own block
+            words.append(_word(verdict, judged).partition(" (")[0])  # the reason stands above
             table.add_row(
                 result.case.name,
                 _what(verdict.bar, verdict.against),
@@ -93,14 +82,6 @@ def print_summary(console: Console, results: list[CaseResult], *, judged: bool) 
         for word in ("met", "missed", "not measured", "not judged")
     }
     console.print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
-
-
-def print_list(console: Console, cases: list[Case]) -> None:
-    """Print the cases and their bars."""
-    for case in cases:
-        console.print(f"{case.name:<18}{case.title}")
-        for bar in case.bars:
-            console.print(f"{'':<18}  {_what(bar)} {_bound(bar)}")
 
 
 def write_csv(path: Path, results: list[CaseResult]) -> None:

@@ -46,7 +46,7 @@ class Equations:
         self._drag = np.array([[config.rotor_drag_kg], [config.rotor_drag_kg], [config.rotor_inflow_kg]])
         self._parasitic = np.array(config.parasitic_drag_kg_m)
         self._wind = np.array(config.wind_m_s)
-        self.time_constant_s = config.motor_time_constants_s
+        self.time_constant_s = np.full(config.rotor_count, config.motor_time_constant_s)
         """Of the motors [s], shape [R]."""
 
     def rate(self, y: Array, speed: Array) -> Array:

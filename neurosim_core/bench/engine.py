@@ -36,7 +36,7 @@ from neurosim_core.sim.model import Model, find_device, make_model, refit
 from neurosim_core.sim.rollout import run_model, step
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.sim.state import StartState, make_state
-from neurosim_core.trajectory import FigureEightConfig, figure_eight
+from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 Poses = tuple[NDArray[np.float32], NDArray[np.float32]]

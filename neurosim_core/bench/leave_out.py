@@ -50,7 +50,6 @@ def cases(quick: bool) -> dict[str, dict[str, Any]]:
         "odometry": {"kind": "odometry"},
     }
     terms = {
-        "motor_time_constant_scale": [1.0, 1.1, 1.2, 1.3],
         "flapping_kg_m": 1e-6,
         "wind_m_s": [0.3, 0.1, 0.0],
         "gusts": [{"velocity_m_s": [0.2, 0.0, 0.1], "start_s": 0.0, "rise_s": 0.1}],

@@ -42,7 +42,7 @@ from neurosim_core.control.se3 import (
     shorten,
     velocity_wrench,
 )
-from neurosim_core.frames import UNIT_TOLERANCE, as_rows
+from neurosim_core.frames import as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
@@ -286,7 +286,6 @@ class Controller:
         self._kernel = kernel
         self._model = list(model)
         self._bound: tuple[Any, Any] = (None, None)
-        self._host: tuple[_HostArrays, Any] | None = None
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
@@ -304,59 +303,6 @@ class Controller:
         if self._bound[0] is not arrays:
             self._bound = (arrays, self._record(arrays))
         self._bound[1].launch()
-
-    def command(
-        self,
-        setpoint: ArrayLike | None = None,
-        *,
-        position: ArrayLike,
-        velocity: ArrayLike,
-        orientation: ArrayLike,
-        body_rate: ArrayLike,
-        rotor_speed: ArrayLike,
-        stamp_ns: int = 0,
-    ) -> NDArray[np.float64]:
-        """Return the rotor speed commands [rad/s] for a state on the host, shape [N, R].
-
-        Args:
-            setpoint: Rows as in `layout`, shape [N, len(layout)] or one row for all; None keeps what
-                `setpoint` holds.
-            position: p_WB [m], shape [N, 3] or [3].
-            velocity: v_WB in W [m/s], shape [N, 3] or [3].
-            orientation: q_WB, xyzw, shape [N, 4] or [4].
-            body_rate: w_WB in B [rad/s], shape [N, 3] or [3].
-            rotor_speed: Measured speeds [rad/s], shape [N, R] or [R].
-            stamp_ns: Time at which a path is evaluated [ns].
-
-        Raises:
-            TypeError: If the stamp is no integer.
-            ValueError: If a shape does not fit, an element is not finite, an orientation is no unit
-                quaternion, or numbers are so large that there is no finite command.
-        """
-        stamp_ns = _checked_stamp(stamp_ns)
-        if setpoint is not None:
-            self.set(setpoint)
-        if self._host is None:
-            arrays = _HostArrays(self.count, self.rotor_count, self.device)
-            self._host = (arrays, self._record(arrays))
-        arrays, launch = self._host
-        for array, name, value, width in (
-            (arrays.position, "position", position, 3),
-            (arrays.velocity, "velocity", velocity, 3),
-            (arrays.orientation, "orientation", orientation, 4),
-            (arrays.body_rate, "body_rate", body_rate, 3),
-            (arrays.rotor_speed, "rotor_speed", rotor_speed, self.rotor_count),
-        ):
-            rows = as_rows(value, name=name, count=self.count, width=width)
-            if name == "orientation" and (abs(np.linalg.norm(rows, axis=1) - 1.0) > UNIT_TOLERANCE).any():
-                raise ValueError(f"orientation must be unit quaternions, got {rows.tolist()}")
-            array.assign(rows)
-        arrays.stamp_ns.fill_(stamp_ns)
-        launch.launch()
-        command = np.array(arrays.rotor_speed_command.numpy())
-        if not np.isfinite(command).all():
-            raise ValueError("state or setpoint is too large: no finite command follows from it")
-        return command
 
     def set(self, setpoint: ArrayLike) -> None:
         """Write all setpoints from the host.
@@ -412,26 +358,6 @@ class Controller:
             device=self.device,
             record_cmd=True,
         )
-
-
-def _checked_stamp(stamp_ns: int) -> int:
-    stamp_ns = operator.index(stamp_ns)
-    if not -(2**63) <= stamp_ns < 2**63:
-        raise ValueError(f"stamp_ns must fit 64 bits, got {stamp_ns}")
-    return stamp_ns
-
-
-class _HostArrays:
-    """Arrays for states that come from the host."""
-
-    def __init__(self, count: int, rotor_count: int, device: Any) -> None:
-        self.position: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
-        self.velocity: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
-        self.orientation: Any = wp.zeros(count, dtype=wp.quatd, device=device)
-        self.body_rate: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
-        self.rotor_speed: Any = wp.zeros((count, rotor_count), dtype=wp.float64, device=device)
-        self.stamp_ns: Any = wp.zeros(count, dtype=wp.int64, device=device)
-        self.rotor_speed_command: Any = wp.zeros((count, rotor_count), dtype=wp.float64, device=device)
 
 
 def make_controller(

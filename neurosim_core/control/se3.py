@@ -69,10 +69,6 @@ class Se3Config(Settings):
     """Motors that are slower than this are overdriven so that they close on the wanted speed with this time
     constant [s], as far as their limits allow; needs measured rotor speeds. Choose it no shorter than the
     control period."""
-    feed_forward_jerk: bool = True
-    """Use jerk and yaw rate of a path: they give its body rate."""
-    feed_forward_snap: bool = True
-    """Use snap and yaw acceleration of a path: they give its angular acceleration."""
     feed_forward_air: bool = True
     """Cancel drag and lift as the vehicle's own model gives them in still air; wind remains a disturbance."""
 
@@ -113,10 +109,6 @@ class Se3Parameters:
     """Highest body or yaw rate that a command may ask for [rad/s]."""
     command_position_max_m: wp.float64
     """Largest coordinate that a command may ask for [m]."""
-    use_jerk: wp.float64
-    """1: feed jerk and yaw rate of a path forward, 0: do not."""
-    use_snap: wp.float64
-    """1: feed snap and yaw acceleration of a path forward, 0: do not."""
 
 
 def make_parameters(
@@ -154,8 +146,6 @@ def make_parameters(
     parameters.command_speed_max_m_s = ranges.speed_max_m_s
     parameters.command_rate_max_rad_s = ranges.body_rate_max_rad_s
     parameters.command_position_max_m = ranges.position_max_m
-    parameters.use_jerk = float(config.feed_forward_jerk)
-    parameters.use_snap = float(config.feed_forward_snap)
     return parameters
 
 
@@ -354,9 +344,7 @@ def point_wrench(parameters: Se3Parameters, state: VehicleState, point: PathPoin
         state,
         point.velocity + correction,
         point.acceleration,
-        parameters.use_jerk * point.jerk,
-        parameters.use_snap * point.snap,
-        heading_of_yaw(
-            point.yaw, parameters.use_jerk * point.yaw_rate, parameters.use_snap * point.yaw_acceleration
-        ),
+        point.jerk,
+        point.snap,
+        heading_of_yaw(point.yaw, point.yaw_rate, point.yaw_acceleration),
     )

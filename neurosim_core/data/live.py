@@ -80,8 +80,7 @@ class LiveSource:
     def _join(self, node: Any, namespace: str, config: WindowConfig) -> Iterator[_Flight]:
         from cortex import latest, reliable
         from cortex.messages import Simulation
-        from neurosim_core.live.engine import packet_type
-        from neurosim_core.live.messages import message_type
+        from neurosim_core.live.messages import sensor_message_type
         from neurosim_core.live.topics import SIMULATION, stream_topic
 
         announced = node.subscriber(namespace + SIMULATION, Simulation, policy=latest())
@@ -95,7 +94,7 @@ class LiveSource:
             subscribers = {
                 sensor: node.subscriber(
                     namespace + stream_topic(vehicle, sensor),
-                    message_type(packet_type(rig.sensors[sensor].kind)),
+                    sensor_message_type(rig.sensors[sensor].kind),
                     policy=reliable(_QUEUE),
                 )
                 for field, sensor in chosen.items()

@@ -44,6 +44,16 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="train with N seeds from --seed on; with --ray"
+    )
+    learn.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="a Ray cluster (local, auto, host:port): one training for each of --seeds; depth, flow: the "
+        "flights of --live",
+    )
+    learn.add_argument("--wandb", action="store_true", help="send what TensorBoard gets to Weights & Biases")
+    learn.add_argument(
         "--algorithm",
         choices=("dagger", "ppo"),
         default="dagger",
@@ -73,9 +83,6 @@ def add_parsers(commands: _Commands) -> None:
     dense = learn.add_argument_group("depth, flow, pretrain")
     dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
     dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
-    dense.add_argument(
-        "--ray", metavar="ADDRESS", help="those of --live fly on a Ray cluster: local, auto, host:port"
-    )
     dense.add_argument(
         "--fly-device",
         metavar="DEVICE",
@@ -166,7 +173,16 @@ def _learn(arguments: argparse.Namespace) -> int:
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
-    config = dataclasses.replace(config, student=student, teacher=teacher)
+    config = dataclasses.replace(config, student=student, teacher=teacher, wandb=arguments.wandb)
+    if arguments.ray is not None:
+        from neurosim_core.learn.population import train_population
+
+        seeds = range(arguments.seed, arguments.seed + arguments.seeds)
+        population = {f"seed-{seed}": dataclasses.replace(config, seed=seed) for seed in seeds}
+        train_population(folder, population, address=arguments.ray)
+        return 0
+    if arguments.seeds != 1:
+        raise ValueError("--seeds needs --ray: local, auto or host:port")
     if train(folder, config, resume=arguments.resume):
         print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
     return 0

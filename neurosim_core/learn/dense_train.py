@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
-from neurosim_core.learn.dense import DenseNet, Head
+from neurosim_core.learn.dense import DenseNet, Head, Memory
 from neurosim_core.learn.dense_live import flight_settings, live_flights
 from neurosim_core.learn.depth import DepthHead
 from neurosim_core.learn.flow import FlowHead
@@ -31,6 +31,8 @@ HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": 
 """What can be learned, by the name of its command."""
 _SILENT_S = 120.0
 """Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
+_REMEMBERED = 0.75
+"""Share of the sequences of a step that begin with the memory that the step before has left."""
 _TEST_SEED = 1_000_000
 """Of the first flight that is only tested on."""
 
@@ -410,6 +412,18 @@ def _gpus(device: str) -> list[str]:
     return subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
+def _some_of(memory: Memory | None, random: np.random.Generator) -> Memory | None:
+    """Return the memory that a step left, but for a quarter of its sequences.
+
+    It is of other flights than those that follow: a network that has to begin with it learns to forget. One
+    that always begins without does well for as many windows as a sequence has, and drifts in longer flights.
+    """
+    if memory is None:
+        return None
+    kept = torch.from_numpy(random.random(len(memory[0])) < _REMEMBERED).to(memory[0])
+    return tuple(level.detach() * kept[:, None, None, None] for level in memory)
+
+
 def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
     """Train for the time that there is."""
     if len(pool) == 0:
@@ -419,6 +433,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
     head, random = config.head, np.random.default_rng(config.seed)
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=1e-4)
     begin_s, steps, waited_s = time.monotonic(), 0, 0.0
+    memory: Memory | None = None
 
     def share_done() -> float:
         if config.steps is not None:
@@ -432,7 +447,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         more(steps)
         waited_s += time.monotonic() - asked_s
         voxel, target = (part.to(config.device).float() for part in pool.draw(config.batch, random))
-        memory, predicted = None, []
+        memory, predicted = _some_of(memory, random), []
         for window in voxel[: config.sequence]:
             one, memory = net(window, memory)
             predicted.append(one)

@@ -9,6 +9,7 @@ what it would have done without the interruption, to the bit on a CPU.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import resource
@@ -28,7 +29,6 @@ from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, te
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
-from neurosim_core.learn.task import Task
 from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
@@ -51,14 +51,14 @@ class TrainConfig:
     """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
-    rays_per_pixel: int | None = None
-    """Rays that a pixel takes the mean of in training; None: as the task says, as in tests."""
     randomise: str = "training"
     """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
     learn, or nothing (`none`)."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
+    wandb: bool = False
+    """Send what TensorBoard gets to Weights & Biases, too (package `wandb`)."""
 
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
@@ -99,7 +99,7 @@ class Training:
         if config.randomise == "training" and drawn is not None:
             randomise = drawn
         self.env = make_env(
-            _task_of(config),
+            config.task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
@@ -113,7 +113,7 @@ class Training:
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
             teacher_env = make_env(
-                _task_of(config),
+                config.task,
                 worlds=config.teacher.worlds,
                 device=config.device,
                 observe=states,
@@ -174,6 +174,11 @@ class Training:
         config = self.config
         wholes = {"teacher": config.teacher.iterations, "student": config.student.iterations}
         limits = wholes if until is None else dict(zip(wholes, until, strict=True))
+        if config.wandb and ranks.rank() == 0:
+            settings = {"dir": str(self.folder), "config": dataclasses.asdict(config)}
+            importlib.import_module("wandb").init(
+                project="neurosim", name=self.folder.name, sync_tensorboard=True, **settings
+            )
         with SummaryWriter(str(self.folder)) if ranks.rank() == 0 else nullcontext() as writer:
             for stage, trainer in self._trainers.items():
                 while self._done[stage] < min(limits[stage], wholes[stage]):
@@ -223,13 +228,6 @@ class Training:
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
-def _task_of(config: TrainConfig) -> Task:
-    """Return the task as it is trained."""
-    task = find_task(config.task)
-    task.rays_per_pixel = config.rays_per_pixel or task.rays_per_pixel
-    return task
-
-
 def prepare_torch() -> None:
     """Choose how PyTorch computes in this process."""
     torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
@@ -263,19 +261,18 @@ def default_config(
             "updates": 8,
             "replay": 10,
             "learning_rate": 2e-3,
-            "inverted": 0.5,
         }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
             config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=75
         )
-    many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 82, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 1024, "iterations": 50} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=45,
+        block=41,
         evaluation_worlds=512,
     )
 
@@ -401,7 +398,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "mount": dict(task.mount),
         "threshold": task.threshold,
         "renders_per_step": task.renders_per_step,
-        "rays_per_pixel": find_task(name).rays_per_pixel,
+        "rays_per_pixel": task.rays_per_pixel,
         "surface": env.surface_card,
         "hover_thrust_n": env.view.vehicle.hover_thrust_n,
         "thrust_span": task.thrust_span,

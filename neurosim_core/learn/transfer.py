@@ -11,7 +11,8 @@ import torch
 
 from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate, student_actor
-from neurosim_core.learn.task import Observations, Task
+from neurosim_core.learn.surfaces import LeakySurface
+from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.learn.train import load_student, read_config
 
 _NOISY_WORLDS = 128
@@ -35,6 +36,8 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "actions one step later": {"late": 1.0},
     "a tenth of the actions lost": {"late": 0.1},
     "three tenths of the actions lost": {"late": 0.3},
+    "a tenth of the event packets lost": {"lost": 0.1},
+    "three tenths of the event packets lost": {"lost": 0.3},
 }
 """What differs from the tests of a task, by name; periods of 50 Hz stay whole nanoseconds."""
 
@@ -67,6 +70,8 @@ def evaluate_transfer(
             **where,
         )
         where = {"models": env.sim.models}  # nothing is loaded twice
+        if "lost" in changes:
+            _lose_events(env, changes["lost"])
         policy = load_student(folder, env.device)
         yield name, evaluate(env, _late(student_actor(policy, env), env, changes.get("late", 0.0)))
 
@@ -85,6 +90,29 @@ def _late(actor: Actor, env: Env, share: float) -> Actor:
         return taken
 
     return act
+
+
+def _lose_events(env: Env, share: float) -> None:
+    """Let the events of a share of the steps get lost, in each world at times of its own."""
+    task, surface = env.task, env.task.surface
+    if not isinstance(surface, LeakySurface):
+        raise ValueError(f"lost packets are for surfaces that decay, got {type(surface).__name__}")
+    tau_s = torch.tensor(surface.tau_s, device=env.device).repeat_interleave(2)
+    decay = torch.exp(-1.0 / (task.rate_hz * tau_s))[:, None, None]
+    generator = torch.Generator(device=env.device).manual_seed(0)
+    before: list[torch.Tensor] = []
+    advance = task.advance
+
+    def lose(view: View) -> None:
+        assert view.surface is not None
+        if before:
+            lost = torch.rand((env.num_envs, 1, 1, 1), generator=generator, device=env.device) < share
+            lost &= (env.episode_length > 1)[:, None, None, None]
+            view.surface.copy_(torch.where(lost, before.pop() * decay, view.surface))
+        before[:] = [view.surface.clone()]
+        advance(view)
+
+    task.advance = lose  # type: ignore[method-assign]
 
 
 def _changed_task(name: str, changes: Mapping[str, Any]) -> Task:

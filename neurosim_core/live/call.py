@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -77,6 +78,33 @@ def parameters_of(settings: Sequence[str]) -> Parameters:
             raise ValueError(f"{key} takes a number, true, false, text or a list, got {text!r}")
         values[key] = value
     return Parameters.of(values)
+
+
+class SensorRates:
+    """How many messages a second sensors publish, from one status to the next."""
+
+    def __init__(self) -> None:
+        self._statuses: deque[SimulatorStatus] = deque()
+
+    def update(self, status: SimulatorStatus) -> dict[tuple[str, str], float]:
+        """Take a status; return the rates of active sensors [Hz] by vehicle and sensor, as far as known.
+
+        They are averages over the last second of simulated time; a run that begins again has none yet.
+        """
+        if self._statuses and status.stamp_ns < self._statuses[-1].stamp_ns:
+            self._statuses.clear()
+        if not self._statuses or status.stamp_ns > self._statuses[-1].stamp_ns:  # else it is paused
+            self._statuses.append(status)
+        while len(self._statuses) > 2 and status.stamp_ns - self._statuses[1].stamp_ns >= NS_PER_S:
+            self._statuses.popleft()
+        before, now = self._statuses[0], self._statuses[-1]
+        passed_s = (now.stamp_ns - before.stamp_ns) / NS_PER_S
+        counts = {(sensor.vehicle, sensor.name): sensor.published_count for sensor in before.sensors}
+        return {
+            key: max(sensor.published_count - counts[key], 0) / passed_s
+            for sensor in now.sensors
+            if sensor.active and passed_s > 0.0 and (key := (sensor.vehicle, sensor.name)) in counts
+        }
 
 
 def describe_status(

@@ -7,8 +7,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from neurosim_core.live.engine import FlownBatch, VehicleEngine
+from neurosim_core.live.vehicle import VehicleNode
 from neurosim_core.packets import Packet
+from neurosim_core.sim import Batch, State, render_batch, skip_batch
 
 GIVE_UP_S = 0.5
 """How long the batch in work may take at the end of a run [s]."""
@@ -18,13 +19,18 @@ GIVE_UP_S = 0.5
 class _Job:
     """A batch of one vehicle that waits to be rendered."""
 
-    vehicle: str
-    engine: VehicleEngine
-    flown: FlownBatch
+    vehicle: VehicleNode
+    state: State
+    """Of the run in which it was flown."""
+    batch: Batch
     dropped: bool = False
     """It is too late: it is skipped and counted."""
     discarded: bool = False
     """The run is over: nobody takes its packets."""
+
+    def skip(self) -> None:
+        """Render nothing of it: the sequence of each camera shows the gap."""
+        skip_batch(self.vehicle.model, self.state, self.batch)
 
 
 class CameraThread:
@@ -48,7 +54,7 @@ class CameraThread:
         self._inline = inline
         self._on_packets = on_packets
         self._jobs: deque[_Job] = deque()
-        self._done: deque[tuple[str, list[Packet]]] = deque()
+        self._done: deque[tuple[VehicleNode, list[Packet]]] = deque()
         self._work: _Job | None = None
         self._closed = False
         self._failure: Exception | None = None
@@ -57,38 +63,36 @@ class CameraThread:
         if not inline:
             self._thread.start()
 
-    def render(
-        self, vehicle: str, engine: VehicleEngine, batches: Sequence[FlownBatch], *, is_late: bool
-    ) -> None:
+    def render(self, vehicle: VehicleNode, batches: Sequence[Batch], *, is_late: bool) -> None:
         """Queue batches of a vehicle; a batch without frames is done at once if nothing waits before it.
 
         Args:
-            vehicle: Name of the vehicle.
-            engine: Its simulation.
+            vehicle: Whose.
             batches: What it has flown.
             is_late: Drop them where rendering is inline, so that no batch waits.
 
         Raises:
             RuntimeError: The rendering of an earlier batch failed.
         """
-        for flown in batches:
+        for batch in batches:
+            job = _Job(vehicle=vehicle, state=vehicle.state, batch=batch)
             with self._changed:
-                if not (self._jobs or self._work or flown.frame_counts):
-                    engine.skip(flown)
+                if not (self._jobs or self._work or frame_counts(job.state, batch)):
+                    job.skip()
                     continue
-                self._jobs.append(_Job(vehicle=vehicle, engine=engine, flown=flown))
+                self._jobs.append(job)
                 self._changed.notify_all()
             if self._inline:
-                job = self._jobs.popleft()
+                self._jobs.popleft()
                 job.dropped = is_late
                 self._do(job)
         self.check()
 
-    def drop_until(self, vehicle: str, stamp_ns: int) -> None:
+    def drop_until(self, vehicle: VehicleNode, stamp_ns: int) -> None:
         """Drop the batches of a vehicle that wait and end at a simulated time [ns] or before."""
         with self._changed:
             for job in self._jobs:
-                job.dropped |= job.vehicle == vehicle and job.flown.end_ns <= stamp_ns
+                job.dropped |= job.vehicle is vehicle and job.batch.until_ns <= stamp_ns
 
     def wait_for(self, condition: Callable[[], bool], stop: Callable[[], bool]) -> bool:
         """Wait until a condition holds, which changes with each batch; return whether it does.
@@ -106,7 +110,7 @@ class CameraThread:
         self.check()
         return holds
 
-    def take(self) -> list[tuple[str, list[Packet]]]:
+    def take(self) -> list[tuple[VehicleNode, list[Packet]]]:
         """Return what was rendered since the last call: vehicle and packets, in order."""
         taken = []
         while self._done:
@@ -138,7 +142,7 @@ class CameraThread:
             for job in dropped:
                 self._count(job)
                 if ended:
-                    job.engine.skip(job.flown)
+                    job.skip()
         return ended
 
     def reset(self) -> None:
@@ -178,9 +182,9 @@ class CameraThread:
         packets: list[Packet] = []
         try:
             if job.dropped:
-                job.engine.skip(job.flown)
+                job.skip()
             else:
-                packets = job.engine.render(job.flown)
+                packets = render_batch(job.vehicle.model, job.state, job.batch)
         except Exception as error:  # raised again in the thread that flies
             self._failure = error
         with self._changed:
@@ -205,5 +209,17 @@ class CameraThread:
             return self._work
 
     def _count(self, job: _Job) -> None:
-        for name, count in job.flown.frame_counts.items():
-            self.dropped[job.vehicle, name] += count
+        for name, count in frame_counts(job.state, job.batch).items():
+            self.dropped[job.vehicle.name, name] += count
+
+
+def frame_counts(state: State, batch: Batch) -> Counter[str]:
+    """Return the frames that a batch has to render, by camera: instants of an event camera, or pictures."""
+    counts: Counter[str] = Counter()
+    for index, group in enumerate(state.groups):
+        stamps_ns = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.groups]
+        for name in batch.wanted.intersection(group.frames):
+            counts[name] += len(stamps_ns)
+        for name in batch.wanted.intersection(group.images):
+            counts[name] += sum(map(group.images[name].rate.has_tick, stamps_ns))
+    return +counts

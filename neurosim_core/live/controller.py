@@ -19,9 +19,9 @@ from cortex import Closed, Info, Node, Publisher, Subscriber, keep_last, latest,
 from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import FollowMode, PathFollower
-from neurosim_core.live.engine import plan_paths
 from neurosim_core.live.messages import command_of
 from neurosim_core.live.topics import COMMANDS, SIMULATION, STATUS, command_topic, stream_topic
+from neurosim_core.sim import plan_paths
 from neurosim_core.trajectory import Path
 
 logger = logging.getLogger(__name__)

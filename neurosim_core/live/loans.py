@@ -15,7 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cortex import Loan, Publisher
-from neurosim_core.live.engine import PinError, PinnedMapping
+from neurosim_core.runtime.pinned import PinError, PinnedMapping
 
 _logger = logging.getLogger(__name__)
 _BYTES_MIN = 1 << 16

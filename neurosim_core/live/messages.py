@@ -19,6 +19,7 @@ from cortex import messages as msg
 from neurosim_core import packets as pkt
 from neurosim_core.live.topics import COMMANDS, WORLD_FRAME, body_frame, sensor_frame
 from neurosim_core.record.header import SensorDescription
+from neurosim_core.registry import find
 from neurosim_core.trajectory import Path
 
 ClockNs = Callable[[int], int]
@@ -56,6 +57,16 @@ def message_type(packet: type[pkt.Packet]) -> type[Any]:
         derived = type(packet.__name__, (), namespace)
         _TYPES[packet] = cortex.message(derived, name=f"neurosim/{packet.__name__}")
     return _TYPES[packet]
+
+
+def sensor_message_type(kind: str) -> type[Any]:
+    """Return the message type of the packets that sensors of a kind yield.
+
+    Raises:
+        ValueError: There is no such kind.
+        TypeError: As `message_type`.
+    """
+    return message_type(find("sensor", kind).packet_type)  # type: ignore[attr-defined]
 
 
 def _field_type(packet: type[pkt.Packet], field: pkt.FieldSchema) -> Any:

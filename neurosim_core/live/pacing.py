@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -123,16 +123,6 @@ def _exact(factor: float) -> tuple[int, int]:
     return Fraction(str(factor)).as_integer_ratio()
 
 
-@dataclass(frozen=True)
-class TimingSummary:
-    """Statistics of durations; all 0 if there were none."""
-
-    count: int
-    median_ns: int
-    p99_ns: int
-    max_ns: int
-
-
 class Timings:
     """Durations since the last `take`, in bounded memory."""
 
@@ -140,22 +130,18 @@ class Timings:
         """Make it empty.
 
         Args:
-            capacity: Durations kept; median and 99th percentile are those of the newest.
+            capacity: Durations kept: the newest.
         """
-        self._ring = np.zeros(capacity, dtype=np.int64)
-        self._count = 0
-        self._max_ns = 0
+        self._newest: deque[int] = deque(maxlen=capacity)
 
     def add(self, duration_ns: int) -> None:
         """Add a duration [ns]."""
-        self._ring[self._count % self._ring.size] = duration_ns
-        self._max_ns = max(self._max_ns, duration_ns) if self._count else duration_ns
-        self._count += 1
+        self._newest.append(duration_ns)
 
-    def take(self) -> TimingSummary:
-        """Return the statistics since the last call, and clear them; count and maximum are of all."""
-        count, self._count = self._count, 0
-        if not count:
-            return TimingSummary(0, 0, 0, 0)
-        median_ns, p99_ns = np.percentile(self._ring[:count], [50.0, 99.0])
-        return TimingSummary(count, round(median_ns), round(p99_ns), self._max_ns)
+    def take(self) -> tuple[int, int]:
+        """Return median and 99th percentile since the last call [ns], 0 if there was none; forget them."""
+        if not self._newest:
+            return 0, 0
+        median_ns, p99_ns = np.percentile(self._newest, [50.0, 99.0])
+        self._newest.clear()
+        return round(median_ns), round(p99_ns)

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.flight import header_of, new_folder
 from neurosim_core.install import install_hint
-from neurosim_core.live.engine import Model
 from neurosim_core.live.links import payload_bytes
 from neurosim_core.packets import Packet
 from neurosim_core.record import RecordingWriter
+from neurosim_core.sim import Model
 
 QUEUE_BYTES = 16_000_000
 """Most that waits to be written [bytes]: gzip writes it in 0.2 s."""

@@ -25,7 +25,7 @@ from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.renderer import Renderer, RendererConfig, refuse_worlds
 from neurosim_core.scene.bodies import Body, BodyPoses
-from neurosim_core.scene.materials import linear_to_srgb, srgb_to_linear
+from neurosim_core.scene.materials import linear_to_srgb8, srgb_to_linear
 from neurosim_core.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -337,4 +337,4 @@ class RemoteRenderer:
             assert frames.srgb is not None
             return np.asarray(frames.srgb[frame])
         exposure = self._scene.config.exposure
-        return linear_to_srgb(linear[frame] * np.float32(1.0 if exposure == "auto" else exposure))
+        return linear_to_srgb8(linear[frame] * np.float32(1.0 if exposure == "auto" else exposure))

@@ -78,7 +78,7 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
             if line.last is not None:
                 console.print(Markdown(describe_status(line.last)))
             for vehicle in simulator.vehicles:
-                if count := vehicle.engine.counts.redone_intervals:
+                if count := vehicle.state.counts["redone intervals"]:
                     console.print(f"{vehicle.name}: adaptive steps replaced {count:,} fixed ones")
             if record is not None:
                 console.print(f"recorded to {record}/")
@@ -107,7 +107,7 @@ def require_single_instance(node: Node) -> None:
 
 def print_plan(console: Console, vehicles: Sequence[VehicleNode], config: SimulationConfig) -> None:
     """Print what is simulated, on which topics, and what it waits for."""
-    model, live = vehicles[0].engine.model, config.live
+    model, live = vehicles[0].model, config.live
     if live.mode == "lockstep":
         pace = "lockstep: every control period waits for its command"
     elif live.real_time_factor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +15,8 @@ from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last, latest
 from cortex import messages as msg
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live import topics
-from neurosim_core.live.call import describe_status
-from neurosim_core.live.engine import packet_type
-from neurosim_core.live.messages import message_type, setpoint_of, to_packet
+from neurosim_core.live.call import SensorRates, describe_status
+from neurosim_core.live.messages import sensor_message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.view.rerun_log import RerunLogger
@@ -27,8 +26,6 @@ from neurosim_core.view.rerun_targets import RerunTarget
 DRAIN_MAX = 1000
 """Messages of one stream that are taken before those of the next."""
 QUEUE = 4096
-RATE_NS = 1_000_000_000
-"""Rates are averages over this simulated time [ns]."""
 _AHEAD_NS = 1_000_000_000
 """Commands may be stamped so far ahead [ns]."""
 _PAST_NS = 100_000_000
@@ -143,7 +140,7 @@ class LiveSession:
         self._paths: dict[str, Any] = {}
         self._command_ns: dict[str, int] = {}
         self._tracker = RunTracker()
-        self._statuses: deque[msg.SimulatorStatus] = deque()
+        self._rates = SensorRates()
         self._streams: list[_Stream] = []
         self._logger = self._open()
         self._subscribe("", topics.STATUS, msg.SimulatorStatus, self._log_status)
@@ -200,7 +197,7 @@ class LiveSession:
 
     def _begin_again(self) -> None:
         self._command_ns.clear()
-        self._statuses.clear()
+        self._rates = SensorRates()
         self._outlet.close_recording(self._logger)
         self._logger = self._open()
         self._say("the simulator has begun again: a new recording")
@@ -214,7 +211,7 @@ class LiveSession:
         subscribe(at("rotor_speeds"), msg.RotorSpeeds, partial(self._log_rotor_speeds, vehicle))
         for sensor in self._vehicles[vehicle]:
             log = partial(self._log_packet, vehicle, sensor.name)
-            subscribe(at(sensor.name), message_type(packet_type(sensor.kind)), log, sensor=sensor.name)
+            subscribe(at(sensor.name), sensor_message_type(sensor.kind), log, sensor=sensor.name)
         subscribe(at("collision"), msg.Collision, partial(self._log_packet, vehicle, "collision"))
         for field in ("depth", "flow"):
             log = partial(self._log_packet, vehicle, f"predicted_{field}")
@@ -271,15 +268,13 @@ class LiveSession:
 
     def _log_status(self, status: msg.SimulatorStatus) -> None:
         self.phase = status.phase
-        self._statuses.append(status)
-        while len(self._statuses) > 2 and status.stamp_ns - self._statuses[1].stamp_ns >= RATE_NS:
-            self._statuses.popleft()
-        stamp_ns, log = status.stamp_ns, self._logger.log_simulator
+        stamp_ns, log = status.stamp_ns, self._logger.log_values
         if status.phase == "running":
             times = ("step_median_ns", "step_p99_ns", "late_median_ns", "late_p99_ns")
             names = (name.removesuffix("_ns").replace("_", ", ") for name in times)
-            log("timing", stamp_ns, {n: 1e-6 * getattr(status, t) for n, t in zip(names, times, strict=True)})
-            log("real_time_factor", stamp_ns, {"real-time factor": status.real_time_factor})
+            milliseconds = {n: 1e-6 * getattr(status, t) for n, t in zip(names, times, strict=True)}
+            log("simulator/timing", stamp_ns, milliseconds)
+            log("simulator/real_time_factor", stamp_ns, {"real-time factor": status.real_time_factor})
         lost = self._lost()
         by_links = sum(sensor.injected_lost_count for sensor in status.sensors)
         losses = {
@@ -291,20 +286,9 @@ class LiveSession:
             "commands lost or refused": sum(v.lost_count + v.refused_count for v in status.vehicles),
             "lost on the way here": sum(lost.values()),
         }
-        log("losses", stamp_ns, losses)
-        text = describe_status(status, rates_hz=self._rates_hz(status), lost=lost)
+        log("simulator/losses", stamp_ns, losses)
+        text = describe_status(status, rates_hz=self._rates.update(status), lost=lost)
         self._logger.log_status(stamp_ns, text)
-
-    def _rates_hz(self, status: msg.SimulatorStatus) -> dict[tuple[str, str], float]:
-        """Return the messages a second of active sensors [Hz], by vehicle and sensor."""
-        before = self._statuses[0]
-        elapsed_s = (status.stamp_ns - before.stamp_ns) / 1e9
-        earlier = {(s.vehicle, s.name): s.published_count for s in before.sensors}
-        return {
-            (s.vehicle, s.name): max(s.published_count - earlier[s.vehicle, s.name], 0) / elapsed_s
-            for s in status.sensors
-            if s.active and elapsed_s > 0.0 and (s.vehicle, s.name) in earlier
-        }
 
     def _lost(self) -> Counter[tuple[str, str]]:
         """Return the messages that were published and not received, by vehicle and sensor."""

@@ -19,7 +19,6 @@ from neurosim_core.clock import to_ns
 from neurosim_core.config import SimulationConfig
 from neurosim_core.live.cameras import CameraThread
 from neurosim_core.live.commands import Command
-from neurosim_core.live.engine import Model, make_fleet, warm_flight, warm_up
 from neurosim_core.live.pacing import Pacer
 from neurosim_core.live.recorder import Recorder, open_folders
 from neurosim_core.live.services import Request, Services, Steps
@@ -27,6 +26,7 @@ from neurosim_core.live.status import RunStats, StatusPublisher, SubscriberMonit
 from neurosim_core.live.streaming import StreamingLoop
 from neurosim_core.live.vehicle import ResetState, VehicleCollisions, VehicleNode, make_reset
 from neurosim_core.packets import Packet
+from neurosim_core.sim import Model, make_fleet, warm_flight, warm_up
 from neurosim_core.trajectory import PosesConfig
 from neurosim_core.vehicle import DynamicsError
 
@@ -114,11 +114,18 @@ class Simulator:
             for vehicle in self.vehicles:
                 stack.callback(vehicle.close_loans)
             if config.live.mode == "streaming":
-                inline = self.vehicles[0].engine.is_cuda
+                inline = self.vehicles[0].is_cuda
                 self._cameras = CameraThread(inline=inline, on_packets=self._wakeup.set)
                 stack.callback(self._cameras.close)
                 self._streaming = StreamingLoop(
-                    self.vehicles, self._cameras, self._pacer, self._stats, wakeup=self._wakeup
+                    self.vehicles,
+                    self._cameras,
+                    self._pacer,
+                    self._stats,
+                    live=lambda: self.config.live,
+                    stop=lambda: self._stop.is_set(),
+                    requested=lambda: bool(self._services),
+                    wakeup=self._wakeup,
                 )
             self._subscribers = SubscriberMonitor(self.vehicles, self.status)
             self._begin(make_reset(self.vehicles, config, Reset()))
@@ -235,10 +242,9 @@ class Simulator:
             return
         begin_ns = time.monotonic_ns()
         end_ns = self._control.stamp_ns(self._tick + 1)
-        period_ns, live, stop = end_ns - self.stamp_ns, self.config.live, self._stop.is_set
         if not self._is_flown:
             try:
-                if not streaming.fly(self.stamp_ns, live, stop, period_ns=period_ns):
+                if not streaming.fly(self.stamp_ns, end_ns):
                     return
             except DynamicsError as error:
                 self._end_with(error)
@@ -246,13 +252,12 @@ class Simulator:
             self._collisions.check(self.vehicles)
             self._stats.step_times.add(time.monotonic_ns() - begin_ns)
             self._is_flown = True
-        requested = self._services.__bool__
-        if not streaming.publish_until(end_ns, period_ns, live, stop, requested=requested):
+        if not streaming.publish_until(self.stamp_ns, end_ns):
             return
         self._is_flown = False
         self._take_commands(end_ns)  # before this stamp is published: its answers count from the next tick on
         self._publish_end(end_ns)
-        streaming.yield_to_readers(end_ns, period_ns)
+        streaming.yield_to_readers(self.stamp_ns, end_ns)
         self._end_period(end_ns)
 
     def _receive_commands(self, *, every: int) -> bool:
@@ -296,11 +301,11 @@ class Simulator:
         live = self.config.live
         self.status.publish_clock(end_ns, live, sequence=self._tick - 1)
         if self._steps.is_last and self._streaming is not None:
-            self._streaming.catch_up(end_ns, self._stop.is_set)
+            self._streaming.catch_up(end_ns)
         self._steps.count()
-        collided = next((vehicle for vehicle in self.vehicles if vehicle.engine.state.ended), None)
+        collided = next((vehicle for vehicle in self.vehicles if vehicle.state.ended), None)
         if collided is not None:
-            self._end(f"{collided.name} collided at {collided.engine.state.stamp_ns / 1e9:.3f} s")
+            self._end(f"{collided.name} collided at {collided.state.stamp_ns / 1e9:.3f} s")
         elif not live.run_on and end_ns >= to_ns(self.config.duration_s):
             self._end(f"the {self.config.duration_s:g} s are over")
 
@@ -379,7 +384,7 @@ class Simulator:
             self._exit = 0
 
     def _end_with(self, error: DynamicsError) -> None:
-        name = next(v.name for v in self.vehicles if v.engine.state.failure is error)
+        name = next(v.name for v in self.vehicles if v.state.failure is error)
         self._end(f"the motion of {name} cannot be computed: {error}")
 
     def _flush(self) -> None:
@@ -393,7 +398,7 @@ class Simulator:
         for vehicle in self.vehicles:
             if at_rest:
                 vehicle.finish()
-            vehicle.publisher.publish_due(max(self.stamp_ns, vehicle.engine.state.stamp_ns))
+            vehicle.publisher.publish_due(max(self.stamp_ns, vehicle.state.stamp_ns))
 
     def _record(self, vehicle: str) -> Callable[[Packet], None] | None:
         return None if self._recorder is None else functools.partial(self._recorder.write, vehicle)
@@ -428,7 +433,7 @@ class Simulator:
     def _pause(self, *, paused: bool) -> None:
         """Stop time, or let it go on."""
         if paused and not self._is_ended and self._tick and self._streaming is not None:
-            self._streaming.catch_up(self.stamp_ns, self._stop.is_set)
+            self._streaming.catch_up(self.stamp_ns)
         self._steps.stop("paused" if paused else "resumed")
         if self._is_paused and not paused:
             self._resume()

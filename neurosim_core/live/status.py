@@ -14,7 +14,6 @@ from neurosim_core.live import topics
 from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.pacing import Timings
 from neurosim_core.live.vehicle import VehicleNode
-from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.command_ranges import command_ranges
 
 STATUS_INTERVAL_S = 0.2
@@ -53,7 +52,7 @@ class StatusPublisher:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
-                thrust_max_n=[_thrust_max_n(airframe) for airframe in airframes],
+                thrust_max_n=[airframe.thrust_max_n for airframe in airframes],
                 command_ranges=[CommandRanges(**dataclasses.asdict(each)) for each in ranges],
             )
         )
@@ -177,7 +176,9 @@ class RunStats:
         now_ns = time.monotonic_ns()
         factor = max(stamp_ns - self._stamp_ns, 0) / max(now_ns - self._wall_ns, 1)
         self._stamp_ns, self._wall_ns = stamp_ns, now_ns
-        steps, late = self.step_times.take(), self.late_times.take()
+        (step_median_ns, step_p99_ns), (late_median_ns, late_p99_ns) = (
+            times.take() for times in (self.step_times, self.late_times)
+        )
         self._sequence += 1
         streaming = config.live.mode == "streaming"
         lossy = [topic for vehicle in vehicles for topic in vehicle.publisher.take_lossy_topics()]
@@ -192,10 +193,10 @@ class RunStats:
             real_time_factor_wanted=config.live.real_time_factor if streaming else 0.0,
             real_time_factor=factor,
             step_count=self.step_count,
-            step_median_ns=steps.median_ns,
-            step_p99_ns=steps.p99_ns,
-            late_median_ns=late.median_ns,
-            late_p99_ns=late.p99_ns,
+            step_median_ns=step_median_ns,
+            step_p99_ns=step_p99_ns,
+            late_median_ns=late_median_ns,
+            late_p99_ns=late_p99_ns,
             overrun_count=self.overrun_count,
             slipped_ns=self.slipped_ns,
             sensors=[entry for vehicle in vehicles for entry in _sensors(vehicle, dropped)],
@@ -220,7 +221,7 @@ def _sensors(vehicle: VehicleNode, dropped: Mapping[tuple[str, str], int]) -> li
                 dropped_count=dropped.get((vehicle.name, name), 0) + lost,
                 injected_lost_count=lost,
                 undelivered_count=topic.undelivered_count,
-                late_p99_ns=topic.late_times.take().p99_ns,
+                late_p99_ns=topic.late_times.take()[1],
             )
         )
     return entries
@@ -238,14 +239,10 @@ def _vehicle(vehicle: VehicleNode, stamp_ns: int) -> VehicleStatus:
         command_age_ns=hold.age_ns(stamp_ns),
         fail_safe=hold.fail_safe is not None,
         fail_safe_count=hold.fail_safe_count,
-        collision_count=vehicle.engine.counts.collisions,
+        collision_count=vehicle.state.counts["collisions"],
         undelivered_count=vehicle.publisher.other_undelivered_count,
         refused_reason=vehicle.subscriber.refusal if counts.refused else "",
         clamped_count=counts.clamped,
         clamped_reason=vehicle.subscriber.clamping if counts.clamped else "",
         command_source="" if hold.command is None else vehicle.subscriber.senders(hold.command.mode),
     )
-
-
-def _thrust_max_n(airframe: MultirotorConfig) -> float:
-    return float(airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from neurosim_core.live.cameras import CameraThread
 from neurosim_core.live.config import LiveConfig
@@ -41,6 +42,9 @@ class StreamingLoop:
         pacer: Pacer,
         stats: RunStats,
         *,
+        live: Callable[[], LiveConfig],
+        stop: Callable[[], bool],
+        requested: Callable[[], bool],
         wakeup: threading.Event,
     ) -> None:
         """Connect the parts.
@@ -50,91 +54,75 @@ class StreamingLoop:
             cameras: Renders what they fly.
             pacer: Says when a stamp is due; sleeps on `wakeup`.
             stats: Counts overruns.
+            live: Returns what gives way when the machine or the cameras are late.
+            stop: Ends all waits.
+            requested: Whether a request waits.
             wakeup: Set when there are new packets or requests.
         """
-        self._vehicles = {vehicle.name: vehicle for vehicle in vehicles}
+        self._vehicles = vehicles
         for vehicle in vehicles:
             vehicle.publisher.lateness_ns = pacer.lateness_ns
         self._cameras = cameras
         self._pacer = pacer
         self._stats = stats
+        self._live = live
+        self._stop = stop
+        self._requested = requested
         self._wakeup = wakeup
 
-    def fly(self, stamp_ns: int, live: LiveConfig, stop: Callable[[], bool], *, period_ns: int) -> bool:
-        """Fly the control period that begins at a tick [ns], and queue its pictures.
-
-        Args:
-            stamp_ns: The tick.
-            live: Says what gives way when the cameras are late.
-            stop: Ends the wait for the cameras.
-            period_ns: Length of the period [ns].
+    def fly(self, stamp_ns: int, end_ns: int) -> bool:
+        """Fly the control period from one tick [ns] to the next, and queue its pictures.
 
         Returns:
-            Whether it was flown: not if `stop` ended the wait.
+            Whether it was flown: not if `stop` ended the wait for the cameras.
 
         Raises:
             DynamicsError: The integration failed.
             RuntimeError: The cameras failed.
         """
-        drop = live.overrun == "drop" and self._pacer.factor > 0.0
-        for vehicle in self._vehicles.values():
-            engine = vehicle.engine
+        drop = self._live().overrun == "drop" and self._pacer.factor > 0.0
+        for vehicle in self._vehicles:
             if drop:
-                self._cameras.drop_until(vehicle.name, stamp_ns - engine.period_count_max * period_ns)
-            if not self._cameras.wait_for(lambda e=engine: e.can_fly(drop=drop), stop):  # type: ignore[misc]
+                self._cameras.drop_until(vehicle, stamp_ns - vehicle.period_count_max * (end_ns - stamp_ns))
+            if not self._cameras.wait_for(partial(vehicle.can_fly, drop=drop), self._stop):
                 return False
             is_late = drop and self._pacer.lateness_ns(stamp_ns) > BEHIND_MAX_NS / 2
-            self._cameras.render(vehicle.name, engine, vehicle.fly(stamp_ns), is_late=is_late)
+            self._cameras.render(vehicle, vehicle.fly(stamp_ns), is_late=is_late)
         return True
 
-    def catch_up(self, stamp_ns: int, stop: Callable[[], bool]) -> None:
+    def catch_up(self, stamp_ns: int) -> None:
         """Wait for the cameras, and publish what arrives by a tick at which time stops [ns].
 
         Raises:
             RuntimeError: The cameras failed.
         """
-        self._cameras.finish(stop)
+        self._cameras.finish(self._stop)
         self.publish_rendered(stamp_ns)
 
     def publish_rendered(self, stamp_ns: int) -> None:
         """Publish what the cameras have rendered and what arrives by a tick at which time stands [ns]."""
         self.offer_rendered()
-        for vehicle in self._vehicles.values():
+        for vehicle in self._vehicles:
             vehicle.publisher.publish_due(stamp_ns)
 
-    def publish_until(
-        self,
-        end_ns: int,
-        period_ns: int,
-        live: LiveConfig,
-        stop: Callable[[], bool],
-        *,
-        requested: Callable[[], bool],
-    ) -> bool:
-        """Publish what arrives before the end of a control period, each packet when it is due.
-
-        Args:
-            end_ns: End of the period [ns].
-            period_ns: Its length [ns].
-            live: Says what gives way when the machine is late.
-            stop: Ends the wait.
-            requested: Whether a request waits; it waits on for an end that is near.
+    def publish_until(self, stamp_ns: int, end_ns: int) -> bool:
+        """Publish what arrives in the period from one tick [ns] to the next, each packet when it is due.
 
         Returns:
-            Whether the end was reached; if a request ended the wait, call this again to go on.
+            Whether the end was reached. A request ends the wait unless the end is near: call it again then.
         """
 
         def leave() -> bool:
-            return stop() or (requested() and self._pacer.lateness_ns(end_ns) < -ANSWER_NS)
+            return self._stop() or (self._requested() and self._pacer.lateness_ns(end_ns) < -ANSWER_NS)
 
         def interrupted() -> bool:
             self._wakeup.clear()  # before the reasons for which it is set are checked
             return leave() or self._cameras.has_packets
 
-        self._handle_overrun(end_ns, period_ns, live)
+        self._handle_overrun(stamp_ns, end_ns)
         while not leave():
             self.offer_rendered()
-            dues = (vehicle.publisher.next_due_ns for vehicle in self._vehicles.values())
+            dues = (vehicle.publisher.next_due_ns for vehicle in self._vehicles)
             due_ns = min([end_ns, *(due for due in dues if due is not None)])
             late_ns = self._pacer.wait_until(due_ns, interrupted)
             if late_ns < 0:
@@ -142,12 +130,12 @@ class StreamingLoop:
             if due_ns == end_ns:
                 self._stats.late_times.add(late_ns)
                 return True
-            for vehicle in self._vehicles.values():
+            for vehicle in self._vehicles:
                 vehicle.publisher.publish_due(due_ns)
         return False
 
-    def yield_to_readers(self, end_ns: int, period_ns: int) -> None:
-        """Sleep for a moment, if there is time, after the packets of the end of a period [ns] were published.
+    def yield_to_readers(self, stamp_ns: int, end_ns: int) -> None:
+        """Sleep for a moment, if there is time, after what arrives at the end of a period was published.
 
         A scheduler may wake a reader on the core of its publisher even if another core is idle; without the
         sleep it waits there until the next period has been flown.
@@ -155,7 +143,7 @@ class StreamingLoop:
         factor = self._pacer.factor
         if not factor:
             return
-        wall_ns = period_ns / factor
+        wall_ns = (end_ns - stamp_ns) / factor
         least_s, most_s = READERS_S
         sleep_s = min(READERS_SHARE * wall_ns * 1e-9, most_s)
         if sleep_s >= least_s and self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
@@ -163,15 +151,15 @@ class StreamingLoop:
 
     def offer_rendered(self) -> None:
         """Send what the cameras have rendered."""
-        for name, packets in self._cameras.take():
-            self._vehicles[name].publisher.offer(packets)
+        for vehicle, packets in self._cameras.take():
+            vehicle.publisher.offer(packets)
 
-    def _handle_overrun(self, end_ns: int, period_ns: int, live: LiveConfig) -> None:
+    def _handle_overrun(self, stamp_ns: int, end_ns: int) -> None:
         """Delay time if a period was computed after its end [ns] and that cannot be caught up."""
         late_ns = self._pacer.lateness_ns(end_ns)
         if late_ns <= 0:
             return
         self._stats.overrun_count += 1
-        had_ns = period_ns / self._pacer.factor
-        if late_ns > (max(had_ns, HICCUP_NS) if live.overrun == "slow" else BEHIND_MAX_NS):
+        had_ns = (end_ns - stamp_ns) / self._pacer.factor
+        if late_ns > (max(had_ns, HICCUP_NS) if self._live().overrun == "slow" else BEHIND_MAX_NS):
             self._stats.slipped_ns += self._pacer.slip(end_ns)

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import selectors
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 from rich.console import Console
 from rich.text import Text
 
-from neurosim_core.signals import INTERRUPTED_LINE
+from neurosim_core.signals import INTERRUPTED_LINE, end_with_parent
 
 GRACE_S = 1.5
 """How long a process may take to end after SIGINT before it is killed [s]."""
 INTERRUPTED = 130
 _LOOK_S = 0.05
 _LAST_READS = 64
-_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of `prctl`
-_LIBC = ctypes.CDLL(None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +86,7 @@ class _Child:
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
-            preexec_fn=partial(_end_with_parent, os.getpid()) if sys.platform == "linux" else None,
+            preexec_fn=end_with_parent(signal.SIGINT),
         )
         assert self._process.stdout is not None
         self.output = self._process.stdout
@@ -135,13 +130,6 @@ class _Child:
     def _kill_session(self) -> None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
-
-
-def _end_with_parent(parent: int) -> None:
-    """Have the kernel send SIGINT to this process when its parent dies."""
-    _LIBC.prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGINT)
-    if os.getppid() != parent:  # it has died meanwhile
-        os._exit(INTERRUPTED)
 
 
 def _attend(

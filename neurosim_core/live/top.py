@@ -12,8 +12,7 @@ from rich.text import Text
 
 from cortex import Node, latest
 from cortex.messages import SimulatorStatus
-from neurosim_core.clock import NS_PER_S
-from neurosim_core.live.call import describe_status, no_simulator
+from neurosim_core.live.call import SensorRates, describe_status, no_simulator
 from neurosim_core.live.topics import STATUS
 
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -26,34 +25,17 @@ class Dashboard:
     """What `top` shows, from one status to the next."""
 
     def __init__(self) -> None:
-        self._before: SimulatorStatus | None = None
         self._factors: deque[float] = deque(maxlen=_HISTORY)
-        self._rates_hz: dict[tuple[str, str], float] = {}
+        self._rates = SensorRates()
 
     def update(self, status: SimulatorStatus) -> Group:
-        """Return the screen after a status.
-
-        Rates are messages a second of simulated time, between two statuses between which time passed.
-        """
-        before = self._before
-        if before is not None and status.stamp_ns < before.stamp_ns:  # a run that has begun again
-            self._rates_hz, before = {}, None
-        if before is None or status.stamp_ns > before.stamp_ns:
-            if before is not None:
-                passed_s = (status.stamp_ns - before.stamp_ns) / NS_PER_S
-                counts = {(sensor.vehicle, sensor.name): sensor.published_count for sensor in before.sensors}
-                self._rates_hz = {
-                    key: (sensor.published_count - counts[key]) / passed_s
-                    for sensor in status.sensors
-                    if (key := (sensor.vehicle, sensor.name)) in counts
-                }
-            self._before = status
+        """Return the screen after a status."""
         self._factors.append(status.real_time_factor)
         most = max(1.0, status.real_time_factor_wanted, *self._factors)
         bars = "".join(_BARS[round(factor / most * (len(_BARS) - 1))] for factor in self._factors)
         return Group(
             Text.assemble(("real-time factor ", "dim"), (bars, "green"), f" {status.real_time_factor:.2f}"),
-            Markdown(describe_status(status, rates_hz=self._rates_hz)),
+            Markdown(describe_status(status, rates_hz=self._rates.update(status))),
         )
 
 

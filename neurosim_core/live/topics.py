@@ -56,9 +56,9 @@ SERVICES: dict[str, tuple[type[Any], type[Any]]] = {
     "/resume": (Trigger, SimulatorReply),
     "/set_parameters": (Parameters, SimulatorReply),
 }
+"""Request and reply of each service."""
 STEP_DEADLINE_S = 60.0
 """Longest wait of a request for steps, which may need the commands of a controller [s]."""
-"""Request and reply of each service."""
 
 
 def stream_topic(vehicle: str, name: str) -> str:

@@ -41,7 +41,7 @@ _WITHOUT_WINDOW = "`neurosim view --web` serves a page, `neurosim view --save FI
 
 def view(
     *,
-    how: str,
+    web: bool = False,
     save: Path | None = None,
     only: Sequence[str] | None = None,
     event_window_s: float = 0.02,
@@ -52,8 +52,8 @@ def view(
     """Show what a simulator publishes, until interrupted; wait for it, and for the next one when it is gone.
 
     Args:
-        how: native (a window), web (a page for the browsers of this machine) or save (files).
-        save: File to write, with "save", which must not exist yet; after a reset NAME-2.rrd, ...
+        web: Serve a page for the browsers of this machine instead of opening a window.
+        save: File to write instead, which must not exist yet; after a reset NAME-2.rrd, ...
         only: Sensors to show; None: all.
         event_window_s: Time in one picture of events [s].
         image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
@@ -70,10 +70,6 @@ def view(
         ViewerEnded: The viewer failed.
         ImportError: Rerun is not installed.
     """
-    if how not in ("native", "web", "save"):
-        raise ValueError(f"unknown way to view {how!r}, known: native, web, save")
-    if (how == "save") != (save is not None):
-        raise ValueError(f"a file to save to goes with how='save', got {how!r} and {save}")
     if save is not None:
         check_new_file(save)
     if only is not None and not all(name.strip() for name in only):
@@ -84,7 +80,7 @@ def view(
         raise ValueError(f"the image rate must be > 0 and <= 1000 Hz, got {image_rate_hz}")
     if not 0 <= port <= 65535:
         raise ValueError(f"a port is 0 to 65535, got {port}")
-    if how == "native" and not has_display():
+    if save is None and not web and not has_display():
         raise ValueError(f"there is no display to open a window on: {_WITHOUT_WINDOW}")
     import_rerun()
     console = Console(highlight=False, soft_wrap=True)
@@ -99,10 +95,10 @@ def view(
         if save is not None:
             outlet = FileTarget(save, say)
         else:
-            viewer = stack.enter_context(RerunViewer(web=how == "web", waiting=lambda: not stop.is_set()))
+            viewer = stack.enter_context(RerunViewer(web=web, waiting=lambda: not stop.is_set()))
             outlet = ViewerTarget(viewer)
         node = stack.enter_context(Node("viewer"))
-        if how == "web":
+        if web:
             page = stack.enter_context(ControlPage(node, viewer.page_url, port=port))
             say(f"open {page.url}")
             if open_browser and has_display():
@@ -110,7 +106,7 @@ def view(
         try:
             status = watch(node, outlet, options, stop=stop, say=say, to_the_end=save is not None)
         except ViewerEnded as error:
-            if how == "web":
+            if web:
                 raise
             raise ViewerEnded(f"{error}\n{_WITHOUT_WINDOW}") from None
     return status

@@ -6,9 +6,9 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block: its threads list and prepare the faces together, each tests half of the points of
-   a pixel, and then each shades a surface that some pixel shows. Pixels that have to be rendered by rays are
-   listed.
+2. A warp is a listed block in two instants, which see nearly the same (of a single instant: two blocks side
+   by side); a thread is a pixel. The threads prepare the faces, look at the edges that cross pixels and shade
+   the surfaces together. Blocks with many faces are taken one by one. Pixels that need rays are listed.
 3. A thread is a ray of such a pixel.
 """
 
@@ -21,6 +21,7 @@ import warp as wp
 from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
+    APART,
     FACE_COUNT_MAX,
     RAY_COUNT,
     RAY_WIDTH,
@@ -41,21 +42,26 @@ _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
 _INSTANTS = wp.constant(4)
 """Instants of a pixel in a block that shows one surface, of a thread."""
-_COVER_BOUNDS = (64, 16)
+_FAST = {"fast_math": True}
+"""Quotients, roots and logarithms are off by a few units in the last place."""
+_COVER_BOUNDS = (64, 10)
 """Threads of a block, and blocks of a multiprocessor."""
+_ROOM = 36
+"""Faces of a block for which a warp has room in each of two instants."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
-MetPair = wp.types.vector(length=14, dtype=float)
+MetPair = wp.types.vector(length=9, dtype=float)
 
 
 @wp.struct
 class BlockLists:
     """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
 
-    uneven: wp.array[int]
-    """Those that show several surfaces."""
+    uneven: wp.array[wp.vec3i]
+    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
+    its blocks; the first instant; a bit for each of the two. Of a single instant: one of two side by side."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
@@ -75,7 +81,7 @@ class GroupKernels(NamedTuple):
 def make_lists(block_count: int, device: Any) -> BlockLists:
     """Return empty lists for at most so many blocks."""
     lists = BlockLists()
-    lists.uneven = wp.zeros(block_count, dtype=int, device=device)
+    lists.uneven = wp.zeros(block_count, dtype=wp.vec3i, device=device)
     lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
     lists.count = wp.zeros(3, dtype=int, device=device)
     lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
@@ -101,7 +107,7 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
 def _cover_block(
     scene: SceneData,
     faces: wp.array3d[int],
@@ -110,6 +116,7 @@ def _cover_block(
     left: int,
     height: int,
     width: int,
+    alone: wp.bool,
     outside: wp.bool,
     origin: wp.vec3,
     center: wp.vec3,
@@ -120,30 +127,32 @@ def _cover_block(
     ...
 
 
-@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
 def _meet_pair(
     scene: SceneData,
     place: int,
+    alone: wp.bool,
     pair: int,
-    faces: wp.array3d[int],
-    instant: int,
-    top: int,
-    left: int,
-    origin: wp.vec3,
+    own_part: int,
+    spread_rad: float,
+    position: wp.vec3,
+    center: wp.vec3,
+    across: wp.vec3,
+    down: wp.vec3,
 ) -> MetPair:
     """Return what a pixel sees of a surface; see the file."""
     ...
 
 
-@wp.func_native(read_native(__file__, "store_pair", MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
 def _store_pair(place: int, pair: int, light: wp.vec3):
     """Keep the light of a pair."""
     ...
 
 
-@wp.func_native(read_native(__file__, "sum_pairs", MOST=FACE_COUNT_MAX))
-def _sum_pairs(place: int, first: int, count: int, step: int) -> wp.vec3:
-    """Return the light of those of consecutive pairs that are among the 32 of a step."""
+@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
+def _sum_pairs(place: int, first: int, count: int, step: int, total: wp.vec3) -> wp.vec3:
+    """Return `total` and the light of those of consecutive pairs that are among the 32 of a step."""
     ...
 
 
@@ -217,15 +226,54 @@ def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Fu
     return locate_pixel
 
 
+def _part_shader(terms: RenderTerms) -> wp.Function:
+    """Return the Warp function that finds the light of a face where a direction meets its plane.
+
+    Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked
+    light and filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
+    """
+    if terms.baked and not terms.finest_level:
+        code = read_native(
+            __file__,
+            "shade_part",
+            TEXTURED=terms.textured,
+            EMISSIVE=terms.emissive,
+            UNIT=True,
+            LIGHT_WITHIN=True,
+            APART=round(100 * APART),
+        )
+
+        @wp.func_native(code)
+        def shade_part(
+            scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3, width_rad: float
+        ) -> wp.vec3: ...
+
+        return shade_part
+    shade = surface_shader(terms, beyond=True)
+
+    @wp.func
+    def shade_met(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3, width_rad: float) -> wp.vec3:
+        met = _meet_part(scene, part, origin, toward)
+        hit = Hit()
+        hit.face = part
+        hit.t = met[0]
+        hit.u = met[1]
+        hit.v = met[2]
+        hit.normal = wp.vec3(met[3], met[4], met[5])
+        return shade(scene, wp.normalize(toward), origin, width_rad, hit, wp.vec2(met[6], met[7]))
+
+    return shade_met
+
+
 def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     """Return the kernels; see `antialias.antialiasing_kernel`."""
     requested = requested_outputs(outputs)
     locate_pixel = _pixel_locator(terms, images=requested.images, instants=requested.log)
     radiance_of = pixel_shader(terms)
-    shade = surface_shader(terms, beyond=True)
+    shade_part = _part_shader(terms)
     write_radiance = radiance_writer(outputs, supersampled=False)
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=PIXEL_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=PIXEL_BOUNDS)
     def shade_even_blocks(
         first: int,
         # In:
@@ -245,46 +293,58 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         group_count = (view.instant_count + _INSTANTS - 1) // _INSTANTS
         tile = group // group_count
         begin = group % group_count * _INSTANTS
-        for instant in range(begin, wp.min(begin + _INSTANTS, view.instant_count)):
-            at = locate_pixel(tile, instant, quarter, lane, view, worlds)
+        end = wp.min(begin + _INSTANTS, view.instant_count)
+        at = locate_pixel(tile, begin, quarter, lane, view, worlds)
+        if wp.static(terms.world_scenes):
+            scene = worlds.scenes[worlds.scene[at.world]]
+        in_picture = at.left < view.width and at.top < view.height
+        first_instant = at.instant - begin
+        uneven = int(0)
+        for instant in range(begin, end):
+            if wp.static(requested.images):
+                at = locate_pixel(tile, instant, quarter, lane, view, worlds)
+            at.instant = first_instant + instant
             if not at.rendered:
                 continue
-            if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[at.world]]
             kind = _classify_block(scene, out.face, at.instant, at.top, at.left, view.height, view.width)
-            if at.left >= view.width or at.top >= view.height:
-                continue
-            block = 4 * (tile * view.instant_count + instant) + quarter
-            if lane == 0 and kind == _SEVERAL:
-                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = block
-            if lane == 0 and kind == _BODY:
+            if lane == 0 and in_picture and kind == _BODY:
                 columns = (1 << wp.min(view.width - at.left, 4)) - 1
                 pixels = int(0)
                 for row in range(wp.min(view.height - at.top, 4)):
                     pixels = pixels | (columns << (4 * row))
-                lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, pixels)
+                lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(
+                    4 * (tile * view.instant_count + instant) + quarter, pixels
+                )
+            if kind == _SEVERAL and in_picture:
+                uneven = uneven | (1 << (instant - begin))
             even = kind != _SEVERAL and kind != _BODY
             if at.outside or not even:
                 continue
             radiance = scene.sky
             if kind != _SKY:
-                origin = view.p_WC[at.instant]
-                q = view.q_WC[at.instant]
                 ray_C = rays[0, at.ray]
-                toward = wp.quat_rotate(q, _xyz(ray_C))
-                part = out.face[at.instant, at.row, at.col]
-                met = _meet_part(scene, part, origin, toward)
-                hit = Hit()
-                hit.face = part
-                hit.t = met[0]
-                hit.u = met[1]
-                hit.v = met[2]
-                hit.normal = wp.vec3(met[3], met[4], met[5])
-                slope = wp.vec2(met[6], met[7])
-                radiance = shade(scene, wp.normalize(toward), origin, SHARPNESS * ray_C[3], hit, slope)
+                toward = wp.quat_rotate(view.q_WC[at.instant], _xyz(ray_C))
+                radiance = shade_part(
+                    scene,
+                    out.face[at.instant, at.row, at.col],
+                    view.p_WC[at.instant],
+                    toward,
+                    SHARPNESS * ray_C[3],
+                )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
+        if view.instant_count == 1:
+            votes = _warp_votes(uneven != 0)
+            bits = (votes & 1) | ((votes >> 15) & 2)
+            if bits != 0 and (first + wp.tid()) % 32 == 0:
+                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(4 * tile + quarter, 0, bits)
+        else:
+            for pair in range(_INSTANTS // 2):
+                bits = (uneven >> (2 * pair)) & 3
+                if lane == 0 and bits != 0:
+                    uneven_block = wp.vec3i(4 * tile + quarter, begin + 2 * pair, bits)
+                    lists.uneven[wp.atomic_add(lists.count, 0, 1)] = uneven_block
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_COVER_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
         first: int,
         # In:
@@ -300,22 +360,28 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         # The threads of a warp reach the functions that they call together.
         lane = (first + wp.tid()) % 32
         entry = _next_entry(lists.count, 2)
+        waiting = int(0)  # bits of the instants of an entry that are taken one by one
         while entry < lists.count[0]:
-            block = lists.uneven[entry]
-            at = locate_pixel(
-                block // 4 // view.instant_count,
-                block // 4 % view.instant_count,
-                block % 4,
-                lane % 16,
-                view,
-                worlds,
-            )
+            listed = lists.uneven[entry]
+            bits = wp.where(waiting != 0, waiting & -waiting, listed[2])
+            alone = bits != 3
+            second = wp.where(alone, bits // 2, lane // 16)
+            several = view.instant_count > 1
+            instant = listed[1] + wp.where(several, second, 0)
+            quarter = listed[0] % 4 + wp.where(several, 0, second)
+            at = locate_pixel(listed[0] // 4, instant, quarter, lane % 16, view, worlds)
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
-            corner = at.ray - (lane % 16 // 4) * view.width - lane % 4
-            pixel = wp.where(at.outside, corner, at.ray)
+            unwanted = at.outside or (alone and lane >= 16)
+            pixel = wp.where(at.outside, at.ray - (at.row - at.top) * view.width - at.col + at.left, at.ray)
+            part = int(-1)
+            if not at.outside:
+                part = out.face[at.instant, at.row, at.col]
             origin = view.p_WC[at.instant]
             q = view.q_WC[at.instant]
+            center = wp.quat_rotate(q, _xyz(rays[0, pixel]))
+            across = wp.quat_rotate(q, _xyz(rays[1, pixel]))
+            down = wp.quat_rotate(q, _xyz(rays[2, pixel]))
             covered = _cover_block(
                 scene,
                 out.face,
@@ -324,43 +390,55 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 at.left,
                 view.height,
                 view.width,
-                at.outside,
+                alone,
+                unwanted,
                 origin,
-                wp.quat_rotate(q, _xyz(rays[0, pixel])),
-                wp.quat_rotate(q, _xyz(rays[1, pixel])),
-                wp.quat_rotate(q, _xyz(rays[2, pixel])),
+                center,
+                across,
+                down,
             )
+            if covered[0] < 0:
+                waiting = int(3)
+                continue
             total = wp.vec3(0.0)
             for step in range((covered[0] + 31) // 32):
                 pair = 32 * step + lane
+                met = _meet_pair(
+                    scene,
+                    covered[5],
+                    alone,
+                    wp.min(pair, covered[0] - 1),
+                    part,
+                    rays[0, pixel][3],
+                    origin,
+                    center,
+                    across,
+                    down,
+                )
                 if pair < covered[0]:
-                    met = _meet_pair(scene, covered[5], pair, out.face, at.instant, at.top, at.left, origin)
-                    owner = int(met[0])
-                    spread_rad = rays[0, corner + owner // 4 * view.width + owner % 4][3]
-                    toward = wp.vec3(met[3], met[4], met[5])
-                    hit = Hit()
-                    hit.face = wp.cast(met[2], int)
-                    hit.t = met[6]
-                    hit.u = met[7]
-                    hit.v = met[8]
-                    hit.normal = wp.vec3(met[9], met[10], met[11])
-                    width_rad = footprint_width(met[1]) * spread_rad
-                    slope = wp.vec2(met[12], met[13])
-                    light = shade(scene, wp.normalize(toward), origin, width_rad, hit, slope)
-                    _store_pair(covered[5], pair, met[1] * light)
-                total += _sum_pairs(covered[5], covered[1], covered[2], step)
+                    light = shade_part(
+                        scene,
+                        wp.cast(met[2], int),
+                        wp.vec3(met[6], met[7], met[8]),
+                        wp.vec3(met[3], met[4], met[5]),
+                        footprint_width(met[0]) * met[1],
+                    )
+                    _store_pair(covered[5], pair, met[0] * light)
+                total = _sum_pairs(covered[5], covered[1], covered[2], step, total)
             whole = float(SAMPLE_COUNT)
             if covered[4] != 0:
                 total += float(covered[3]) * scene.sky
             else:
                 whole -= float(covered[3])
-            written = lane < 16 and not at.outside
-            if written and covered[3] >= 0:
+            if not unwanted and covered[3] >= 0:
                 write_radiance(scene, total / whole, 1, at.instant, at.slot, at.row, at.col, out)
-            unresolved = _warp_votes(written and covered[3] < 0)
-            if unresolved != 0 and lane == 0:
+            unresolved = _warp_votes(not unwanted and covered[3] < 0) >> (lane // 16 * 16) & 0xFFFF
+            if unresolved != 0 and lane % 16 == 0:
+                block = 4 * (listed[0] // 4 * view.instant_count + instant) + quarter
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
-            entry = _next_entry(lists.count, 2)
+            waiting = waiting & ~bits
+            if waiting == 0:
+                entry = _next_entry(lists.count, 2)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
     def cast_unresolved_pixels(

@@ -223,11 +223,6 @@ def _look_up(lens: LensData, p: wp.vec3d) -> wp.vec3d:
     begin = lens.guess[wp.clamp(down, 0, _GUESSES - 1), wp.clamp(across, 0, _GUESSES - 1)]
     u = wp.float64(begin[0])
     v = wp.float64(begin[1])
-    e1 = wp.vec3d(-d[2], wp.float64(0.0), d[0])
-    if wp.abs(d[1]) > wp.float64(0.9):
-        e1 = wp.vec3d(wp.float64(0.0), d[2], -d[1])
-    e1 = wp.normalize(e1)
-    e2 = wp.cross(d, e1)
     width = lens.table.shape[1]
     height = lens.table.shape[0]
     half = wp.float64(0.5)
@@ -244,19 +239,11 @@ def _look_up(lens: LensData, p: wp.vec3d) -> wp.vec3d:
         ray = a + x * right + y * below + (x * y) * bent
         du = right + y * bent
         dv = below + x * bent
-        # the ray is along d where it has no part along e1 and e2
-        f1 = wp.dot(ray, e1)
-        f2 = wp.dot(ray, e2)
-        j11 = wp.dot(du, e1)
-        j12 = wp.dot(dv, e1)
-        j21 = wp.dot(du, e2)
-        j22 = wp.dot(dv, e2)
-        det = j11 * j22 - j12 * j21
-        step_u = (j22 * f1 - j12 * f2) / det
-        step_v = (j11 * f2 - j21 * f1) / det
-        u = wp.clamp(u - step_u, -one, wp.float64(width) + one)
-        v = wp.clamp(v - step_v, -one, wp.float64(height) + one)
-        if wp.abs(step_u) + wp.abs(step_v) < wp.float64(1.0e-9):
+        # where ray + a du + b dv is along d
+        step = wp.inverse(wp.matrix_from_cols(du, dv, d)) * ray
+        u = wp.clamp(u - step[0], -one, wp.float64(width) + one)
+        v = wp.clamp(v - step[1], -one, wp.float64(height) + one)
+        if wp.abs(step[0]) + wp.abs(step[1]) < wp.float64(1.0e-9):
             if wp.dot(ray, d) > wp.float64(0.0):
                 return wp.vec3d(u, v, one)
             return wp.vec3d()

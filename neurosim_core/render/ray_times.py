@@ -9,6 +9,7 @@ controller that has the picture sees nothing of the future.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -48,6 +49,23 @@ class RayTiming(Protocol):
             lens: For its size.
             sample_count: Rays per pixel that the settings ask for.
         """
+
+
+@dataclass(frozen=True)
+class SweepTiming:
+    """When the rays of a scan are cast, the last at the stamp; those of a camera all at the first time."""
+
+    window_ns: int
+    """From the first ray to the stamp [ns]."""
+
+    def times(self, lens: Lens, sample_count: int) -> RayTimes:
+        """Return the times of the rays: one ray each, whatever the settings ask for."""
+        fractions = lens.fractions() if hasattr(lens, "fractions") else np.zeros((lens.height, lens.width))
+        steps = np.rint((fractions - 1.0) * self.window_ns).astype(np.int64).ravel()
+        offsets_ns, instant = np.unique(steps, return_inverse=True)
+        if len(offsets_ns) > INSTANT_COUNT_MAX:
+            raise ValueError(f"a sweep has at most {INSTANT_COUNT_MAX} times, got {len(offsets_ns)}")
+        return RayTimes(offsets_ns, np.ascontiguousarray(instant.reshape(1, -1), dtype=np.int32), 1)
 
 
 class ShutterConfig(Settings):

@@ -191,8 +191,6 @@ class FreeSpace:
     """Lowest and highest corner of the scene [m], shape [2, 3]; beyond them nothing is free."""
     seed_m: Array
     """A point in the free space that is meant [m], shape [3]."""
-    seed_rule: str
-    """How the seed was found, one sentence."""
     closed: bool
     """Outside there is nothing to fly in (`Scene.closed`), and no `seed_m` of the configuration says else."""
     notes: tuple[str, ...]
@@ -367,7 +365,6 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
         voxel_m=voxel,
         bounds_m=bounds,
         seed_m=bounds.mean(axis=0),
-        seed_rule="",
         closed=scene.closed and config.seed_m is None,
         notes=(),
         arrays=arrays,
@@ -390,7 +387,6 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     return dataclasses.replace(
         unseeded,
         seed_m=seed.point,
-        seed_rule=seed.rule,
         notes=(*notes, f"Free space is what can be reached from {place}: {seed.rule}."),
     )
 

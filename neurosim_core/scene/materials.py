@@ -1,4 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,return-value,assignment,operator"
+# mypy: disable-error-code="no-any-return"
 """Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled.
 
 A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the
@@ -14,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -25,8 +27,8 @@ wp.set_module_options({"enable_backward": False})
 
 _LEVELS_RG = 2047
 _LEVELS_B = 1023
-_SCALE_RG = wp.constant(1.0 / _LEVELS_RG)
-_SCALE_B = wp.constant(1.0 / _LEVELS_B)
+_TEXEL_UNIT = wp.constant(wp.vec3(1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_B**2))
+"""Linear light of a texel whose roots are coded by 1."""
 _CODE = np.arange(256) / 255.0
 _LINEAR = np.where(_CODE <= 0.04045, _CODE / 12.92, ((_CODE + 0.055) / 1.055) ** 2.4).astype(np.float32)
 """Linear light of each 8-bit sRGB code. Reference: IEC 61966-2-1."""
@@ -37,11 +39,11 @@ def srgb_to_linear(srgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return _LINEAR[srgb]
 
 
-def linear_to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return linear light as 8-bit sRGB (IEC 61966-2-1); what is above 1 is white."""
-    light = np.clip(linear, 0.0, 1.0)
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return np.asarray(np.rint(255.0 * code), dtype=np.uint8)
+def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
+    """Encode linear light in [0, 1] as 8-bit sRGB, rounded. Reference: IEC 61966-2-1."""
+    value = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
+    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
+    return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
 def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
@@ -151,16 +153,17 @@ def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArra
 
 
 @wp.func
-def decode_texel(code: wp.uint32) -> wp.vec3:
-    """Return the linear light of a packed texel."""
-    red = float(int(code & wp.uint32(2047))) * _SCALE_RG
-    green = float(int((code >> wp.uint32(11)) & wp.uint32(2047))) * _SCALE_RG
-    blue = float(int(code >> wp.uint32(22))) * _SCALE_B
+def _decode_texel(code: wp.uint32) -> wp.vec3:
+    """Return the linear light of a packed texel in `_TEXEL_UNIT`, which is a whole number."""
+    red = float(int(code & wp.uint32(2047)))
+    green = float(int((code >> wp.uint32(11)) & wp.uint32(2047)))
+    blue = float(int(code >> wp.uint32(22)))
     return wp.vec3(red * red, green * green, blue * blue)
 
 
 @wp.func
 def _sample_level(texels: wp.array[wp.uint32], level: wp.vec3i, u: float, v: float) -> wp.vec3:
+    """Return the linear light in `_TEXEL_UNIT`."""
     width = level[1]
     height = level[2]
     x = u * float(width) - 0.5
@@ -177,8 +180,8 @@ def _sample_level(texels: wp.array[wp.uint32], level: wp.vec3i, u: float, v: flo
     top = wp.where(top < 0, height - 1, top)
     upper = level[0] + top * width
     lower = level[0] + bottom * width
-    above = wp.lerp(decode_texel(texels[upper + left]), decode_texel(texels[upper + right]), blend_x)
-    below = wp.lerp(decode_texel(texels[lower + left]), decode_texel(texels[lower + right]), blend_x)
+    above = wp.lerp(_decode_texel(texels[upper + left]), _decode_texel(texels[upper + right]), blend_x)
+    below = wp.lerp(_decode_texel(texels[lower + left]), _decode_texel(texels[lower + right]), blend_x)
     return wp.lerp(above, below, blend_y)
 
 
@@ -192,7 +195,7 @@ def sample_finest(
     """
     u = uv[0] - wp.floor(uv[0])
     v = 1.0 - (uv[1] - wp.floor(uv[1]))
-    return _sample_level(texels, levels[texture[0]], u, v)
+    return wp.cw_mul(_TEXEL_UNIT, _sample_level(texels, levels[texture[0]], u, v))
 
 
 @wp.func
@@ -208,7 +211,7 @@ def sample_nearest(
     v = 1.0 - (uv[1] - wp.floor(uv[1]))
     col = wp.min(int(u * float(level[1])), level[1] - 1)
     row = wp.min(int(v * float(level[2])), level[2] - 1)
-    return decode_texel(texels[level[0] + row * level[1] + col])
+    return wp.cw_mul(_TEXEL_UNIT, _decode_texel(texels[level[0] + row * level[1] + col]))
 
 
 @wp.func
@@ -236,4 +239,4 @@ def sample_texture(
     color = _sample_level(texels, levels[texture[0] + finer], u, v)
     if blend > 0.0:
         color = wp.lerp(color, _sample_level(texels, levels[texture[0] + finer + 1], u, v), blend)
-    return color
+    return wp.cw_mul(_TEXEL_UNIT, color)

@@ -15,6 +15,7 @@ from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import hang_lamps, scaled_lights
+from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture
 from neurosim_core.scene.source import (
@@ -22,7 +23,6 @@ from neurosim_core.scene.source import (
     Part,
     SceneError,
     Source,
-    linear_to_srgb8,
     rgb,
 )
 

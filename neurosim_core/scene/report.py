@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import re
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,159 +30,66 @@ CLEARANCE_M = 0.3
 
 _SIZE = (1600, 900)
 _VIEW = (1010, 900)
-_PLAN = (550, 520)
+_PLAN = (550, 760)
 _INK, _FAINT, _PAPER = (29, 37, 48), (107, 118, 130), (255, 255, 255)
 _FREE = np.array([34.0, 160.0, 110.0])
 
 
-@dataclass(frozen=True, kw_only=True)
-class FreeSpaceReport:
-    """The room that there is to fly in."""
+def figures(scene: Scene, space: FreeSpace | None = None) -> dict[str, str]:
+    """Return the figures of a scene as text by their names, and those of its free space if that is given.
 
-    volume_m3: float
-    """What can be reached at `CLEARANCE_M` [m^3], to the voxel."""
-    floor_m2: float
-    """Its extent seen from above [m^2]."""
-    widest_m: float
-    """Largest distance to any surface in it [m]."""
-    height_m: float
-    """The height at which most of it lies: a good one to fly at [m]."""
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneReport:
-    """The figures of a scene."""
-
-    name: str
-    bounds_m: tuple[tuple[float, float, float], tuple[float, float, float]]
-    """Lowest and highest corner [m]."""
-    triangle_count: int
-    vertex_count: int
-    area_m2: float
-    """Of all triangles, one side each [m^2]."""
-    edge_median_m: float
-    """Median length of the triangles' longest edges [m]."""
-    instance_count: int
-    material_count: int
-    emissive_count: int
-    """Materials that glow."""
-    texture_count: int
-    """Distinct textures."""
-    texel_count: int
-    """Texels of all distinct textures."""
-    untextured_share: float
-    """Share of the area that has no texture, in [0, 1]."""
-    light_count: int
-    notes: tuple[str, ...]
-    """What was assumed, dropped or repaired."""
-    free_space: FreeSpaceReport | None = None
-
-    @property
-    def size_m(self) -> tuple[float, float, float]:
-        """Extent along x, y, z [m]."""
-        low, high = self.bounds_m
-        return high[0] - low[0], high[1] - low[1], high[2] - low[2]
-
-
-def describe(scene: Scene, free_space: FreeSpace | None = None) -> SceneReport:
-    """Count and measure what is in a scene, and in its free space if that is given."""
+    The area is that of all triangles, one side each, the median edge that of their longest edges. Free space
+    is what can be reached at `CLEARANCE_M`, to the voxel, and its area is seen from above.
+    """
     triangles = scene.vertices[scene.faces].astype(np.float64)
     edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = 0.5 * np.linalg.norm(cross, axis=1)
     plain = np.array([material.texture is None for material in scene.materials])[scene.face_material]
-    textures = {id(m.texture): m.texture for m in scene.materials if m.texture is not None}
-    low, high = scene.bounds_m.tolist()
-    return SceneReport(
-        name=scene.name,
-        bounds_m=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
-        triangle_count=len(scene.faces),
-        vertex_count=len(scene.vertices),
-        area_m2=float(area.sum()),
-        edge_median_m=float(np.median(edges.max(axis=1))),
-        instance_count=len(np.unique(scene.face_instance)),
-        material_count=len(scene.materials),
-        emissive_count=sum(max(material.emission) > 0.0 for material in scene.materials),
-        texture_count=len(textures),
-        texel_count=sum(t.srgb.shape[0] * t.srgb.shape[1] for t in textures.values()),
-        untextured_share=float(area[plain].sum() / area.sum()),
-        light_count=len(scene.lights),
-        notes=scene.notes,
-        free_space=None if free_space is None else _describe_free(free_space),
-    )
-
-
-def _describe_free(space: FreeSpace) -> FreeSpaceReport:
-    reachable = space.reachable(CLEARANCE_M)
-    layers = reachable.sum(axis=(0, 1))
-    # the middle of the layers that are about as wide as the widest
-    wide = np.flatnonzero(layers >= 0.95 * layers.max())
-    return FreeSpaceReport(
-        volume_m3=float(reachable.sum() * space.voxel_m**3),
-        floor_m2=float(reachable.any(axis=2).sum() * space.voxel_m**2),
-        widest_m=float(space.distance[reachable].max()) if reachable.any() else 0.0,
-        height_m=float(space.origin_m[2] + space.voxel_m * wide[len(wide) // 2]),
-        notes=space.notes,
-    )
-
-
-def rows(report: SceneReport) -> list[tuple[str, str]]:
-    """Return the figures as text, a name and a value each."""
-    low, high = report.bounds_m
-    size = " x ".join(f"{length:,.2f}" for length in report.size_m)
-    corners = " to ".join("(" + ", ".join(f"{c:.2f}" for c in corner) + ")" for corner in (low, high))
-    edge_m = report.edge_median_m
+    pictures = {id(m.texture): m.texture.srgb for m in scene.materials if m.texture is not None}
+    glowing = sum(max(material.emission) > 0.0 for material in scene.materials)
+    bare = 100.0 * float(area[plain].sum() / area.sum())
+    texels = sum(srgb.shape[0] * srgb.shape[1] for srgb in pictures.values()) / 1e6
+    edge_m = float(np.median(edges.max(axis=1)))
     edge = f"{100.0 * edge_m:.1f} cm" if edge_m < 10.0 else f"{edge_m:,.0f} m"
-    textures = f"{report.texture_count}, {report.texel_count / 1e6:.1f} million texels"
-    if report.untextured_share > 0.0:
-        textures += f"; {100.0 * report.untextured_share:.0f} % of the area has none"
-    table = [
-        ("size", f"{size} m"),
-        ("corners", f"{corners} m"),
-        ("triangles", f"{report.triangle_count:,}, median edge {edge}"),
-        ("vertices", f"{report.vertex_count:,}"),
-        ("area", f"{report.area_m2:,.1f} m²"),
-        ("objects", str(report.instance_count)),
-        ("materials", f"{report.material_count}, {report.emissive_count} glow"),
-        ("textures", textures),
-        ("lights", str(report.light_count)),
-    ]
-    free = report.free_space
-    if free is not None and free.volume_m3 == 0.0:
-        table.append(("free space", f"none with {CLEARANCE_M:g} m clear"))
-    elif free is not None:
-        table += [
-            ("free space", f"{free.volume_m3:,.1f} m³ over {free.floor_m2:,.1f} m², {CLEARANCE_M:g} m clear"),
-            ("widest place", f"{free.widest_m:,.2f} m to the nearest surface"),
-            ("fly at", f"z = {free.height_m:.2f} m"),
-        ]
-    return table
+    corners = " to ".join("(" + ", ".join(f"{c:.2f}" for c in corner) + ")" for corner in scene.bounds_m)
+    found = {
+        "size": " x ".join(f"{length:,.2f}" for length in np.ptp(scene.bounds_m, axis=0)) + " m",
+        "corners": f"{corners} m",
+        "triangles": f"{len(scene.faces):,}, median edge {edge}",
+        "vertices": f"{len(scene.vertices):,}",
+        "area": f"{area.sum():,.1f} m²",
+        "objects": str(len(np.unique(scene.face_instance))),
+        "materials": f"{len(scene.materials)}, {glowing} glow",
+        "textures": f"{len(pictures)}, {texels:.1f} million texels"
+        + (f"; {bare:.0f} % of the area has none" if bare > 0.0 else ""),
+        "lights": str(len(scene.lights)),
+    }
+    if space is not None:
+        reachable = space.reachable(CLEARANCE_M)
+        volume_m3 = float(reachable.sum() * space.voxel_m**3)
+        floor_m2 = float(reachable.any(axis=2).sum() * space.voxel_m**2)
+        widest_m = float(space.distance[reachable].max(initial=0.0))
+        found["free space"] = f"{volume_m3:,.1f} m³ over {floor_m2:,.1f} m², {CLEARANCE_M:g} m clear"
+        found["widest place"] = f"{widest_m:,.2f} m to the nearest surface"
+        found["fly at"] = f"z = {flight_height_m(space):.2f} m"
+    return found
 
 
-def print_report(report: SceneReport, console: Console) -> None:
-    """Print the figures as a table, and the notes under it."""
-    table = Table(title=report.name, title_justify="left", box=box.SIMPLE, show_header=False)
-    table.add_column(style="bold")
-    table.add_column()
-    for name, value in rows(report):
-        table.add_row(name, value)
-    console.print(table)
-    for note in (*report.notes, *(report.free_space.notes if report.free_space else ())):
-        console.print(f"- {note}", markup=False, highlight=False)
+def flight_height_m(space: FreeSpace) -> float:
+    """Return a good height to fly at [m]: the middle of those at which there is about the most room."""
+    layers = space.reachable(CLEARANCE_M).sum(axis=(0, 1))
+    wide = np.flatnonzero(layers >= 0.95 * layers.max())
+    return float(space.origin_m[2] + space.voxel_m * wide[len(wide) // 2])
 
 
 def report_scene(
-    file: Path | MeshSceneConfig | Scene,
-    out: Path | None = None,
-    *,
-    device: str = "cpu",
-    console: Console | None = None,
-) -> SceneReport:
+    file: Path | Scene, out: Path | None = None, *, device: str = "cpu", console: Console | None = None
+) -> None:
     """Say what is in a scene, and draw it.
 
     Args:
-        file: A mesh file, how to load one, or a scene that is loaded already.
+        file: A mesh file, or a scene that is loaded already.
         out: Where the picture goes; None: the scene's name with .png, in the working directory.
         device: Where free space is mapped and the picture is rendered.
         console: Where the table is printed; None: standard output.
@@ -198,61 +103,57 @@ def report_scene(
         raise ValueError(f"{out}: the scene is drawn into a picture: {out.stem}.png")
     console = console or Console()
     start = time.perf_counter()
-    if isinstance(file, Scene):
-        scene = file
-    else:
-        scene = load_mesh_scene(file if isinstance(file, MeshSceneConfig) else MeshSceneConfig(file=file))
+    scene = file if isinstance(file, Scene) else load_mesh_scene(MeshSceneConfig(file=file))
     loaded_s = time.perf_counter() - start
-    space: FreeSpace | None
+    space: FreeSpace | None = None
+    notes = list(scene.notes)
+    more = {}
     try:
         space = make_free_space(scene, FreeSpaceConfig(), device=device)
+        notes += space.notes
+        if not space.reachable(CLEARANCE_M).any():
+            space = None
     except ValueError as error:  # a sheet, or something smaller than a voxel
-        space, report = None, describe(scene)
-        none = FreeSpaceReport(
-            volume_m3=0.0,
-            floor_m2=0.0,
-            widest_m=0.0,
-            height_m=report.bounds_m[1][2],
-            notes=(f"There is no room to fly in: {error}.",),
-        )
-        report = dataclasses.replace(report, free_space=none)
-    else:
-        report = describe(scene, space)
-    print_report(report, console)
+        notes.append(f"There is no room to fly in: {error}.")
+    if space is None:
+        more["free space"] = f"none with {CLEARANCE_M:g} m clear"
+    table = Table(title=scene.name, title_justify="left", box=box.SIMPLE, show_header=False)
+    table.add_column(style="bold")
+    for name, value in (figures(scene, space) | more).items():
+        table.add_row(name, value)
+    console.print(table)
     if not isinstance(file, Scene):
-        console.print(f"- Loaded in {loaded_s:.2f} s.", highlight=False)
+        notes.append(f"Loaded in {loaded_s:.2f} s.")
     out = Path(f"{scene.name}.png") if out is None else out
     out.parent.mkdir(parents=True, exist_ok=True)
-    scene_picture(scene, space, report, device=device).save(out)
-    console.print(f"- Picture: {out}", markup=False, highlight=False, soft_wrap=True)
-    return report
+    scene_picture(scene, space, device=device).save(out)
+    for note in (*notes, f"Picture: {out}"):
+        console.print(f"- {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def scene_picture(
-    scene: Scene, space: FreeSpace | None, report: SceneReport, *, device: str = "cpu"
-) -> Image.Image:
+def scene_picture(scene: Scene, space: FreeSpace | None, *, device: str = "cpu") -> Image.Image:
     """Draw a scene, cut open at about eye height, from above, with the plan of its free space if it has any.
 
     Returns:
         An RGB picture of 1600 x 900 px.
     """
-    config = RenderConfig(
-        samples_per_pixel=4,
-        lighting=LightingConfig(edge_max_m=max(0.3, max(report.size_m) / 60.0), ambient_ray_count=12),
-    )
-    opened = cut_open(scene, _cut_height(report))
-    arrays = upload_scene(opened, config, device)
+    low, high = scene.bounds_m[:, 2]
+    fly_m = high if space is None else flight_height_m(space)
+    edge_max_m = max(0.3, float(np.ptp(scene.bounds_m, axis=0).max()) / 60.0)
+    lighting = LightingConfig(edge_max_m=edge_max_m, ambient_ray_count=12)
+    # under the ceiling of the storey that one flies in, over most furniture; things are whole
+    cut_m = min(max(fly_m + 0.5, low + 0.5 * (high - low)), high - 0.15 * (high - low))
+    opened = cut_open(scene, high if high - low < 1.8 else cut_m)
+    arrays = upload_scene(opened, RenderConfig(samples_per_pixel=4, lighting=lighting), device)
     arrays.data.sky = wp.vec3(1.0 / arrays.exposure)  # white paper
     picture = Image.new("RGB", _SIZE, _PAPER)
-    corners = opened.bounds_m
-    picture.paste(Image.fromarray(_look(arrays, *_view_from_above(corners), _VIEW)), (0, 0))
+    picture.paste(Image.fromarray(_look(arrays, *_view_from_above(opened.bounds_m), _VIEW)), (0, 0))
 
-    plan, scale, origin = _draw_plan(arrays, space, report, corners)
+    plan, scale, origin = _draw_plan(arrays, space, fly_m, opened.bounds_m)
     left, top = _VIEW[0] + 20, 70
     picture.paste(plan, (left, top))
     draw = ImageDraw.Draw(picture)
-    large, normal = ImageFont.load_default(size=30), ImageFont.load_default(size=17)
-    draw.text((left, 22), report.name, font=large, fill=_INK)
+    draw.text((left, 22), scene.name, font=ImageFont.load_default(size=30), fill=_INK)
     bottom = top + plan.height
     for light in scene.lights:
         x = left + (light.position_m[0] - origin[0]) * scale
@@ -263,27 +164,10 @@ def scene_picture(
     bar_m *= next(k for k in (5.0, 2.0, 1.0) if k * bar_m * scale <= 160.0)
     draw.line((left, bottom + 14, left + bar_m * scale, bottom + 14), fill=_INK, width=3)
     caption = f"{bar_m:g} m"
-    if report.free_space is not None and report.free_space.volume_m3 > 0.0:
-        caption += f"      green: free at z = {_flight_height(report):.1f} m, {CLEARANCE_M:g} m clear"
-    draw.text((left, bottom + 20), caption, font=normal, fill=_FAINT)
-    for index, (name, value) in enumerate(entry for entry in rows(report) if entry[0] != "corners"):
-        y = bottom + 58 + 24 * index
-        if y > _SIZE[1] - 24:
-            break
-        draw.text((left, y), name, font=normal, fill=_FAINT)
-        _write(draw, (left + 120, y), value, size=17)
+    if space is not None:
+        caption += f"      green: free at z = {fly_m:.1f} m, {CLEARANCE_M:g} m clear"
+    draw.text((left, bottom + 20), caption, font=ImageFont.load_default(size=17), fill=_FAINT)
     return picture
-
-
-def _write(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, *, size: int) -> None:
-    """Write text with superscripts, which the font that Pillow brings has not: small digits, set high."""
-    large, small = ImageFont.load_default(size=size), ImageFont.load_default(size=0.65 * size)
-    x, y = place
-    for piece in re.split("([²³])", text):
-        raised = piece in ("²", "³")
-        shown, font = ({"²": "2", "³": "3"}[piece], small) if raised else (piece, large)
-        draw.text((x, y), shown, font=font, fill=_INK)
-        x += font.getlength(shown)
 
 
 def cut_open(scene: Scene, height_m: float) -> Scene:
@@ -333,18 +217,6 @@ def cut_open(scene: Scene, height_m: float) -> Scene:
     )
 
 
-def _flight_height(report: SceneReport) -> float:
-    return report.bounds_m[1][2] if report.free_space is None else report.free_space.height_m
-
-
-def _cut_height(report: SceneReport) -> float:
-    """Under the ceiling of the storey that one flies in, over most furniture; for things, above them."""
-    low, high = report.bounds_m[0][2], report.bounds_m[1][2]
-    if high - low < 1.8:
-        return high
-    return min(max(_flight_height(report) + 0.5, low + 0.5 * (high - low)), high - 0.15 * (high - low))
-
-
 def _pose(eye: NDArray[np.float64], forward: NDArray[np.float64], up: NDArray[np.float64]) -> Any:
     """Return p_WC and q_WC of a camera that looks along `forward`."""
     right = np.cross(forward, up)
@@ -385,7 +257,7 @@ def _look(arrays: SceneArrays, pose: Any, fov_rad: float, size: tuple[int, int])
 
 
 def _draw_plan(
-    arrays: SceneArrays, space: FreeSpace | None, report: SceneReport, bounds: NDArray[np.float64]
+    arrays: SceneArrays, space: FreeSpace | None, fly_m: float, bounds: NDArray[np.float64]
 ) -> tuple[Image.Image, float, NDArray[np.float64]]:
     """Return the scene from above with free space in green, its pixels per metre and its lower left [m]."""
     extent = bounds[1, :2] - bounds[0, :2]
@@ -401,7 +273,7 @@ def _draw_plan(
     lower_left = centre[:2] - 0.5 * np.array([width, height]) / scale
     if space is None:
         return Image.fromarray(picture.astype(np.uint8)), scale, lower_left
-    layer = space.voxel_of([*space.seed_m[:2], _flight_height(report)])[2]
+    layer = space.voxel_of([*space.seed_m[:2], fly_m])[2]
     free = space.reachable(CLEARANCE_M)[:, :, layer]
     x = lower_left[0] + (np.arange(width) + 0.5) / scale
     y = lower_left[1] + (height - np.arange(height) - 0.5) / scale

@@ -29,11 +29,6 @@ class Texture:
         """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
         return self._source() if callable(self._source) else self._source
 
-    @property
-    def painted(self) -> bool:
-        """Whether there are texels already."""
-        return "srgb" in self.__dict__ or not callable(self._source)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Material:

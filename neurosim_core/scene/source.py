@@ -6,7 +6,7 @@ import hashlib
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,13 +115,6 @@ def decode_picture(data: bytes | Image.Image, *, file: str, name: str) -> NDArra
         raise SceneError(
             f"{file}: texture {name!r} cannot be decoded ({error}); PNG, JPEG and the like will do"
         ) from error
-
-
-def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
-    """Encode linear light in [0, 1] as 8-bit sRGB, rounded. Reference: IEC 61966-2-1."""
-    value = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
-    return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
 def rgb(value: Sequence[float] | NDArray[np.float64]) -> LinearRgb:

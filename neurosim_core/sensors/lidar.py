@@ -24,13 +24,15 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from neurosim_core.clock import NS_PER_S
 from neurosim_core.packets import PointCloud
 from neurosim_core.random import normal4, random_bits, stream_id
 from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
+from neurosim_core.render.ray_times import SweepTiming
 from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
 from neurosim_core.sensors.lidar_presets import PRESETS
-from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan, SweepTiming
+from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 from neurosim_core.settings import Settings, fill_from_preset
 
@@ -117,7 +119,7 @@ class LidarConfig(PictureSensorConfig):
     @property
     def timing(self) -> SweepTiming | None:
         """When rays are cast; None: all at the stamp."""
-        return SweepTiming(span_s=self.span_s) if self.span_s > 0.0 else None
+        return SweepTiming(round(self.span_s * NS_PER_S)) if self.span_s > 0.0 else None
 
     def make_process(self, context: PictureContext) -> PixelProcess:
         """Return what makes points of what rays find: x, y, z [m] and intensity, vec4, shape [M, H, W]."""
@@ -150,7 +152,7 @@ class LidarConfig(PictureSensorConfig):
 
     def packet(self, picture: NDArray[Any], **header: Any) -> PointCloud:
         """Return the points of a sweep, in the order of time; the picture has x, y, z, intensity."""
-        span_ns = round(self.span_s * 1e9)
+        span_ns = round(self.span_s * NS_PER_S)
         ring, t = _rings_and_times(self.scan, span_ns)
         in_time = np.ascontiguousarray(picture.view(_RAY)[..., 0].T)
         seen = np.flatnonzero(np.isfinite(in_time.view(np.float32).reshape(-1, 4)[:, 0]))

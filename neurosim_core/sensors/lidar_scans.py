@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,9 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from neurosim_core.clock import NS_PER_S
-from neurosim_core.render.camera import Lens
-from neurosim_core.render.ray_times import INSTANT_COUNT_MAX, RayTimes
 from neurosim_core.settings import Settings
 
 _ROWS = (8, 7, 6, 5, 4, 3, 2)  # of a pattern: neighbours in time are cast together
@@ -72,7 +68,7 @@ class Scan(Settings):
 
 
 class SpinningScan(Scan):
-    """A column of lasers that turns about z; all lasers of a column fire at once.
+    """A column of lasers that turns to the right about z; all lasers of a column fire at once.
 
     Column 0 looks backwards, so that the cut between sweeps is behind the vehicle.
     """
@@ -82,13 +78,10 @@ class SpinningScan(Scan):
     """Elevation of each ring [rad]; ring 0 is the first."""
     columns: Annotated[int, Field(ge=1, le=16384)] = 1024
     """Columns of a turn."""
-    clockwise: bool = True
-    """The head turns to the right, as seen from above."""
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""
-        turn = 2.0 * math.pi * np.arange(self.columns) / self.columns
-        azimuth = math.pi + (-turn if self.clockwise else turn)
+        azimuth = math.pi - 2.0 * math.pi * np.arange(self.columns) / self.columns
         return np.stack(np.broadcast_arrays(azimuth, np.array(self.elevations_rad)[:, None]), axis=-1)
 
 
@@ -163,28 +156,6 @@ class PatternScan(Scan):
 
 
 AnyScan = Annotated[SpinningScan | RosetteScan | PatternScan, Field(discriminator="kind")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SweepTiming:
-    """When the rays of a sweep are cast; the last one is cast at the stamp."""
-
-    span_s: float
-    """Time from the first ray to the last [s]."""
-
-    @property
-    def window_ns(self) -> int:
-        """How long before the stamp the first ray is cast [ns]."""
-        return round(self.span_s * NS_PER_S)
-
-    def times(self, lens: Lens, sample_count: int) -> RayTimes:
-        """Return the times of the rays of a scan: one ray each, whatever the settings ask for."""
-        assert isinstance(lens, Scan)
-        steps = np.rint((lens.fractions() - 1.0) * self.window_ns).astype(np.int64).ravel()
-        offsets_ns, instant = np.unique(steps, return_inverse=True)
-        if len(offsets_ns) > INSTANT_COUNT_MAX:
-            raise ValueError(f"a sweep has at most {INSTANT_COUNT_MAX} times, got {len(offsets_ns)}")
-        return RayTimes(offsets_ns, np.ascontiguousarray(instant.reshape(1, -1), dtype=np.int32), 1)
 
 
 def _in_rows(rays: NDArray[Any]) -> NDArray[Any]:

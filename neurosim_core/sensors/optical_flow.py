@@ -25,10 +25,9 @@ from pydantic import Field
 from neurosim_core.clock import to_ns
 from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
-from neurosim_core.render.camera import Lens
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.render.projection import projector, velocity_projector
-from neurosim_core.render.ray_times import RayTimes
+from neurosim_core.render.ray_times import SweepTiming
 from neurosim_core.scene.bodies import make_body_poses, velocity_on_body
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
 from neurosim_core.sensors.occlusion import (
@@ -69,23 +68,6 @@ class OpticalFlow(Packet):
     """What a pixel of `data` is, named as in ROS."""
 
 
-@dataclass(frozen=True)
-class _Before:
-    """All rays are cast before the stamp."""
-
-    span_ns: int
-
-    @property
-    def window_ns(self) -> int:
-        """How long before the stamp rays are cast [ns]."""
-        return self.span_ns
-
-    def times(self, lens: Lens, sample_count: int) -> RayTimes:
-        """Return one time for all rays."""
-        instant = np.zeros((1, lens.height * lens.width), np.int32)
-        return RayTimes(np.array([-self.span_ns], np.int64), instant, 1)
-
-
 @register("sensor", "optical_flow")
 class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
     """A camera that measures optical flow, exactly, of scene and moving bodies, through its lens."""
@@ -115,9 +97,9 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
         return frozenset(["range", "instance"])
 
     @property
-    def timing(self) -> _Before | None:
+    def timing(self) -> SweepTiming | None:
         """Forward flow casts its rays at the earlier time."""
-        return _Before(self.window_ns) if self.direction == "forward" and self.window_ns else None
+        return SweepTiming(self.window_ns) if self.direction == "forward" and self.window_ns else None
 
     @property
     def look_back_ns(self) -> int:

@@ -1,11 +1,9 @@
 """The engine: what a run needs (`model`), what changes in it (`state`), and the data flow (`step`)."""
 
 from neurosim_core.sim.integrate import COLLISION, forget_controllers
-from neurosim_core.sim.model import Model, find_device, make_fleet, make_model, plan_paths, refit
-from neurosim_core.sim.observation import Observation, Samples
+from neurosim_core.sim.model import Model, make_fleet, make_model, plan_paths
 from neurosim_core.sim.render_group import move_bodies
 from neurosim_core.sim.rollout import (
-    PendingStep,
     acquire_rooms,
     advance,
     begin_step,
@@ -33,9 +31,6 @@ __all__ = [
     "COLLISION",
     "Batch",
     "Model",
-    "Observation",
-    "PendingStep",
-    "Samples",
     "Simulation",
     "StartState",
     "State",
@@ -43,7 +38,6 @@ __all__ = [
     "advance",
     "begin_step",
     "end_step",
-    "find_device",
     "finish",
     "forget_controllers",
     "free_lanes",
@@ -55,7 +49,6 @@ __all__ = [
     "observe",
     "plan_paths",
     "prepare_step",
-    "refit",
     "render_batch",
     "run",
     "run_model",

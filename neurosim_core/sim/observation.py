@@ -8,25 +8,7 @@ from typing import Any
 
 import warp as wp
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class VehicleStates:
-    """The states of all vehicles, on the device, valid until the next step or reset."""
-
-    position: wp.array[wp.vec3d]
-    """p_WB [m], shape [N, 3]."""
-    velocity: wp.array[wp.vec3d]
-    """v_WB in W [m/s], shape [N, 3]."""
-    orientation: wp.array[wp.quatd]
-    """q_WB, xyzw, shape [N, 4]."""
-    body_rate: wp.array[wp.vec3d]
-    """w_WB in B [rad/s], shape [N, 3]."""
-    air_velocity: wp.array[wp.vec3d]
-    """Velocity of the air there, wind, gusts and turbulence together, in W [m/s], shape [N, 3]."""
-    rotor_speed: wp.array2d[wp.float64]
-    """[rad/s], shape [N, R]."""
-    stamp_ns: wp.array[wp.int64]
-    """Time of each state since the reset of its world [ns], shape [N]; stops where a vehicle is held."""
+from neurosim_core.vehicle.arrays import MultirotorArrays
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,8 +25,8 @@ class Samples:
 class Observation:
     """What all worlds yield in a step: arrays on the device that the next step or reset overwrites."""
 
-    state: VehicleStates
-    """At the end of the step."""
+    state: MultirotorArrays
+    """The states of all vehicles at the end of the step."""
     clock_ns: wp.array[wp.int64]
     """Time since the reset of each world [ns], shape [N]."""
     frames: Mapping[str, Any]

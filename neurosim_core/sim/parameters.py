@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,29 @@ from pydantic import ValidationError
 from neurosim_core.config_errors import explain
 from neurosim_core.sensors.base import CameraConfig, SensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sim.scene_table import SceneTable
 
 Rig = dict[str, SensorConfig]
 """The sensors of one world by name."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorldSettings:
+    """How worlds that are stepped together differ, and what their results are."""
+
+    scenes: SceneTable
+    seeds: Sequence[int]
+    """Of each world."""
+    rigs: Sequence[Rig]
+    """The sensors of each world."""
+    instant_count: int
+    """The most instants of a group in one step."""
+    slot_count: int
+    """The most boundaries of one step."""
+    event_capacity: int | None = None
+    """Room for the events of one world and camera in one step."""
+    ordered: bool = True
+    """Sort events."""
 
 
 def vary_sensors(sensors: Rig, parameters: Mapping[str, ArrayLike], count: int) -> list[Rig]:

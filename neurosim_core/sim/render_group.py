@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -20,7 +20,6 @@ from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.outputs import INSTANT_OUTPUTS
 from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.render.renderer import (
-    ONE_WORLD,
     Renderer,
     RenderWorlds,
     make_renderer,
@@ -48,6 +47,8 @@ from neurosim_core.sensors.base import (
 )
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.parameters import WorldSettings, lens_tables
 
 MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
@@ -73,6 +74,26 @@ class ImageChannel:
 
 
 @dataclass(kw_only=True, eq=False)
+class BatchBuffers:
+    """What a group writes for one batch in flight."""
+
+    renderer: Renderer
+    copies: Mapping[str, HostCopy]
+    """Pictures on the host by source; empty: they stay on the device."""
+    processes: Mapping[str, PictureProcess]
+    """What pictures go through on the device, by the name of the sensor."""
+    p_WC: wp.array[wp.vec3]
+    """Where the camera is at the instants [m], shape [N K]; [N K J] where rays have times of their own."""
+    q_WC: wp.array[wp.quat]
+    stamps: Any
+    """Times of the instants [ns], shape [N K, 1], or [N K J, 1]; empty if nobody asks."""
+    bodies: BodyPoses | None
+    """Where bodies are at the instants; None: nothing moves but the vehicle."""
+    chosen_slots: HostInput | None
+    """Slots of the ticks chosen, which do not come again; None: all ticks are rendered."""
+
+
+@dataclass(kw_only=True, eq=False)
 class RenderGroupState:
     """The device buffers of one group, for batches of at most `capacity` instants."""
 
@@ -83,12 +104,8 @@ class RenderGroupState:
     picture_count: int
     """M, the most pictures of one batch in each world."""
     rate: Rate
-    renderers: list[Renderer]
+    buffers: Sequence[BatchBuffers]
     """One for each batch in flight."""
-    picture_copies: list[dict[str, HostCopy]]
-    """Pictures on the host by source, for each batch in flight; empty: they stay on the device."""
-    processes: Sequence[Mapping[str, PictureProcess]]
-    """What pictures go through on the device, by the name of the sensor, for each batch in flight."""
     frames: dict[str, FrameSensor]
     """The frame sensors, where packets go to the host."""
     images: dict[str, ImageChannel]
@@ -98,151 +115,232 @@ class RenderGroupState:
     """The last picture of each image sensor, where they stay on the device: arrays [N, H, W, ...]."""
     shared_pictures: dict[str, Any]
     """What the renderer wrote, for image sensors whose last picture another one of the group replaces."""
-    parity: int = field(default=0, kw_only=True)
+    parity: int = 0
     """Which of the two states of `world_frames` is the present one."""
     p_BC: wp.vec3d
     q_BC: wp.quatd
     offsets_ns: Any
     """From an instant to its J rays [ns], device array; None: all are cast at the instant."""
-    p_WC: Sequence[wp.array[wp.vec3]]
-    """Where the camera is at the instants [m], for each batch in flight, shape [N K]; [N K J] with
-    `offsets_ns`."""
-    q_WC: Sequence[wp.array[wp.quat]]
-    stamps: Sequence[Any]
-    """Times of the instants [ns], shape [N K, 1]; [N K J, 1] with `offsets_ns`; empty if nobody asks."""
-    instants: Any = None
+    instants: Any
     """0, 1, ... N K - 1: the instants in order."""
-    motions: wp.array[Motion] | None = None
+    motions: wp.array[Motion] | None
     """Of the bodies; None: nothing moves but the vehicle."""
-    body_poses: Sequence[BodyPoses | None] = ()
-    """Where bodies are at the instants, for each batch in flight."""
     slots: dict[Hashable, wp.array[int]] = field(default_factory=dict)
     """Lists of slots on the device by batch in flight: the same few come again and again. What one uploads on
     its stream is not there yet for another, whose stream does not wait for it."""
-    rule: DisplacementRule | None = None
+    rule: DisplacementRule | None
     """Chooses the ticks that are rendered; None: all are."""
-    chosen_slots: Sequence[HostInput] = ()
-    """Slots of the ticks chosen, for each batch in flight: they do not come again."""
-    make_room: MakeRoom | None = None
+    make_room: MakeRoom | None
     """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
 
 
-def make_render_group(
-    group: RenderGroup,
-    sensors: Mapping[str, SensorConfig],
-    scene: Any,
+class _Plan(NamedTuple):
+    """What the buffers of a group are made for."""
+
+    group: RenderGroup
+    model: Model
+    worlds: RenderWorlds
+    images: Mapping[str, ImageChannel]
+    capacity: int
+    picture_count: int
+    """As in `RenderGroupState`."""
+    times: RayTimes | None
+    motions: Any
+    seeds: Any
+
+
+def make_render_groups(
+    model: Model,
+    worlds: WorldSettings,
     *,
-    capacity: int,
+    seeds: Any,
+    history: Any,
     in_flight: int,
-    device: str,
-    seed: int = 0,
-    seeds: Any = None,
-    bodies: Mapping[str, BodyConfig] | None = None,
-    worlds: RenderWorlds = ONE_WORLD,
-    on_host: bool = True,
-    make_room: MakeRoom | None = None,
-    world_context: Callable[[str, Any], WorldFrameContext] | None = None,
-    history: Any = None,
-) -> RenderGroupState:
-    """Allocate the buffers of a group.
+    on_host: bool,
+    make_room: MakeRoom | None,
+) -> list[RenderGroupState]:
+    """Allocate the buffers of all groups; there are none where the scene is not on the device.
 
     Args:
-        group: Which cameras it serves.
-        sensors: All sensors of the rig.
-        scene: What to look at.
-        capacity: K, the most instants of one batch in each world.
-        in_flight: The most batches in flight.
-        device: Where to compute.
-        seed: Seed of the noise of frame sensors.
-        seeds: Of each world, for the noise of pictures, device array of uint64.
-        bodies: What moves in the scene.
+        model: Which cameras there are.
         worlds: Who is rendered together.
+        seeds: Of each world, for the noise of pictures, device array of uint64.
+        history: The flight, for sensors that look back.
+        in_flight: The most batches in flight.
         on_host: Bring pictures and events to the host, as packets.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; `acquire_room` asks
             for it before pictures are rendered.
-        history: The flight, for sensors that look back.
-        world_context: Without `on_host`: what the frame sensor of a name is made for, given its frames.
 
     Raises:
-        ValueError: The renderer cannot say what moves how far, and the group is adaptive; or a picture is not
-            for many worlds.
+        ValueError: The renderer cannot say what moves how far, and a group is adaptive; or a picture, or an
+            adaptive group, is not for many worlds.
     """
-    images = _image_channels(group, sensors, on_host=on_host)
-    picture_count = _picture_count(group, images, capacity) if on_host else 1
-    times = _ray_times(group, scene)
-    renderers = [
-        make_renderer(
-            scene,
-            group.lens,
-            outputs=group.outputs,
-            instant_count=capacity,
-            image_count=worlds.count * picture_count,
-            worlds=worlds,
-            times=times,
+    groups: list[RenderGroupState] = []
+    for index, group in enumerate(model.groups if model.scene_on_device is not None else ()):
+        if not on_host and group.max_displacement_px is not None:
+            raise ValueError(
+                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses "
+                "what to render for one vehicle, on the host"
+            )
+        capacity = model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count
+        images = _image_channels(group, model.config.sensors, on_host=on_host)
+        bodies = model.config.bodies
+        plan = _Plan(
+            group=group,
+            model=model,
+            worlds=_render_worlds(group, worlds),
+            images=images,
+            capacity=capacity,
+            picture_count=_picture_count(group, images, capacity) if on_host else 1,
+            times=_ray_times(group, model.scene_on_device),
+            motions=upload_motions(bodies, model.device, world_count=len(worlds.seeds)) if bodies else None,
+            seeds=seeds,
         )
-        for _ in range(in_flight)
-    ]
-    motions: Any = upload_motions(bodies, device, world_count=worlds.count) if bodies else None
-    one_scene = not worlds.arrays or worlds.scene_of_world is None
-    first_scene = wp.zeros(worlds.count, dtype=int, device=device)
-    processes = _picture_processes(
-        images,
-        renderers,
-        lenses=worlds.lenses or (group.lens,),
-        lens_of_world=worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
-        scenes=(scene,) if one_scene else worlds.arrays,
-        scene_of_world=first_scene if one_scene else worlds.scene_of_world,
-        motions=motions,
-        times=times,
-        stride=capacity,
-        seeds=seeds,
-    )
+        groups.append(_make_group(plan, worlds, history, in_flight, make_room, on_host=on_host))
+    return groups
+
+
+def _make_group(
+    plan: _Plan,
+    worlds: WorldSettings,
+    history: Any,
+    in_flight: int,
+    make_room: MakeRoom | None,
+    *,
+    on_host: bool,
+) -> RenderGroupState:
+    group, model, count, device = plan.group, plan.model, plan.worlds.count, plan.model.device
+    seeing = {name: model.config.sensors[name] for name in group.frame_sensors}
+    sensors = {name: sensor for name, sensor in seeing.items() if isinstance(sensor, FrameSensorConfig)}
+    rooms = {  # checked before anything is allocated
+        name: 0 if on_host else sensor.world_capacity(count, worlds.event_capacity)
+        for name, sensor in sensors.items()
+    }
+    buffers = [_make_buffers(plan, on_host=on_host) for _ in range(in_flight)]
+    first = buffers[0]
+    pictures, shared = ({}, {}) if on_host else _picture_arrays(plan.images, first.renderer, first.processes)
     p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
-    offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
-    rows = worlds.count * capacity * (1 if offsets_ns is None else offsets_ns.shape[0])
-    timed_rows = rows if bodies or processes[0] else 0
-    pictures, shared = ({}, {}) if on_host else _picture_arrays(images, renderers[0], processes[0])
+    rule = _make_rule(group, model.scene_on_device, p_BC, q_BC, plan.motions)
+    frames, world_frames = {}, {}
+    for name, sensor in sensors.items():
+        if on_host:
+            frames[name] = sensor.make(
+                FrameContext(
+                    name=name,
+                    width=group.lens.width,
+                    height=group.lens.height,
+                    lens=group.lens,
+                    device=device,
+                    in_flight=in_flight,
+                    seed=worlds.seeds[0],
+                    scene=model.scene_on_device,
+                    motions=plan.motions,
+                    history=history,
+                    p_BC=p_BC,
+                    q_BC=q_BC,
+                )
+            )
+        else:  # they read log radiance [N, K, H W]
+            seen: Any = first.renderer.log_radiance
+            shape = (count, plan.capacity, seen.shape[1] * seen.shape[2])
+            world_frames[name] = sensor.make_worlds(
+                WorldFrameContext(
+                    name=name,
+                    configs=[rig[name] for rig in worlds.rigs],
+                    frames=seen.reshape(shape),
+                    capacity=rooms[name],
+                    seeds=worlds.seeds,
+                    ordered=worlds.ordered,
+                )
+            )
+    offsets_ns = None if plan.times is None else plan.times.offsets_ns
     return RenderGroupState(
         device=device,
-        world_count=worlds.count,
-        capacity=capacity,
-        picture_count=picture_count,
+        world_count=count,
+        capacity=plan.capacity,
+        picture_count=plan.picture_count,
         rate=group.rate,
-        renderers=renderers,
-        picture_copies=[
-            _picture_copies(images if on_host else {}, *each)
-            for each in zip(renderers, processes, strict=True)
-        ],
-        processes=processes,
-        frames=_frame_sensors(
-            group.frame_sensors if on_host else (),
-            sensors,
-            lens=group.lens,
-            device=device,
-            in_flight=in_flight,
-            seed=seed,
-            scene=scene,
-            motions=motions,
-            history=history,
-            p_BC=p_BC,
-            q_BC=q_BC,
-        ),
-        images=images,
-        world_frames=_world_frames(group, sensors, renderers[0], world_context, worlds.count, capacity),
+        buffers=buffers,
+        frames=frames,
+        images=dict(plan.images),
+        world_frames=world_frames,
         pictures=pictures,
         shared_pictures=shared,
         p_BC=p_BC,
         q_BC=q_BC,
-        offsets_ns=offsets_ns,
-        p_WC=[wp.zeros(rows, dtype=wp.vec3, device=device) for _ in renderers],
-        q_WC=[wp.zeros(rows, dtype=wp.quat, device=device) for _ in renderers],
-        stamps=[wp.zeros((timed_rows, 1), dtype=wp.int64, device=device) for _ in renderers],
-        instants=wp.array(np.arange(timed_rows, dtype=np.int32), dtype=int, device=device),
-        motions=motions,
-        body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
-        rule=_make_rule(group, scene, p_BC, q_BC, motions),
+        offsets_ns=None if offsets_ns is None else wp.array(offsets_ns, dtype=wp.int64, device=device),
+        instants=wp.array(np.arange(first.stamps.shape[0], dtype=np.int32), dtype=int, device=device),
+        motions=plan.motions,
+        rule=rule,
         make_room=make_room,
-        chosen_slots=_chosen_slots(group, in_flight, capacity, device),
+    )
+
+
+def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
+    """Allocate what one batch writes; constants and sources of the images are set."""
+    device, instant_count = plan.model.device, plan.worlds.count * plan.capacity
+    renderer = make_renderer(
+        plan.model.scene_on_device,
+        plan.group.lens,
+        outputs=plan.group.outputs,
+        instant_count=plan.capacity,
+        image_count=plan.worlds.count * plan.picture_count,
+        worlds=plan.worlds,
+        times=plan.times,
+    )
+    worlds, scene = plan.worlds, plan.model.scene_on_device
+    one_scene = not worlds.arrays or worlds.scene_of_world is None
+    first_scene = wp.zeros(worlds.count, dtype=int, device=device)
+    processes: dict[str, PictureProcess] = {}
+    for name, image in plan.images.items():
+        context = PictureContext(
+            name=name,
+            source=getattr(renderer, image.output),
+            sources={output: getattr(renderer, output) for output in image.config.outputs},
+            lenses=worlds.lenses or (plan.group.lens,),
+            lens_of_world=worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
+            scenes=(scene,) if one_scene else worlds.arrays,
+            scene_of_world=first_scene if one_scene else worlds.scene_of_world,
+            motions=plan.motions,
+            times=plan.times,
+            stride=plan.capacity,
+            seeds=plan.seeds,
+        )
+        image.constants = image.config.constants(context)
+        if (process := image.config.make_process(context)) is not None:
+            processes[name] = process
+            image.source = f"{name}/processed"
+    sources = {
+        image.source: processes[name].picture if name in processes else getattr(renderer, image.output)
+        for name, image in plan.images.items()
+    }
+    body_count = len(plan.model.config.bodies)
+    rows = instant_count * (1 if plan.times is None else len(plan.times.offsets_ns))
+    timed_rows = rows if body_count or processes else 0
+    slots = None if plan.group.max_displacement_px is None else wp.zeros(plan.capacity, int, device=device)
+    return BatchBuffers(
+        renderer=renderer,
+        copies={source: HostCopy(array) for source, array in sources.items()} if on_host else {},
+        processes=processes,
+        p_WC=wp.zeros(rows, dtype=wp.vec3, device=device),
+        q_WC=wp.zeros(rows, dtype=wp.quat, device=device),
+        stamps=wp.zeros((timed_rows, 1), dtype=wp.int64, device=device),
+        bodies=make_body_poses(rows, body_count, device) if body_count else None,
+        chosen_slots=None if slots is None else HostInput(slots),
+    )
+
+
+def _render_worlds(group: RenderGroup, worlds: WorldSettings) -> RenderWorlds:
+    """Return who is rendered together."""
+    lenses, lens_of_world = lens_tables(group, worlds.rigs)
+    return RenderWorlds(
+        count=len(worlds.seeds),
+        lenses=lenses,
+        lens_of_world=lens_of_world,
+        scenes=worlds.scenes.data,
+        scene_of_world=worlds.scenes.scene,
+        arrays=[each.scene_on_device for each in worlds.scenes.models],
+        terms=worlds.scenes.terms,
     )
 
 
@@ -262,58 +360,6 @@ def _image_channels(
             "`rgb` and the results of event cameras stay on the device"
         )
     return images
-
-
-def _picture_processes(
-    images: Mapping[str, ImageChannel], renderers: Sequence[Renderer], **context: Any
-) -> list[dict[str, PictureProcess]]:
-    """Return what makes pictures of what a renderer wrote, for each renderer; `context`: as `PictureContext`.
-
-    Constants and sources of the channels are set.
-    """
-    processes: list[dict[str, PictureProcess]] = [{} for _ in renderers]
-    for name, image in images.items():
-        for renderer, by_name in zip(renderers, processes, strict=True):
-            sources = {output: getattr(renderer, output) for output in image.config.outputs}
-            made_for = PictureContext(
-                name=name, source=getattr(renderer, image.output), sources=sources, **context
-            )
-            process = image.config.make_process(made_for)
-            if process is not None:
-                by_name[name] = process
-                image.source = f"{name}/processed"
-        image.constants = image.config.constants(made_for)
-    return processes
-
-
-def _picture_copies(
-    images: Mapping[str, ImageChannel], renderer: Renderer, processes: Mapping[str, Any]
-) -> dict[str, HostCopy]:
-    """Return the pictures of a renderer on the host, by their sources."""
-    return {
-        image.source: HostCopy(
-            processes[name].picture if name in processes else getattr(renderer, image.output)
-        )
-        for name, image in images.items()
-    }
-
-
-def _frame_sensors(
-    names: Sequence[str], sensors: Mapping[str, SensorConfig], *, lens: Any, **context: Any
-) -> dict[str, FrameSensor]:
-    """Return frame sensors at work in one world, by name; `context`: as `FrameContext`."""
-    return {
-        name: config.make(FrameContext(name=name, width=lens.width, height=lens.height, lens=lens, **context))
-        for name in names
-        if isinstance(config := sensors[name], FrameSensorConfig)
-    }
-
-
-def _chosen_slots(group: RenderGroup, in_flight: int, capacity: int, device: str) -> Sequence[HostInput]:
-    """Return where the slots of chosen ticks go, for each batch in flight; none if all ticks are rendered."""
-    if group.max_displacement_px is None:
-        return ()
-    return [HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(in_flight)]
 
 
 def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
@@ -344,26 +390,6 @@ def _picture_count(group: RenderGroup, images: Mapping[str, ImageChannel], capac
     """
     most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
     return max(1, min(capacity, most))
-
-
-def _world_frames(
-    group: RenderGroup,
-    sensors: Mapping[str, SensorConfig],
-    renderer: Renderer,
-    context: Callable[[str, Any], WorldFrameContext] | None,
-    world_count: int,
-    capacity: int,
-) -> dict[str, WorldFrameSensor]:
-    """Return the frame sensors whose results stay on the device; they read log radiance [N, K, H W]."""
-    if context is None:
-        return {}
-    found = {}
-    for name in group.frame_sensors:
-        if isinstance(config := sensors[name], FrameSensorConfig):
-            frames = renderer.log_radiance
-            shape = (world_count, capacity, frames.shape[1] * frames.shape[2])
-            found[name] = config.make_worlds(context(name, frames.reshape(shape)))
-    return found
 
 
 def move_bodies(groups: Iterable[RenderGroupState], bodies: Mapping[str, BodyConfig]) -> None:
@@ -404,10 +430,10 @@ def _make_rule(
 
 def render_terms(group: RenderGroupState) -> tuple[str, ...]:
     """Return what a group computes beyond its outputs: for the scene, its settings, lens, pictures."""
-    renderer = group.renderers[0]
+    renderer = group.buffers[0].renderer
     terms = getattr(renderer, "terms", None)  # only Warp's has a kernel made to measure
     present = {} if terms is None else terms._asdict()
     if getattr(renderer, "antialiased", False):
         present |= {"supersampled": False, "antialiased": True}
-    made = (term for process in group.processes[0].values() for term in process.terms)
+    made = (term for process in group.buffers[0].processes.values() for term in process.terms)
     return (*(name for name, value in present.items() if value), *made)

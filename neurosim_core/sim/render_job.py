@@ -147,48 +147,46 @@ def plan_render(
     key: Hashable | None = (id(group), lane, posed, placed)
     if group.world_count > 1:  # shared walks look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
-    chosen = None
+    buffers, chosen = group.buffers[lane], None
     if group.rule is not None:
-        key, chosen = None, group.chosen_slots[lane]
+        key, chosen = None, buffers.chosen_slots
+        assert chosen is not None
         chosen.rows[: len(slots)] = slots
     from_slots = _on_device(group, (lane, "from", posed), lambda: posed) if chosen is None else chosen.array
     to_slots = _on_device(group, (lane, "to", placed), lambda: _image_slots(group, placed))
-    p_WC, q_WC, body_poses = group.p_WC[lane], group.q_WC[lane], group.body_poses[lane]
+    p_WC, q_WC, stamps, bodies = buffers.p_WC, buffers.q_WC, buffers.stamps, buffers.bodies
 
     def render() -> tuple[Any, Any]:
         if chosen is not None:
             chosen.upload()
-        stamps = group.stamps[lane]
         mount: dict[str, Any] = {"p_BC": group.p_BC, "q_BC": group.q_BC}
         poses = {"count": len(posed), **mount, "p_WC": p_WC, "q_WC": q_WC, "stamps": stamps}
         if group.offsets_ns is None:
             trace.camera_poses(from_slots, **poses)
         else:
             trace.ray_poses(from_slots, group.offsets_ns, **poses)
-        if group.motions is not None and body_poses is not None:
+        if group.motions is not None and bodies is not None:
             rays = 1 if group.offsets_ns is None else group.offsets_ns.shape[0]
             count = len(slots) * rays if group.world_count == 1 else stamps.shape[0]
-            pose_bodies(group.motions, stamps, group.instants, count=count, poses=body_poses)
-        group.renderers[lane].render(
-            p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses, active=active
-        )
+            pose_bodies(group.motions, stamps, group.instants, count=count, poses=bodies)
+        buffers.renderer.render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=bodies, active=active)
 
         def look(offsets_ns: Any, **there: Any) -> None:
-            bodies = there.pop("bodies")
+            bodies_then = there.pop("bodies")
             trace.ray_poses(from_slots, offsets_ns, count=len(posed), **mount, **there)
             if group.motions is not None:
                 times = there["stamps"]
-                pose_bodies(group.motions, times, group.instants, count=times.shape[0], poses=bodies)
+                pose_bodies(group.motions, times, group.instants, count=times.shape[0], poses=bodies_then)
 
         find_twists = partial(trace.camera_twists, from_slots, count=len(posed), **mount)
-        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, body_poses, look, find_twists)
+        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, bodies, look, find_twists)
         for name in {name: None for _, _, name in pictures}:
-            if name in group.processes[lane]:
-                group.processes[lane][name].launch(views)
+            if name in buffers.processes:
+                buffers.processes[name].launch(views)
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:
-            for source, copy in group.picture_copies[lane].items():
+            for source, copy in buffers.copies.items():
                 copy.fetch(0, len(slots) if source in INSTANT_OUTPUTS else used)
         else:
             _bring(group, instants)
@@ -210,7 +208,7 @@ def acquire_room(job: RenderJob) -> None:
         return
     for stamp_ns, slot, name in instants.pictures:
         if (name, stamp_ns) not in instants.rooms:
-            picture = group.picture_copies[instants.lane][group.images[name].source].view(slot, 1)[0]
+            picture = group.buffers[instants.lane].copies[group.images[name].source].view(slot, 1)[0]
             room = group.make_room(name, stamp_ns, picture)
             if room is not None:
                 instants.rooms[name, stamp_ns] = room
@@ -241,7 +239,7 @@ def leave_out(group: RenderGroupState, stamps_ns: Iterable[int], wanted: Collect
 
 def scan_frames(group: RenderGroupState, instants: Instants) -> None:
     """Let the frame sensors see the instants just rendered."""
-    frames = group.renderers[instants.lane].log_radiance
+    frames = group.buffers[instants.lane].renderer.log_radiance
     for name in instants.frames:
         group.frames[name].see(frames, instants.stamps_ns)
 
@@ -262,7 +260,7 @@ def flush_frames(group: RenderGroupState, *, until_ns: int) -> list[Packet]:
 def _bring(group: RenderGroupState, instants: Instants) -> None:
     """Launch the copies of pictures to the host: to the room that there is, or as usual."""
     for stamp_ns, slot, name in instants.pictures:
-        copy = group.picture_copies[instants.lane][group.images[name].source]
+        copy = group.buffers[instants.lane].copies[group.images[name].source]
         room = instants.rooms.get((name, stamp_ns))
         if room is None:
             copy.fetch(slot, 1)
@@ -285,7 +283,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         room = instants.rooms.pop((name, stamp_ns), None)
         if room is not None:
             return room
-        picture: NDArray[Any] = group.picture_copies[instants.lane][image.source].view(slot, 1)[0]
+        picture: NDArray[Any] = group.buffers[instants.lane].copies[image.source].view(slot, 1)[0]
         if borrow:
             return picture
         key = (image.source, slot)  # cameras that take the same picture share the copy

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.frames import normalised
 from neurosim_core.sim.scene_table import SceneTable
 from neurosim_core.sim.trace import Fleet
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
@@ -44,21 +45,6 @@ def begin_of_paths(scenes: SceneTable) -> dict[str, NDArray[np.float64]]:
     rows = {name: values[list(scenes.scene_of_world)] for name, values in of_scene.items()}
     rows["orientation"] = normalised(rows["orientation"])
     return rows
-
-
-def normalised(orientation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quaternions of unit length.
-
-    Raises:
-        ValueError: One is 0, or too large to be normalised.
-    """
-    with np.errstate(over="ignore"):
-        norm: NDArray[np.float64] = np.linalg.norm(orientation, axis=1, keepdims=True)
-    if not ((norm > 1e-6) & (norm < np.inf)).all():
-        raise ValueError(
-            f"orientation must not be 0, nor too large to be normalised, got {orientation.tolist()}"
-        )
-    return orientation / norm
 
 
 @wp.func

@@ -21,18 +21,18 @@ from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.observation import Observation, Samples, VehicleStates
-from neurosim_core.sim.parameters import lenses_differ, vary_sensors
-from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows, take_seeds
+from neurosim_core.sim.observation import Observation, Samples
+from neurosim_core.sim.parameters import WorldSettings, lenses_differ, vary_sensors
+from neurosim_core.sim.reset import begin_of_paths, normalise, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
-from neurosim_core.sim.state import State, WorldSettings, make_state, reset_vehicles
+from neurosim_core.sim.state import State, make_state, reset_vehicles
 from neurosim_core.sim.step import launch, launch_first
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
 
@@ -180,7 +180,7 @@ class Simulation:
         for group in self._state.groups:
             if group.motions is None:
                 raise ValueError("there are no bodies to throw: say what they are in `bodies`")
-            if any(group.processes) or group.rule is not None:
+            if any(each.processes for each in group.buffers) or group.rule is not None:
                 raise ValueError("bodies can be thrown where cameras give colour, depth and events only")
             throw_bodies(group.motions, position, velocity, (0.0, 0.0, -GRAVITY_M_S2))
 
@@ -198,11 +198,6 @@ class Simulation:
     def models(self) -> tuple[Model, ...]:
         """The model of each scene: its free space, path and light."""
         return self._scenes.models
-
-    @property
-    def command_width(self) -> Mapping[str, int]:
-        """Numbers in a command of each mode that was used; of `motor_speeds`, rotors."""
-        return {mode: int(buffer.array.shape[1]) for mode, buffer in self._state.commands.items()}
 
     @property
     def common_ns(self) -> int:
@@ -370,15 +365,7 @@ class Simulation:
                 offsets_ns=offsets_ns,
             )
         return Observation(
-            state=VehicleStates(
-                position=arrays.position,
-                velocity=arrays.velocity,
-                orientation=arrays.orientation,
-                body_rate=arrays.body_rate,
-                air_velocity=arrays.air_velocity,
-                rotor_speed=arrays.rotor_speed,
-                stamp_ns=arrays.stamp_ns,
-            ),
+            state=arrays,
             clock_ns=state.fleet.clock_ns,
             frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
             images={name: picture for group in state.groups for name, picture in group.pictures.items()},

@@ -16,27 +16,23 @@ from numpy.typing import ArrayLike
 
 from neurosim_core.clock import to_ns
 from neurosim_core.control import CommandMode, Controller, make_controller
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.packets import Odometry
-from neurosim_core.render.renderer import RenderWorlds
 from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy, make_stream
 from neurosim_core.sensors.base import (
-    FrameSensorConfig,
     Sampler,
     SamplerContext,
     StateSensorConfig,
-    WorldFrameContext,
 )
-from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sensors.sampler_checks import make_sampler
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.parameters import Rig, lens_tables
-from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_group
+from neurosim_core.sim.parameters import WorldSettings
+from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
 from neurosim_core.sim.render_job import Choice, Instants, RenderJob
-from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
-from neurosim_core.sim.scene_table import SceneTable, single_scene
+from neurosim_core.sim.reset import Start, begin_of_paths, restart
+from neurosim_core.sim.scene_table import single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
 from neurosim_core.sim.trace import Fleet, Trace, make_surfaces
 from neurosim_core.vehicle import DynamicsError
@@ -184,25 +180,6 @@ class State:
     """Wall-clock time by phase [s]."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WorldSettings:
-    """How worlds that are stepped together differ, and what their results are."""
-
-    scenes: SceneTable
-    seeds: Sequence[int]
-    """Of each world."""
-    rigs: Sequence[Rig]
-    """The sensors of each world."""
-    instant_count: int
-    """The most instants of a group in one step."""
-    slot_count: int
-    """The most boundaries of one step."""
-    event_capacity: int | None = None
-    """Room for the events of one world and camera in one step."""
-    ordered: bool = True
-    """Sort events."""
-
-
 def make_state(
     model: Model,
     *,
@@ -290,11 +267,11 @@ def make_state(
         start=_make_start(worlds, start, device),
         path_controller=_path_controller(model, worlds),
         trace=trace,
-        groups=_make_groups(
+        groups=make_render_groups(
             model,
             worlds,
-            seeds,
-            trace.history,
+            seeds=seeds,
+            history=trace.history,
             in_flight=in_flight,
             on_host=on_host,
             make_room=make_room,
@@ -371,77 +348,6 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
     return model.config.vehicle.make(
         VehicleContext(count=len(worlds.seeds), device=model.device, max_step_ns=max_step_ns, seeds=seeds)
     )
-
-
-def _make_groups(
-    model: Model,
-    worlds: WorldSettings,
-    seeds: Any,
-    history: Any,
-    *,
-    in_flight: int,
-    on_host: bool,
-    make_room: MakeRoom | None,
-) -> list[RenderGroupState]:
-    """Return the render groups; none where the scene is not on the device."""
-    config, scenes = model.config, worlds.scenes
-    groups: list[RenderGroupState] = []
-    for index, group in enumerate(model.groups if model.scene_on_device is not None else ()):
-        if not on_host and group.max_displacement_px is not None:
-            raise ValueError(
-                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses "
-                "what to render for one vehicle, on the host"
-            )
-        lenses, lens_of_world = lens_tables(group, worlds.rigs)
-        rooms = {} if on_host else _frame_capacities(group, worlds)
-
-        def world_context(name: str, frames: Any, rooms: Mapping[str, int] = rooms) -> WorldFrameContext:
-            return WorldFrameContext(
-                name=name,
-                configs=[rig[name] for rig in worlds.rigs],
-                frames=frames,
-                capacity=rooms[name],
-                seeds=worlds.seeds,
-                ordered=worlds.ordered,
-            )
-
-        groups.append(
-            make_render_group(
-                group,
-                config.sensors,
-                model.scene_on_device,
-                capacity=model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count,
-                in_flight=in_flight,
-                device=model.device,
-                seed=worlds.seeds[0],
-                seeds=seeds,
-                bodies=config.bodies,
-                worlds=RenderWorlds(
-                    count=len(worlds.seeds),
-                    lenses=lenses,
-                    lens_of_world=lens_of_world,
-                    scenes=scenes.data,
-                    scene_of_world=scenes.scene,
-                    arrays=[each.scene_on_device for each in scenes.models],
-                    terms=scenes.terms,
-                ),
-                on_host=on_host,
-                make_room=make_room,
-                world_context=None if on_host else world_context,
-                history=history,
-            )
-        )
-    return groups
-
-
-def _frame_capacities(group: RenderGroup, worlds: WorldSettings) -> dict[str, int]:
-    """Return for how many results of each frame sensor there is room, before anything is allocated."""
-    configs = {name: worlds.rigs[0][name] for name in group.frame_sensors}
-    return {
-        name: config.world_capacity(len(worlds.seeds), worlds.event_capacity)
-        for name, config in configs.items()
-        if isinstance(config, FrameSensorConfig)
-    }
 
 
 def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -> Any:

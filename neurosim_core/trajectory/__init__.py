@@ -7,18 +7,8 @@ from typing import Annotated
 from pydantic import Field
 
 from neurosim_core.scene.freespace import FreeSpace
-from neurosim_core.trajectory.certify import ClearanceProof, prove_clearance
-from neurosim_core.trajectory.feasibility import FlightBounds, FlightLimits, flight_bounds
-from neurosim_core.trajectory.minsnap import minimum_snap
-from neurosim_core.trajectory.path import (
-    Path,
-    PathArrays,
-    PathCursor,
-    PathPoint,
-    PathSamples,
-    evaluate_path,
-    upload_paths,
-)
+from neurosim_core.trajectory.feasibility import FlightLimits
+from neurosim_core.trajectory.path import Path
 from neurosim_core.trajectory.planner import (
     CollisionFreeConfig,
     PlanningError,
@@ -55,41 +45,7 @@ PathConfig = Annotated[
 ]
 """Where to fly, as a user says it."""
 
-__all__ = [
-    "CircleConfig",
-    "ClearanceProof",
-    "CollisionFreeConfig",
-    "FigureEightConfig",
-    "FlightBounds",
-    "FlightLimits",
-    "HoverConfig",
-    "LineConfig",
-    "LissajousConfig",
-    "Path",
-    "PathArrays",
-    "PathConfig",
-    "PathCursor",
-    "PathPoint",
-    "PathSamples",
-    "PlanningError",
-    "PosesConfig",
-    "TourConfig",
-    "WaypointsConfig",
-    "circle",
-    "evaluate_path",
-    "figure_eight",
-    "flight_bounds",
-    "hover",
-    "line",
-    "lissajous",
-    "make_path",
-    "minimum_snap",
-    "plan_tour",
-    "plan_waypoints",
-    "pose_path",
-    "prove_clearance",
-    "upload_paths",
-]
+__all__ = ["CollisionFreeConfig", "Path", "PathConfig", "PosesConfig", "TourConfig", "make_path"]
 
 
 def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, *, duration_s: float) -> Path:
@@ -129,8 +85,7 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
-    thrust = airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2
-    weight = airframe.mass_kg * airframe.gravity_m_s2
+    thrust, weight = airframe.thrust_max_n, airframe.hover_thrust_n
     if limits.thrust_to_weight_max * weight > thrust:
         raise PlanningError(
             f"limits.thrust_to_weight_max = {limits.thrust_to_weight_max:g} is more than the vehicle has: "

@@ -37,8 +37,6 @@ class ClearanceProof:
     """Whether each piece is proven to keep the clearance asked for, shape [S]."""
     clearance_m: float
     """Proven lower bound of the clearance over all pieces that hold [m]; inf if none does."""
-    sample_min_m: float
-    """Smallest exact clearance that was met at the ends of parts [m]: an upper bound of the true minimum."""
 
 
 def prove_clearance(path: Path, space: FreeSpace, clearance_m: float) -> ClearanceProof:
@@ -73,7 +71,7 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
     length = 1.0 / parts[piece]
     start = (np.arange(len(piece)) - first[piece]) * length
     holds = np.ones(len(coefficients), dtype=bool)
-    proven, met = math.inf, math.inf
+    proven = math.inf
     straight = np.linspace(0.0, 1.0, degree + 1)[:, None]
     for halving in range(_HALVINGS_MAX + 1):
         hull = np.einsum(
@@ -82,7 +80,6 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
         a, b = hull[:, 0], hull[:, -1]
         room = space.clearance(np.concatenate([a, b])) - spare
         room_a, room_b = room[: len(a)], room[len(a) :]
-        met = min(met, float(room.min()) + spare)
         excess = np.linalg.norm(hull - (a[:, None] + straight * (b - a)[:, None]), axis=2).max(axis=1)
         bound = segment_clearance(room_a, room_b, np.linalg.norm(b - a, axis=1)) - excess
         good = bound >= clearance_m
@@ -98,7 +95,7 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
         half = 0.5 * length[open_]
         start = np.stack([start[open_], start[open_] + half], axis=1).reshape(-1)
         length, piece = np.repeat(half, 2), np.repeat(piece[open_], 2)
-    return ClearanceProof(holds=holds, clearance_m=proven, sample_min_m=met)
+    return ClearanceProof(holds=holds, clearance_m=proven)
 
 
 def segment_clearance(room_a: Array, room_b: Array, length: Array) -> Array:

@@ -63,7 +63,7 @@ class CollisionFreeConfig(Settings):
     """Distance from the path to the scene [m]: more than the vehicle's collision radius; holds everywhere."""
     limits: FlightLimits = FlightLimits()
     """What the path may ask of the vehicle; time is scaled so that the tightest of them is met."""
-    lookahead_s: float = Field(default=0.5, gt=0.0)
+    lookahead_s: float = Field(default=0.5, gt=0.0, le=1e6)
     """The vehicle looks to where it will be after this time [s]."""
 
 
@@ -79,8 +79,6 @@ class TourConfig(CollisionFreeConfig):
     """Least height of goals above what is below them [m]."""
     height_max_m: float = Field(default=1.7, gt=0.0)
     """Largest height of goals above what is below them [m]."""
-    goal_count: int | None = Field(default=None, ge=1)
-    """How many places to visit; null: as many as the duration of the run needs."""
 
 
 class WaypointsConfig(CollisionFreeConfig):
@@ -111,7 +109,7 @@ def plan_tour(space: FreeSpace, config: TourConfig, *, duration_s: float) -> Pat
     Args:
         space: Where to fly.
         config: What to plan.
-        duration_s: Least duration of the path [s]; plays no part if `goal_count` is given.
+        duration_s: Least duration of the path [s].
 
     Raises:
         PlanningError: There is no room at this clearance.
@@ -125,7 +123,7 @@ def plan_tour(space: FreeSpace, config: TourConfig, *, duration_s: float) -> Pat
     length = 0.0
     # nothing is faster than the limit, so a way of this length takes at least as long as asked
     length_min = duration_s * config.limits.speed_max_m_s
-    while len(legs) < config.goal_count if config.goal_count is not None else length < length_min:
+    while length < length_min:
         found = search(terrain.slowness, space.voxel_m, here, cost_max_m=_RING[1] * config.leg_length_m)
         goal = _next_goal(found.cost, places, visited, config.leg_length_m, rng)
         if goal is None:

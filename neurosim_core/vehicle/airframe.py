@@ -27,7 +27,6 @@ from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig
 
 TERMS = (
     "motor_lag",
-    "rotor_lags",
     *AIR_TERMS,
     "wind",
     "gusts",
@@ -73,8 +72,6 @@ class MultirotorConfig(Settings):
     """Drag of the frame along body x, y, z per squared air speed [N/(m/s)^2]."""
     motor_time_constant_s: NonNegative = 0.0
     """Time to close 63 % of a step in commanded rotor speed [s]; 0 means at once."""
-    motor_time_constant_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its time constant as a multiple of the common one, where they are not alike."""
     rotor_speed_min_rad_s: NonNegative = 0.0
     """Slowest speed of a rotor [rad/s]; commands below saturate there, as in the motor controller."""
     rotor_speed_max_rad_s: Annotated[float, Field(gt=0.0)]
@@ -113,7 +110,7 @@ class MultirotorConfig(Settings):
                 "rotor_position_m and rotor_direction must have one entry for each rotor, "
                 f"got {len(self.rotor_position_m)} and {len(self.rotor_direction)}"
             )
-        for name in ("rotor_thrust_scale", "rotor_torque_scale", "motor_time_constant_scale"):
+        for name in ("rotor_thrust_scale", "rotor_torque_scale"):
             if len(scale := getattr(self, name)) not in (0, self.rotor_count):
                 raise ValueError(
                     f"{name} must have one entry for each of {self.rotor_count} rotors, or none, "
@@ -146,11 +143,6 @@ class MultirotorConfig(Settings):
     def torque_coefficients_n_m_s2(self) -> NDArray[np.float64]:
         """Reaction torque of each rotor per squared speed [N m/(rad/s)^2], shape [R]."""
         return self._of_each(self.torque_coefficient_n_m_s2, self.rotor_torque_scale)
-
-    @property
-    def motor_time_constants_s(self) -> NDArray[np.float64]:
-        """Time constant of each rotor [s], shape [R]."""
-        return self._of_each(self.motor_time_constant_s, self.motor_time_constant_scale)
 
     @property
     def hover_rotor_speed_rad_s(self) -> float:
@@ -186,8 +178,7 @@ class MultirotorConfig(Settings):
         """
         inertia = np.array(self.inertia_kg_m2)
         needed = {
-            "motor_lag": bool(self.motor_time_constants_s.any()),
-            "rotor_lags": bool(np.ptp(self.motor_time_constants_s) > 0.0),
+            "motor_lag": self.motor_time_constant_s > 0.0,
             "rotor_drag": self._feels_air,
             "translational_lift": self._feels_air,
             "flapping": self.flapping_kg_m > 0.0,

@@ -140,8 +140,7 @@ def top_speed_m_s(vehicle: MultirotorConfig) -> float:
     All rotors are at their highest speed: k v + c v^2 = sqrt(T^2 - (m g)^2) with the rotors' drag k and the
     frame's larger horizontal drag c, both as if the body were level. `SPEED_CEILING_M_S` at most.
     """
-    thrust_n = vehicle.thrust_coefficients_n_s2.sum() * vehicle.rotor_speed_max_rad_s**2
-    surplus = thrust_n**2 - (vehicle.mass_kg * vehicle.gravity_m_s2) ** 2
+    surplus = vehicle.thrust_max_n**2 - vehicle.hover_thrust_n**2
     if not surplus > 0.0:  # it cannot hover; what it is asked for is not its limit
         return SPEED_CEILING_M_S
     push_n = math.sqrt(surplus)

@@ -86,7 +86,7 @@ def make_dormand_prince(equations: Equations) -> Any:
     """
     wind, changing_wind = equations.wind, equations.changing_wind
     near_ground = equations.ground or equations.ground_effect
-    rates, lift, wind_at, sums_at = equations.rates, equations.lift, equations.wind_at, equations.rotors.at
+    rates, lift, wind_at, sums_at = equations.rates, equations.lift, equations.wind_at, equations.sums_at
 
     @wp.func
     def derivative(
@@ -101,7 +101,7 @@ def make_dormand_prince(equations: Equations) -> Any:
         y: _vec12d,
     ):
         """d/dt of displacement, velocity, rotation vector, body rate; q is the attitude at u = 0."""
-        quadratic, linear = sums_at(airframe, sums, around.rotors, vehicle, t)
+        quadratic, linear = sums_at(sums, t)
         v = _part(y, 3)
         u = _part(y, 6)
         w = _part(y, 9)

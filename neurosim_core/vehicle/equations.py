@@ -9,7 +9,7 @@ import warp as wp
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.chart import rotation_series
 from neurosim_core.vehicle.ground import Ground, contact_wrench, lifted
-from neurosim_core.vehicle.rotors import RotorFunctions, make_rotor_functions
+from neurosim_core.vehicle.rotors import make_sums_at
 from neurosim_core.vehicle.wind import WindFunctions, make_wind_functions
 
 
@@ -17,7 +17,6 @@ class Equations(NamedTuple):
     """Device functions of one set of terms, and which of them there are."""
 
     motor_lag: bool
-    rotor_lags: bool
     air_terms: bool
     """Something depends on the air speed."""
     wind: bool
@@ -41,7 +40,8 @@ class Equations(NamedTuple):
     dw/dt in B, B being B0 turned by exp(u); what ends in 0 is in B0."""
     lift: Any
     """(ground, height, quadratic) -> the sums over the rotors with the ground effect."""
-    rotors: RotorFunctions
+    sums_at: Any
+    """See `rotors.make_sums_at`."""
     wind_at: Any
     """See `WindFunctions.at`."""
 
@@ -127,7 +127,6 @@ def make_equations(terms: frozenset[str]) -> Equations:
 
     return Equations(
         motor_lag="motor_lag" in terms,
-        rotor_lags="rotor_lags" in terms,
         air_terms=air_terms,
         wind=air_terms and (winds.changes or "wind" in terms),
         changing_wind=air_terms and winds.changes,
@@ -139,6 +138,6 @@ def make_equations(terms: frozenset[str]) -> Equations:
         forces=forces,
         rates=rates,
         lift=lift,
-        rotors=make_rotor_functions(terms, air_terms=air_terms),
+        sums_at=make_sums_at(terms, air_terms=air_terms),
         wind_at=winds.at,
     )

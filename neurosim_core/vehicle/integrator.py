@@ -96,12 +96,11 @@ def part_of(interval: Interval, duration_ns: wp.int64) -> Interval:
 def make_kernels(terms: frozenset[str]) -> Kernels:
     """Return the kernels that compute only the given terms (see `multirotor.TERMS`)."""
     equations = make_equations(terms)
-    motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
+    motor_lag, air_terms = equations.motor_lag, equations.air_terms
     wind, changing_wind, turbulence = equations.wind, equations.changing_wind, equations.turbulence
     windy = not terms.isdisjoint(("wind", "gusts", "turbulence"))
     near_ground = equations.ground or equations.ground_effect
     forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
-    set_step = equations.rotors.set_step
     fly_fixed = make_rkmk4(equations)
     fly_adaptive = make_dormand_prince(equations)
     name = "_".join(sorted(terms)) or "rigid"
@@ -121,12 +120,12 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
             c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
             d = batch.rotor_speed[vehicle, rotor] - c
             quadratic_cc += c * c * around.rotors.quadratic_weight[rotor]
-            if wp.static(motor_lag and not rotor_lags):
+            if wp.static(motor_lag):
                 quadratic_cd += wp.float64(2.0) * c * d * around.rotors.quadratic_weight[rotor]
                 quadratic_dd += d * d * around.rotors.quadratic_weight[rotor]
             if wp.static(air_terms):
                 linear_c += c * around.rotors.linear_weight[rotor]
-                if wp.static(motor_lag and not rotor_lags):
+                if wp.static(motor_lag):
                     linear_d += d * around.rotors.linear_weight[rotor]
 
         x = batch.position[vehicle]
@@ -173,10 +172,6 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         batch.body_rate[vehicle] = w
         for rotor in range(rotor_count):
             c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
-            if wp.static(rotor_lags):
-                remaining = wp.exp(
-                    -around.rotors.lags[0, rotor].rate * wp.float64(interval.step_count) * interval.step_s
-                )
             if wp.static(motor_lag):
                 batch.rotor_speed[vehicle, rotor] = c + remaining * (batch.rotor_speed[vehicle, rotor] - c)
             else:
@@ -214,8 +209,6 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
                     around.wind, airframe, vehicle, now_ns, batch.position[vehicle], batch.velocity[vehicle]
                 )
                 part = part_of(interval, wp.min(left_ns, time_to_tick(around.wind, now_ns)))
-                if wp.static(rotor_lags):
-                    set_step(around.rotors, vehicle, part.step_s)
                 fly(airframe, around, part, batch, vehicle)
                 left_ns -= part.duration_ns
 

@@ -3,20 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
 from neurosim_core.vehicle.arrays import allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
-from neurosim_core.vehicle.motor import LagConstants, lag_constants
-from neurosim_core.vehicle.rotors import RotorLag, Rotors
+from neurosim_core.vehicle.motor import lag_constants
+from neurosim_core.vehicle.rotors import Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
 from neurosim_core.vehicle.surroundings import Surroundings
 from neurosim_core.vehicle.wind import make_wind
@@ -121,9 +121,8 @@ class Multirotor:
             velocity and of body rate.
         atol: What is added to that [m, m/s, rad, rad/s].
         evaluation_count_max: The most evaluations of the right-hand side for one interval of one vehicle.
-        seed: Of the turbulence, 0 <= seed < 2^64; each vehicle of the batch has its own, by its index.
-        seeds: A seed for each vehicle, device array of uint64, shape [N], in place of `seed`: its turbulence
-            is then that of a vehicle that flies alone with that seed.
+        seed: Of the turbulence, 0 <= seed < 2^64: that of vehicle 0; the others count on from it.
+        seeds: A seed for each vehicle in place of `seed`, device array of uint64, shape [N].
 
     Raises:
         TypeError: What counts is not an integer.
@@ -172,27 +171,35 @@ class Multirotor:
         self._model = make_airframe(config, self.device)
         self.airframes = alike(self._model.airframe, count, self.device)
         """Parameters of each vehicle, [N], which may be written between steps."""
-        self._wind = make_wind(
+        if seeds is None:
+            own = np.arange(count, dtype=np.uint64) + np.uint64(seed)
+            seeds = wp.array(own, dtype=wp.uint64, device=self.device)
+        wind = make_wind(
             config.gusts if "gusts" in self.terms else (),
             config.turbulence,
             turbulent="turbulence" in self.terms,
             wind_m_s=config.wind_m_s,
             ground_height_m=0.0 if config.ground is None else config.ground.height_m,
-            seed=seed,
+            seeds=seeds,
             count=count,
             device=self.device,
-            seeds=seeds,
         )
-        self._ground = make_ground(config.ground, config.rotor_position_m, self.device)
+        self._around = _struct(
+            Surroundings,
+            wind=wind,
+            ground=make_ground(config.ground, config.rotor_position_m, self.device),
+            rotors=_struct(
+                Rotors,
+                quadratic_weight=self._model.quadratic_weight,
+                linear_weight=self._model.linear_weight,
+            ),
+        )
         self._batch = _struct(Batch, **vars(self.arrays))
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
-            self._begin = self._record(
-                self._kernels.begin, self.airframes, self._surroundings(), None, self._batch
-            )
+            self._begin = self._record(self._kernels.begin, self.airframes, self._around, None, self._batch)
         self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
-        self._own_lags: wp.array2d[Any] | None = None
         self.reset()
 
     def reset(
@@ -218,10 +225,6 @@ class Multirotor:
         """
         config, arrays = self.config, self.arrays
         q = self._rows((0.0, 0.0, 0.0, 1.0) if orientation is None else orientation, "orientation", 4)
-        with np.errstate(over="ignore"):
-            norm = np.linalg.norm(q, axis=1, keepdims=True)
-        if not ((norm > 1e-6) & (norm < np.inf)).all():
-            raise ValueError(f"orientation must not be 0, nor too large to be normalised, got {q.tolist()}")
         rotors = config.rotor_count
         hover = np.full(rotors, config.hover_rotor_speed_rad_s)
         speed = self._rows(hover if rotor_speed is None else rotor_speed, "rotor_speed", rotors)
@@ -233,7 +236,7 @@ class Multirotor:
         rows = [
             (arrays.position, self._rows(zero if position is None else position, "position", 3)),
             (arrays.velocity, self._rows(zero if velocity is None else velocity, "velocity", 3)),
-            (arrays.orientation, q / norm),
+            (arrays.orientation, normalised(q)),
             (arrays.body_rate, self._rows(zero if body_rate is None else body_rate, "body_rate", 3)),
             (arrays.rotor_speed, speed),
             (arrays.rotor_speed_command, speed),
@@ -299,7 +302,7 @@ class Multirotor:
             wp.launch(
                 self._kernels.begin,
                 dim=self.count,
-                inputs=[self.airframes, self._surroundings(), mask, self._batch],
+                inputs=[self.airframes, self._around, mask, self._batch],
                 device=self.device,
                 block_dim=_BLOCK_DIM,
             )
@@ -308,7 +311,7 @@ class Multirotor:
         """Evaluate `arrays.acceleration` and `.angular_acceleration` at the current state; device form."""
         if self._acceleration_launch is None:
             self._acceleration_launch = self._record(
-                self._kernels.accelerate, self.airframes, self._surroundings(), self._batch
+                self._kernels.accelerate, self.airframes, self._around, self._batch
             )
         self._acceleration_launch.launch()
 
@@ -389,7 +392,7 @@ class Multirotor:
     def _record_interval(self, duration_ns: int) -> wp.Launch:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
-        lags = [lag_constants(step_s, float(tau_s)) for tau_s in self.config.motor_time_constants_s]
+        lag = lag_constants(step_s, self.config.motor_time_constant_s)
         is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
         interval = _struct(
             Interval,
@@ -397,47 +400,16 @@ class Multirotor:
             max_step_ns=self.max_step_ns,
             step_s=step_s,
             step_count=step_count,
-            speed_nodes=wp.vec3d(*lags[0].speed_nodes),
-            square_nodes=wp.vec3d(*lags[0].square_nodes),
-            decay=lags[0].decay,
-            lag_rate=lags[0].rate_1_s,
+            speed_nodes=wp.vec3d(*lag.speed_nodes),
+            square_nodes=wp.vec3d(*lag.square_nodes),
+            decay=lag.decay,
+            lag_rate=lag.rate_1_s,
             is_adaptive=is_adaptive,
             rtol=rtol,
             atol=atol,
             evaluation_count_max=evaluation_count_max,
         )
-        return self._record(
-            self._kernels.advance, self.airframes, self._surroundings(lags), interval, self._batch
-        )
-
-    def _surroundings(self, lags: Sequence[LagConstants] = ()) -> Surroundings:
-        """Return all but the airframe; of the rotors, lags only where they are not equal."""
-        rotors = _struct(
-            Rotors,
-            quadratic_weight=self._model.quadratic_weight,
-            linear_weight=self._model.linear_weight,
-            command=self.arrays.rotor_speed_command,
-            speed=self.arrays.rotor_speed,
-        )
-        if lags and "rotor_lags" in self.terms:
-            rotors.lags = self._rotor_lags(lags)
-        around: Surroundings = _struct(Surroundings, wind=self._wind, ground=self._ground, rotors=rotors)
-        return around
-
-    def _rotor_lags(self, lags: Sequence[LagConstants]) -> wp.array2d[Any]:
-        """Return the lags of one length of step, or what kernels set them in for each vehicle."""
-        if self._own_lags is not None:
-            return self._own_lags
-        own = "turbulence" in self.terms
-        table = np.zeros((self.count if own else 1, len(lags)), dtype=RotorLag.numpy_dtype())
-        table["rate"] = [lag.rate_1_s for lag in lags]
-        if not own:
-            table["speed_nodes"] = [lag.speed_nodes for lag in lags]
-            table["square_nodes"] = [lag.square_nodes for lag in lags]
-        array: wp.array2d[Any] = wp.array(table, dtype=RotorLag, device=self.device)
-        if own:
-            self._own_lags = array
-        return array
+        return self._record(self._kernels.advance, self.airframes, self._around, interval, self._batch)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

@@ -38,13 +38,12 @@ def make_rkmk4(equations: Equations) -> Any:
     steps; position [m] and velocity [m/s] in W, attitude, body rate [rad/s]. It returns the last four, what
     is left of the decaying part, and whether the guard tripped; then the others mean nothing.
     """
-    motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
+    motor_lag, air_terms = equations.motor_lag, equations.air_terms
     wind, changing_wind = equations.wind, equations.changing_wind
     near_ground = equations.ground or equations.ground_effect
     contact = equations.ground
     forces, rates, rotor_wrench = equations.forces, equations.rates, equations.rotor_wrench
     solve_inertia, lift, wind_at = equations.solve_inertia, equations.lift, equations.wind_at
-    rotor_nodes = equations.rotors.nodes
 
     @wp.func
     def gust_at(
@@ -122,16 +121,7 @@ def make_rkmk4(equations: Equations) -> Any:
             linear_1 = linear_c
             linear_2 = linear_c
             linear_4 = linear_c
-            if wp.static(rotor_lags):
-                lag_1, lag_2, lag_4, slow_1, slow_2, slow_4 = rotor_nodes(airframe, around.rotors, vehicle, t)
-                quadratic_1 += lag_1
-                quadratic_2 += lag_2
-                quadratic_4 += lag_4
-                if wp.static(air_terms):
-                    linear_1 += slow_1
-                    linear_2 += slow_2
-                    linear_4 += slow_4
-            elif wp.static(motor_lag):
+            if wp.static(motor_lag):
                 quadratic_1 += speed_nodes[0] * quadratic_cd + square_nodes[0] * quadratic_dd
                 quadratic_2 += speed_nodes[1] * quadratic_cd + square_nodes[1] * quadratic_dd
                 quadratic_4 += speed_nodes[2] * quadratic_cd + square_nodes[2] * quadratic_dd
@@ -237,7 +227,7 @@ def make_rkmk4(equations: Equations) -> Any:
             q = q * quaternion_exp(u)
             # one Newton step towards unit length: exact to rounding this close to it
             q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
-            if wp.static(motor_lag and not rotor_lags):
+            if wp.static(motor_lag):
                 remaining *= decay
                 quadratic_cd = decay * quadratic_cd
                 quadratic_dd = decay * decay * quadratic_dd

@@ -100,8 +100,7 @@ class Wind:
     """What blows, besides the constant wind of the airframe."""
 
     gusts: wp.array(dtype=Gust)
-    seed: wp.uint64
-    seeds: wp.array(dtype=wp.uint64)  # of each vehicle as if it flew alone, [N]; empty: `seed` is that of all
+    seeds: wp.array(dtype=wp.uint64)  # of each vehicle, [N]
     tick_ns: wp.int64
     sigma_w: wp.float64
     along: wp.vec3d  # horizontal direction of the mean wind
@@ -120,10 +119,9 @@ def make_wind(
     turbulent: bool,
     wind_m_s: Vector3,
     ground_height_m: float,
-    seed: int,
+    seeds: Any,
     count: int,
     device: Any,
-    seeds: Any = None,
 ) -> Wind:
     """Allocate what gusts and turbulence need, for a number of vehicles; nothing for what there is not.
 
@@ -133,11 +131,9 @@ def make_wind(
         turbulent: There is turbulence, be it still.
         wind_m_s: Mean wind, which turbulence is aligned with.
         ground_height_m: z of the ground in W.
-        seed: Of the turbulence.
+        seeds: Of the turbulence of each vehicle, device array of uint64, shape [N].
         count: Number of vehicles.
         device: Warp device.
-        seeds: Of each vehicle, as if it flew alone, device array of uint64, shape [N]; None: `seed` is that
-            of all, which differ by their index.
     """
     wind = Wind()
     if gusts:
@@ -154,9 +150,7 @@ def make_wind(
         turbulence = turbulence or TurbulenceConfig(wind_20ft_m_s=1.0)
         horizontal = math.hypot(wind_m_s[0], wind_m_s[1])
         along = (wind_m_s[0] / horizontal, wind_m_s[1] / horizontal) if horizontal > 0.0 else (1.0, 0.0)
-        wind.seed = seed
-        if seeds is not None:
-            wind.seeds = seeds
+        wind.seeds = seeds
         wind.tick_ns = to_ns(turbulence.sample_s)
         wind.sigma_w = sigma_w
         wind.along = wp.vec3d(*along, 0.0)
@@ -226,9 +220,7 @@ def _next_along(z: wp.float64, theta: wp.float64, noise: wp.float64) -> wp.float
 
 @wp.func
 def _noise(wind: Wind, vehicle: wp.int32, tick: wp.int64, axis: wp.int32) -> wp.vec2d:
-    if wind.seeds.shape[0] > 0:
-        return normal2(random_bits(wind.seeds[vehicle], _STREAM, tick, axis))
-    return normal2(random_bits(wind.seed, _STREAM, tick, wp.int32(3) * vehicle + axis))
+    return normal2(random_bits(wind.seeds[vehicle], _STREAM, tick, axis))
 
 
 @wp.func

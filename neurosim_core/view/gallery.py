@@ -20,6 +20,7 @@ from neurosim_core.config import load_config
 from neurosim_core.flight import saved_flight
 from neurosim_core.learn.pilot import fly_policy
 from neurosim_core.packets import Events, Packet, PointCloud, as_numpy, join_events, schema_of
+from neurosim_core.sensors.corners import Corners
 from neurosim_core.sensors.event_presets import PRESETS
 from neurosim_core.sim.model import make_model
 from neurosim_core.sim.rollout import run, run_model
@@ -43,6 +44,7 @@ _MORE: Mapping[str, Mapping[str, Any]] = {
     "frame_camera": {"color": "bayer_rggb", "full_well_e": 400, "shot_noise": True, "read_noise_e": 6},
     "lidar": {"preset": "velodyne_vlp16", "deskew": True},
     "optical_flow": {"window_s": 0.02},
+    "range_finder": {"lens": {"width": 5, "height": 5, "horizontal_fov_rad": 0.07}},
 }
 """What a kind of sensor is shown with, besides its lens."""
 _LENSES = (
@@ -191,6 +193,9 @@ def _picture(packets: list[Packet]) -> NDArray[np.uint8] | None:
         return event_picture(recent, width=events[0].width, height=events[0].height)
     if packets and isinstance(packets[-1], PointCloud):
         return _from_above(as_numpy(packets[-1].points))
+    if packets and isinstance(packets[-1], Corners):
+        column, row = as_numpy(packets[-1].pixels).astype(int).T
+        return _dots(row, column, np.array([30, 60, 150], np.uint8))
     try:
         kind, data = picture_of(packets[-1])
     except (ValueError, IndexError):
@@ -212,12 +217,19 @@ def _turbo(share: NDArray[Any]) -> NDArray[Any]:
 
 def _from_above(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return points in the plan, dark on white, coloured by height."""
-    picture = np.full((_SIZE["height"], _SIZE["width"], 3), 255, np.uint8)
     scale = 0.48 * _SIZE["height"] / max(1e-3, float(np.quantile(np.abs(points[:, :2]), 0.99)))
-    row = (_SIZE["height"] / 2 - scale * points[:, 1]).astype(int).clip(0, _SIZE["height"] - 1)
-    column = (_SIZE["width"] / 2 + scale * points[:, 0]).astype(int).clip(0, _SIZE["width"] - 1)
+    row = (_SIZE["height"] / 2 - scale * points[:, 1]).astype(int)
+    column = (_SIZE["width"] / 2 + scale * points[:, 0]).astype(int)
     height = np.clip((points[:, 2] + 1.3) / 2.6, 0.0, 1.0)
-    picture[row, column] = (230 * _turbo(height)).astype(np.uint8)
+    return _dots(row, column, (230 * _turbo(height)).astype(np.uint8))
+
+
+def _dots(row: NDArray[Any], column: NDArray[Any], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a white picture with dots of two by two pixels."""
+    picture = np.full((_SIZE["height"], _SIZE["width"], 3), 255, np.uint8)
+    for down, right in np.ndindex(2, 2):
+        place = (row + down).clip(0, _SIZE["height"] - 1), (column + right).clip(0, _SIZE["width"] - 1)
+        picture[place] = colors
     return picture
 
 

@@ -19,8 +19,8 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
     plots/<vehicle>/<sensor>/<field>        numbers, bars and texts; speed, height, rotor speeds of a pose
     plots/<vehicle>/command/<mode>          what it was told to do
     plots/<vehicle>/links/<link>            delay of each message [ms]; a gap where one was lost
-    plots/<vehicle>/<name>                  what `log_scalar` was given
-    simulator/<name>, status                what `log_simulator` and `log_status` were given
+    plots/<vehicle>/clearance               room around it, as `log_values` was given
+    simulator/<name>, status                how it is doing: what `log_values` and `log_status` were given
 """
 
 from __future__ import annotations
@@ -194,16 +194,15 @@ class RerunLogger:
             )
             self._recording.log(f"world/paths/{vehicle or self._first}", path, static=True)
 
-    def log_scalar(self, name: str, stamp_ns: int, value: float, *, vehicle: str | None = None) -> None:
-        """Plot a quantity that no packet carries, such as the clearance [m].
+    def log_values(self, entity: str, stamp_ns: int, values: Mapping[str, ArrayLike]) -> None:
+        """Plot quantities that no packet carries.
 
         Args:
-            name: Name of the plot; the blueprint shows `clearance`.
+            entity: Their plot, as in the list above, such as plots/drone/clearance or simulator/timing.
             stamp_ns: Time [ns].
-            value: Value in SI units.
-            vehicle: Name of the vehicle; None: the first one.
+            values: One value for each line, by its name; the same names every time.
         """
-        self._plot(f"plots/{vehicle or self._first}/{name}", stamp_ns, value, (name,))
+        self._plot(entity, stamp_ns, list(values.values()), tuple(values))
 
     def log_rotor_speeds(
         self, sensor: str, stamp_ns: int, speed: NDArray[np.float64], *, vehicle: str | None = None
@@ -235,16 +234,6 @@ class RerunLogger:
         if mode == "attitude":
             row = np.array([row[0], *_roll_pitch_yaw(row[1:5])])
         self._plot(f"plots/{vehicle or self._first}/command/{mode}", stamp_ns, row, names)
-
-    def log_simulator(self, name: str, stamp_ns: int, values: Mapping[str, float]) -> None:
-        """Plot how the simulator is doing.
-
-        Args:
-            name: Name of the plot; the blueprint shows `timing`, `real_time_factor` and `losses`.
-            stamp_ns: Time [ns].
-            values: One value for each line, by its name; the same names every time.
-        """
-        self._plot(f"simulator/{name}", stamp_ns, list(values.values()), tuple(values))
 
     def log_status(self, stamp_ns: int, text: str) -> None:
         """Show a text beside the pictures.

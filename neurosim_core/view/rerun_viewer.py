@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib.util
 import os
 import signal
@@ -23,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 
 from neurosim_core.install import install_hint
-from neurosim_core.signals import stop_at_signals
+from neurosim_core.signals import end_with_parent, stop_at_signals
 from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
 
 HOST = "127.0.0.1"
@@ -32,7 +31,6 @@ _END_S = 0.5
 _POLL_S = 0.1
 _WINDOW_MEMORY = "2GB"
 _SERVER_MEMORY = "1GB"
-_PR_SET_PDEATHSIG = 1
 
 
 class ViewerEnded(RuntimeError):
@@ -86,7 +84,7 @@ class RerunViewer:
             stderr=self._words,
             env={**os.environ, "RERUN_APP_ONLY": "true"},
             start_new_session=True,  # Ctrl-C is for us, and we end it
-            preexec_fn=_end_with_parent(),
+            preexec_fn=end_with_parent(signal.SIGTERM),
         )
         try:
             self._wait_for(data_port, waiting)
@@ -232,11 +230,3 @@ def _free_ports(*wanted: int) -> list[int]:
                 probe.bind((HOST, port))
             ports.append(int(probe.getsockname()[1]))
     return ports
-
-
-def _end_with_parent() -> Callable[[], None] | None:
-    """What the viewer does first: ask to be ended when this process is killed. Only Linux can."""
-    if sys.platform != "linux":
-        return None
-    prctl = ctypes.CDLL(None).prctl
-    return lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

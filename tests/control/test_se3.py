@@ -64,18 +64,6 @@ def test_tracking_is_exact_in_the_limit(device):
     assert errors[-1] < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("off", "factor"),
-    [({"feed_forward_snap": False}, 3.0), ({"feed_forward_jerk": False, "feed_forward_snap": False}, 30.0)],
-)
-def test_each_feed_forward_term_is_needed(off, factor):
-    """Without a term the error no longer vanishes; each is worth at least this factor at 500 Hz."""
-    config, path = preset("hummingbird", **IDEAL), eight(4.0, 4.0)
-    with_all = path_error(config, path, rate_hz=500.0).max()
-    without = path_error(config, path, rate_hz=500.0, gains=Se3Config(**off)).max()
-    assert without > factor * with_all
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_attitude_step_response(device, axis):
     """A small attitude error obeys e'' + rate_gain e' + attitude_gain e = 0."""

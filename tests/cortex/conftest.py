@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes import Child
+from peer import Number
+from processes import SOON_S, Child
 from runtime_directory import runtime
 
 from cortex.node import Node
+from cortex.policy import reliable
+from cortex.publisher import Publisher
+from cortex.subscriber import Subscriber
 
 __all__ = ["runtime"]
 
@@ -24,6 +28,21 @@ def make_node(runtime: Path) -> Iterator[Callable[..., Node]]:
             return stack.enter_context(Node(name, **options))  # type: ignore[arg-type]
 
         yield make
+
+
+@pytest.fixture
+def node(make_node: Callable[..., Node]) -> Node:
+    """A node that knows only itself, so that no registry has to start."""
+    return make_node(registry="off")
+
+
+@pytest.fixture
+def numbers(node: Node) -> tuple[Publisher[Number], Subscriber[Number]]:
+    """A publisher and its reliable subscriber."""
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    return publisher, subscriber
 
 
 @pytest.fixture

@@ -12,22 +12,9 @@ from peer import Number
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
-from cortex.inlet import PAUSE_COUNT
+from cortex.fast_receive import PAUSE_COUNT
 
 STREAM = 12 * PAUSE_COUNT
-
-
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
-@pytest.fixture
-def numbers(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    return publisher, subscriber
 
 
 def test_async_iteration(numbers):

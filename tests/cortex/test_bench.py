@@ -257,10 +257,10 @@ def test_another_checkout_is_measured_beside_each_way_of_cortex():
 # Tables.
 
 
-def printed(function: Any, results: Any, *, judged: bool = True) -> str:
+def printed(function: Any, results: Any, **options: Any) -> str:
     console = make_console()
     with console.capture() as capture:
-        function(console, results, judged=judged)
+        function(console, results, **options)
     return capture.get()
 
 
@@ -273,7 +273,7 @@ def results() -> list[CaseResult]:
 
 
 def test_summary_says_met_or_missed_and_counts():
-    text = printed(print_summary, results())
+    text = printed(print_summary, results(), judged=True)
     assert "0.90 ± 0.00" in text
     assert "1 met, 1 missed" in text
 
@@ -330,7 +330,8 @@ def test_case(tiny_run: tuple[str, list[dict[str, str]]], name: str):
         if contestant.peer in OPTIONAL and (row["absent"] or row.get("error")):  # said in words
             continue
         assert not row.get("error"), contestant.name
-        figures = [row[metric] for metric in case.metrics if row[metric]]
+        # Memory may shrink, too: the ring that one with more room has replaced is let go.
+        figures = [row[metric] for metric in case.metrics if row[metric] and metric != "grown_kb"]
         assert figures, contestant.name
         assert min(map(float, figures)) >= 0.0, contestant.name
         faults = {row[count] for count in ("lost", "misordered", "corrupt")}

@@ -93,7 +93,7 @@ def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, 
     with child.stopped():
         thread = threading.Thread(target=publish)
         thread.start()
-        wait_for(lambda: publisher._patience.is_waiting)
+        wait_for(lambda: publisher._back_pressure.is_waiting)
         node.stop_waiting()
         thread.join(SOON_S)
         assert not thread.is_alive()

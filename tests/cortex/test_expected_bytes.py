@@ -12,11 +12,6 @@ from cortex import keep_last, latest, reliable
 EXPECTED = 400_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def scan(number, size_bytes):
     return Scan(number, np.full(size_bytes // 4, number, np.float32))
 

@@ -20,11 +20,6 @@ from cortex import keep_last, latest, reliable
 LARGE = 100_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def scan(number, size=LARGE):
     return Scan(number, np.full(size, number, np.float32))
 

@@ -17,11 +17,6 @@ from cortex.compiled import native
 pytestmark = pytest.mark.skipif(native is None, reason="without the C module there are no short cuts")
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def test_what_is_not_as_usual_goes_the_long_way(node):
     """Another class, a wrong dtype, an array that is not contiguous: the same words, and no slot is lost."""
     publisher, subscriber = connected(node, Scan, reliable(64, 5.0))

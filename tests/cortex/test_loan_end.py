@@ -20,11 +20,6 @@ LARGE = 50_000
 FORGOTTEN = "/large: a loan was forgotten, neither published nor dropped"
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def borrow_all(publisher: Publisher[Scan], size: int = LARGE) -> list[Loan]:
     """Take every slot there is on loan."""
     loans: list[Loan] = []

@@ -18,11 +18,6 @@ SHAPE = (60, 480, 3)
 DIMS = dict(zip(("height", "width", "channels"), SHAPE, strict=True))
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 @pytest.fixture(params=["as it is", "the long way"])
 def way(request, monkeypatch):
     """Without the C module there is only the long way."""
@@ -65,7 +60,7 @@ def test_the_same_bytes_as_a_message_that_is_copied(node, way):
         with pytest.raises(RuntimeError, match="before"):
             loan.publish(expected)
         del room, body, lent_body, loan
-    assert not way or True in way  # not each: now and then the gate looks who has come
+    assert not way or True in way  # not each: now and then the fast path looks who has come
     wait_for(lambda: slots_held(publisher) == 0)
 
 

@@ -21,7 +21,7 @@ def test_the_end_comes_after_a_full_queue(make_node, monkeypatch):
     assert subscriber.wait_for_publisher(SOON_S)
     assert subscriber.carriers == ["tcp"]
     block, count = make_block(0, 10_000), 6_000
-    with subscriber._turn:  # nobody reads: queues and buffers fill up, and the rest is dropped
+    with subscriber._receive_lock:  # nobody reads: queues and buffers fill up, and the rest is dropped
         for _ in range(count):
             publisher.publish(block)
         closing = threading.Thread(target=publisher.close, kwargs={"linger_s": SOON_S})

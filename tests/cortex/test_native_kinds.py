@@ -354,11 +354,6 @@ def test_nothing_of_any_kind_is_leaked():
 # Through a ring
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 @message
 class Frames:
     """Nothing in it is of a size known in advance."""
@@ -375,7 +370,7 @@ def opened(node, kind, value):
     for _ in range(3):
         publisher.publish(value)
         subscriber.recv(SOON_S)
-    assert publisher._gate.ring is not None
+    assert publisher._fast_send.ring is not None
     return publisher, subscriber
 
 
@@ -422,7 +417,7 @@ def test_a_list_that_changes_between_measuring_and_writing(node, change):
     numbers = [float(k) for k in range(20_000)]
     value = Frames(5, [], numbers)
     publisher, subscriber = opened(node, Frames, value)
-    acquire, changed = publisher._gate.large_acquire, []
+    acquire, changed = publisher._fast_send.large_acquire, []
 
     def change_and_acquire(may_wait: bool) -> bool:
         if not changed:
@@ -435,7 +430,7 @@ def test_a_list_that_changes_between_measuring_and_writing(node, change):
                 numbers[7] = "seven"
         return acquire(may_wait)
 
-    publisher._gate.large_acquire = change_and_acquire
+    publisher._fast_send.large_acquire = change_and_acquire
     if change == "wrong":
         with pytest.raises(TypeError, match=r"numbers\[7\]"):
             publisher.publish(value)

@@ -17,11 +17,6 @@ from cortex import keep_last, latest, reliable
 MANY = 1_000_000 if os.environ.get("CORTEX_LONG_TESTS") else 100_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def connected(node, policy, **options):
     """A publisher and a subscriber of one node."""
     publisher = node.publisher("/numbers", Number, **options)

@@ -18,11 +18,6 @@ from cortex.publisher import Closed
 LARGE = 100_000
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def scan(number, size=3):
     return Scan(number, np.full(size, number, np.float32))
 
@@ -234,7 +229,7 @@ def test_closing_while_another_thread_is_held_up(node):
     for thread in threads:
         thread.start()
     published = -1
-    while published != (published := publisher._gate.sequence) or published < 100:
+    while published != (published := publisher._fast_send.sequence) or published < 100:
         time.sleep(0.05)
     publisher.close()
     for thread in threads:

@@ -15,7 +15,6 @@ import pytest
 import zmq
 from directories import (
     ROOT,
-    TYPES,
     answers_unknown,
     dealer,
     drive,
@@ -51,7 +50,8 @@ from cortex.records import (
     check_record,
 )
 from cortex.registry import Registry, RegistryRunning, ensure_registry
-from cortex.wire import control_frame, parse_control
+from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
+from cortex.wire import control_frame
 
 
 @pytest.fixture(autouse=True)
@@ -195,7 +195,7 @@ def test_a_flood_of_nodes_is_bounded_and_told_why(make, caplog):
             sum("there are 3 nodes already" in r.getMessage() for r in caplog.records) == 4
         )  # both sides, once
         next(node for node in nodes if node.directory.connected).close()
-        live = [node for node in nodes if not node.directory._links[0].socket.closed]
+        live = [node for node in nodes if not node.directory.socket.closed]
         drive(live, lambda: any(node.directory.connected for node in refused))  # the place is taken
 
 
@@ -322,23 +322,26 @@ def test_a_node_belongs_to_the_process_that_came_with_it(make):
         drive([watcher], lambda: not watcher.directory.nodes.get(0xACE))
 
 
-def test_a_node_belongs_to_its_key(context, make):
-    """Over CURVE: neither another key's record nor its farewell counts, at a registry or at a peer."""
-    key, other = (zmq.curve_keypair()[0].decode() for _ in range(2))
-    endpoint = Endpoint("tcp", "tcp://h:1", "tcp://h:2", "tcp://h:3", key)
-    record = make_record("x", endpoints=[endpoint])
-    newer = dataclasses.replace(record, revision=9, name="theft")
-    peer = make("peer", registry="off")
-
-    def answer(message, sender):
-        frame = peer.directory.answer(control_frame(message), sender)
-        return None if frame is None else parse_control(frame, TYPES)[0]
-
-    assert isinstance(answer(Hello(False, record), other), Refused)
-    assert isinstance(answer(Hello(False, record), key), Changed)
-    assert isinstance(answer(Hello(False, newer), other), Refused)
-    answer(Leave(record.node), other)
-    assert peer.names == ["x"]
-    assert isinstance(answer(Hello(False, newer), key), Changed)
-    answer(Leave(record.node), key)
-    assert not peer.names
+def test_a_node_belongs_to_its_key(make, tmp_path):
+    """Over CURVE: neither another key's record nor its farewell counts, nor addresses with another's key."""
+    public = {name: new_keys(tmp_path / name).public for name in ("registry", "owner", "thief")}
+    lines = [public["owner"], public["thief"], f"{public['registry']} 127.0.0.1"]
+    for name in public:
+        (tmp_path / name / AUTHORIZED_FILE).write_text("\n".join(lines))
+    keys = {name: load_keys(tmp_path / name) for name in public}
+    with serving(listen="tcp://127.0.0.1:*", keys=keys["registry"]) as registry:
+        watcher = make("watcher")
+        owner = make("owner", registry=registry.address, keys=keys["owner"])
+        endpoint = Endpoint("tcp", "tcp://h:1", "tcp://h:2", "tcp://h:3", public["owner"])
+        owner.record = dataclasses.replace(owner.record, endpoints=[endpoint])
+        drive([owner, watcher], lambda: watcher.names == ["owner"])
+        for node, refusals in ((owner.id, 1), (make_record("x").node, 2)):  # its number, or its key
+            thief = make("thief", registry=registry.address, keys=keys["thief"])
+            thief.record = dataclasses.replace(owner.record, node=node, name="theft")
+            thief.directory._revision = 1000
+            thief.directory.announce()
+            drive([owner, watcher, thief], lambda refusals=refusals: registry.refused >= refusals)
+            thief.close()
+        drive_for([owner, watcher], 0.3)
+        assert watcher.names == ["owner"]
+        assert not watcher.ever_lost

@@ -30,11 +30,6 @@ class Bulk:
     data: bytes
 
 
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
 def double(request):
     return Number(request.stamp_ns, 2 * request.value)
 

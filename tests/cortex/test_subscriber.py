@@ -16,26 +16,13 @@ import zmq
 from peer import Number, OtherNumber, Scan
 from processes import SOON_S, in_time, wait_for
 
-from cortex import keep_last, reliable, turn
+from cortex import keep_last, receive_lock, reliable
 from cortex.codec import codec_of
 from cortex.publisher import Closed
 from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
 
 LARGE = 100_000
-
-
-@pytest.fixture
-def node(make_node):
-    return make_node(registry="off")
-
-
-@pytest.fixture
-def numbers(node):
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    return publisher, subscriber
 
 
 def scan(number, size=LARGE):
@@ -85,7 +72,7 @@ def test_a_handler_that_uses_the_subscriber_it_has_interrupted_is_told_so(number
     if threading.current_thread() is not threading.main_thread():
         pytest.skip("only the main thread handles signals")
     publisher, subscriber = numbers
-    monkeypatch.setattr(turn, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(receive_lock, "PATIENCE_S", 0.05)
     before = signal.signal(signal.SIGALRM, lambda *_: subscriber.publisher_count)
     signal.setitimer(signal.ITIMER_REAL, 0.2, 0.2)  # again where it came between two waits
     try:

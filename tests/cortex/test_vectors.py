@@ -16,10 +16,10 @@ from cortex.intake import Intake
 from cortex.link import Link
 from cortex.message import is_message
 from cortex.policy import keep_last
+from cortex.receive_lock import ReceiveLock
 from cortex.records import PublisherRecord
 from cortex.schema import Schema, fingerprint_of, schema_of, type_from_schema
 from cortex.stats import SubscriberCounters
-from cortex.turn import Turn
 from cortex.wire import (
     AttachAnswer,
     AttachKey,
@@ -143,7 +143,7 @@ def test_malformed_frames(case):
     counters = SubscriberCounters()
     link = make_link(counters)
     try:
-        Intake(keep_last(), counters, Turn()).accept(link, frame, timed=False)
+        Intake(keep_last(), counters, ReceiveLock()).accept(link, frame, timed=False)
     finally:
         link.close()
     assert counters.rejected == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
+from directories import mutate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -124,7 +125,7 @@ def test_an_attach_answer_survives(key, answer):
 @given(keys, answers, st.data())
 def test_an_attach_answer_is_refused_or_fits_its_frame(key, answer, data):
     """Whatever is changed, what comes out is all of the frame and no more."""
-    frame = data.draw(mutated(answer_frame(attach_key(key, stamped=True), answer)))
+    frame = mutate(answer_frame(attach_key(key, stamped=True), answer), data.draw(st.randoms()))
     try:
         parsed = parse_answer(frame)
     except MalformedMessage:
@@ -138,39 +139,6 @@ def test_an_attach_answer_with_bad_counts(value):
     struct.pack_into("<I", frame, 48, value)
     with pytest.raises(MalformedMessage, match=f"{value} bytes"):
         parse_answer(bytes(frame))
-
-
-# Mutation
-
-
-def mutated(frame):
-    """A strategy: the frame cut, extended, with bytes or numbers replaced, or a stretch of it repeated."""
-
-    def cut(n):
-        return frame[:n]
-
-    def replace(changes):
-        data = bytearray(frame)
-        for place, byte in changes:
-            if data:
-                data[place % len(data)] = byte
-        return bytes(data)
-
-    def overwrite(place, number, size):
-        data = bytearray(frame)
-        raw = number.to_bytes(8, "little")[:size]
-        place = place % max(len(data) - size, 1)
-        data[place : place + size] = raw
-        return bytes(data)
-
-    extreme = st.sampled_from([0, 1, 63, 64, 65, 2**31, 2**32 - 1, 2**63, 2**64 - 1])
-    return st.one_of(
-        st.integers(0, len(frame)).map(cut),
-        st.lists(st.tuples(st.integers(0, 2**16), u8), min_size=1, max_size=8).map(replace),
-        st.builds(overwrite, st.integers(0, len(frame)), extreme, st.sampled_from([1, 2, 4, 8])),
-        st.binary(min_size=1, max_size=64).map(lambda more: frame + more),
-        st.integers(0, len(frame)).map(lambda n: frame[:n] + frame),
-    )
 
 
 # Control frames
@@ -192,7 +160,7 @@ def test_a_control_message_of_another_type_is_refused():
 @settings(max_examples=300)
 @given(st.data())
 def test_a_mutated_control_frame_is_refused_or_a_message(data):
-    frame = data.draw(mutated(control_frame(Heartbeat(1, 2, 3))))
+    frame = mutate(control_frame(Heartbeat(1, 2, 3)), data.draw(st.randoms()))
     try:
         received, _ = parse_control(frame, control_types(Heartbeat))
     except MalformedMessage:

@@ -236,6 +236,22 @@ def test_worlds_give_the_windows_of_runs(scene):
         next(world_windows(config, HEADS["flow"], worlds=2, bins=5, window_s=0.0505))
 
 
+def test_worlds_draw_thresholds_and_render_as_often_as_is_said(scene, monkeypatch):
+    """On one path worlds see the same but for their thresholds; fewer renders see nearly the same events."""
+    monkeypatch.setattr(dense_worlds, "_PATHS_MAX", 1)
+    config, options = settings(scene, seed=3), {"worlds": 2, "bins": 5, "window_s": 0.05}
+    totals = {}
+    for renders, spread in ((None, 0.0), (2, 0.0), (2, 0.25)):
+        flown = world_windows(config, HEADS["pretrain"], renders=renders, threshold_spread=spread, **options)
+        voxels = [found.voxel.clone() for found in itertools.islice(flown, 4)]
+        one, other = torch.stack(voxels, 1)
+        assert torch.equal(one, other) == (spread == 0.0)
+        totals[renders, spread] = one.abs().sum().item()
+    assert totals[2, 0.0] == pytest.approx(
+        totals[None, 0.0], rel=0.2
+    )  # what flickers within 25 ms is not seen
+
+
 def test_worlds_fly_on_when_their_windows_have_been_seen(tmp_path, flights, scene, monkeypatch):
     monkeypatch.setattr(dense_train, "flight_settings", lambda *_, **__: settings(scene))
     config = DenseConfig(task="flow", steps=3, batch=1, channels=4, reuse=0.25)

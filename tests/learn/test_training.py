@@ -55,6 +55,7 @@ CONDITIONS = (
     "clock 36 % slower",
     "actions one step later",
     "three tenths of the actions lost",
+    "three tenths of the event packets lost",
 )
 
 
@@ -111,6 +112,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
 
     training = Training(tmp_path, small(), models=[hall])
     policy = training.student
+    torch.nn.init.normal_(policy.motion.weight, 0.0, 0.05)  # zero at first
     export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
     pilot = Pilot(tmp_path / "policy.onnx")
     rng = np.random.default_rng(0)
@@ -151,6 +153,7 @@ def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):
 
     training = Training(tmp_path, small(), models=[hall])
     policy = training.student
+    torch.nn.init.normal_(policy.motion.weight, 0.0, 0.05)  # zero at first
     export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     rng = np.random.default_rng(3)
@@ -262,6 +265,18 @@ def test_a_policy_is_evaluated_where_it_was_not_trained(tmp_path, hall, monkeypa
     found = dict(transfer.evaluate_transfer(tmp_path, scenes=[str(file)], worlds=3))
     assert found["as in the tests"] == next(evaluate_run(tmp_path, scenes=str(file), worlds=3))[1]
     assert len({evaluation.metrics["speed_m_s"] for evaluation in found.values()}) == len(CONDITIONS)
+
+
+def test_weights_and_biases_gets_what_tensorboard_does_if_asked_for(tmp_path, hall, monkeypatch):
+    begun = []
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: begun.append(given)))
+    Training(tmp_path / "without", small(), models=[hall]).run(until=(2, 0))
+    assert not begun
+    Training(tmp_path / "with", small(wandb=True), models=[hall]).run(until=(2, 0))
+    (given,) = begun
+    assert given["sync_tensorboard"] is True
+    assert given["name"] == "with"
+    assert given["config"]["teacher"]["worlds"] == 4
 
 
 def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):

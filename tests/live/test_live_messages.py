@@ -16,7 +16,7 @@ from processes import SOON_S
 from cortex import Node, reliable
 from cortex import messages as msg
 from cortex.schema import schema_of
-from neurosim_core.live import engine
+from neurosim_core import sim
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.live.messages import command_of, message_type, setpoint_of, to_message, to_packet
 from neurosim_core.live.topics import COMMANDS
@@ -150,13 +150,13 @@ def test_a_new_packet_is_published_under_the_topic_of_its_sensor(
     """Odometry stands in for a sensor of a new kind: nothing in the live stack knows its packets."""
     config = make_config(sensors={"scanner": ODOMETRY | {"rate_hz": 200.0}}, **{"live.mode": "lockstep"})
     monkeypatch.setattr(OdometrySensorConfig, "packet_type", RangeScan)
-    end_step = engine.VehicleEngine.end_step
+    end_step = sim.end_step
 
-    def with_scans(self: engine.VehicleEngine, pending: Any) -> list[Packet]:
-        found = end_step(self, pending)
+    def with_scans(*arguments: Any) -> list[Packet]:
+        found = end_step(*arguments)
         return [a_scan(stamp_ns=p.stamp_ns, sequence=p.sequence, sensor="scanner") for p in found]
 
-    monkeypatch.setattr(engine.VehicleEngine, "end_step", with_scans)
+    monkeypatch.setattr(sim, "end_step", with_scans)
     with LiveRig(config) as rig:
         scans = rig.listen("/drone/scanner", message_type(RangeScan))
         rig.fly(rig.listen("/drone/odometry", msg.Odometry), 3)

@@ -35,10 +35,11 @@ from cortex.messages import (
 )
 from cortex.messages import Delivery as DeliveryMessage
 from neurosim_core.config import load_config
-from neurosim_core.live.engine import FlownBatch, VehicleEngine
+from neurosim_core.live import cameras
+from neurosim_core.live.cameras import frame_counts
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Recording
-from neurosim_core.sim import forget_controllers, make_state, observe, step
+from neurosim_core.sim import Batch, Model, State, forget_controllers, make_state, observe, step
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
 
@@ -267,7 +268,7 @@ def test_only_what_is_listened_to_is_rendered():
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         odometry = rig.listen("/drone/odometry", Odometry)
         states = rig.fly(odometry, 8)
-        state = rig.simulator.vehicles[0].engine.state
+        state = rig.simulator.vehicles[0].state
         assert state.counts["renders"] == 0
         pictures = rig.listen("/drone/rgb", Image)
         status = rig.wait_for_status(lambda status: status.sensors[2].active)
@@ -398,14 +399,14 @@ def test_the_fail_safe_ends_with_the_next_command():
 
 def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     """Let the rendering of a batch with frames take longer."""
-    render = VehicleEngine.render
+    render = cameras.render_batch
 
-    def slow(self: VehicleEngine, flown: FlownBatch) -> Any:
-        if flown.frame_counts:
+    def slow(model: Model, state: State, batch: Batch) -> Any:
+        if frame_counts(state, batch):
             time.sleep(seconds)
-        return render(self, flown)
+        return render(model, state, batch)
 
-    monkeypatch.setattr(VehicleEngine, "render", slow)
+    monkeypatch.setattr(cameras, "render_batch", slow)
 
 
 def test_slow_cameras_slow_time_down(monkeypatch: pytest.MonkeyPatch):
@@ -449,7 +450,7 @@ def test_what_is_left_out_at_the_end_is_counted(monkeypatch: pytest.MonkeyPatch,
         running = rig.wait_for_status(lambda s: s.sensors[2].dropped_count)
         rig.stop.set()
         assert rig.join() == 0
-        flown_ns = rig.simulator.vehicles[0].engine.state.stamp_ns
+        flown_ns = rig.simulator.vehicles[0].state.stamp_ns
     with Recording(tmp_path / "flight.h5") as flight:
         packets = list(flight.packets())
     pictures = [p.stamp_ns for p in packets if p.sensor == "rgb"]
@@ -463,15 +464,15 @@ def test_what_is_left_out_at_the_end_is_counted(monkeypatch: pytest.MonkeyPatch,
 def test_the_end_of_a_run_waits_for_the_picture_in_work_for_a_limited_time(
     monkeypatch: pytest.MonkeyPatch, give_up_s: float, stamps_ms: list[int]
 ):
-    render, reached, told = VehicleEngine.render, threading.Event(), []
+    render, reached, told = cameras.render_batch, threading.Event(), []
 
-    def held(self: VehicleEngine, flown: FlownBatch) -> Any:
-        if flown.end_ns == 20 * MS:
+    def held(model: Model, state: State, batch: Batch) -> Any:
+        if batch.until_ns == 20 * MS:
             reached.set()
             assert release.wait(SOON_S)
-        return render(self, flown)
+        return render(model, state, batch)
 
-    monkeypatch.setattr(VehicleEngine, "render", held)
+    monkeypatch.setattr(cameras, "render_batch", held)
     monkeypatch.setattr("neurosim_core.live.cameras.GIVE_UP_S", give_up_s)
     with LiveRig(make_config()) as rig:
         release = rig.stop if give_up_s else threading.Event()
@@ -491,7 +492,7 @@ def test_cameras_that_fail_end_it(monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any) -> Any:
         raise ValueError("no picture")
 
-    monkeypatch.setattr(VehicleEngine, "render", fail)
+    monkeypatch.setattr(cameras, "render_batch", fail)
     with LiveRig(make_config()) as rig:
         rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
@@ -681,7 +682,7 @@ def test_gains_change_in_flight():
         assert rig.set({"control.gains.position_gain_per_s2": 2.0}).accepted
         rig.send(row, mode="position", stamp_ns=states[-1].stamp_ns)
         after = odometry.recv(SOON_S)
-        changed = rig.simulator.vehicles[0].engine.model
+        changed = rig.simulator.vehicles[0].model
     state = make_state(before)
     for _ in range(3):
         step(before, state, row, mode="position")

@@ -30,7 +30,8 @@ from neurosim_core.live import viewer as viewer_module
 from neurosim_core.live.session import ViewOptions
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
-from neurosim_core.view import FileTarget, event_picture
+from neurosim_core.view.pictures import event_picture
+from neurosim_core.view.rerun_targets import FileTarget
 
 BODY = "/world/vehicles/drone"
 
@@ -402,15 +403,13 @@ def test_waiting_is_interrupted(tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"how": "television"}, "unknown way to view 'television', known: native, web, save"),
-        ({"how": "save"}, "a file to save to goes with"),
-        ({"how": "web", "event_window_s": 0.0}, r"the event window must be 0.0001 to 10 s, got 0.0"),
-        ({"how": "web", "image_rate_hz": float("nan")}, "the image rate must be > 0"),
-        ({"how": "web", "port": 70_000}, "a port is 0 to 65535, got 70000"),
-        ({"how": "web", "only": [""]}, "sensors to show are names, such as events,imu, got ''"),
-        ({"how": "web", "only": ["", ""]}, "got ','"),
-        ({"how": "save", "save": Path("q.txt")}, r"a file of Rerun ends in .rrd, got q.txt"),
-        ({"how": "native"}, "no display to open a window on: `neurosim view --web`.*--save"),
+        ({"web": True, "event_window_s": 0.0}, r"the event window must be 0.0001 to 10 s, got 0.0"),
+        ({"web": True, "image_rate_hz": float("nan")}, "the image rate must be > 0"),
+        ({"web": True, "port": 70_000}, "a port is 0 to 65535, got 70000"),
+        ({"web": True, "only": [""]}, "sensors to show are names, such as events,imu, got ''"),
+        ({"web": True, "only": ["", ""]}, "got ','"),
+        ({"save": Path("q.txt")}, r"a file of Rerun ends in .rrd, got q.txt"),
+        ({}, "no display to open a window on: `neurosim view --web`.*--save"),
     ],
 )
 def test_wrong_arguments_are_refused(options, reason, monkeypatch):
@@ -422,13 +421,13 @@ def test_wrong_arguments_are_refused(options, reason, monkeypatch):
 
 def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path):
     with pytest.raises(OSError, match=r"cannot write .*: there is no folder .*nowhere"):
-        view(how="save", save=tmp_path / "nowhere" / "f.rrd")
+        view(save=tmp_path / "nowhere" / "f.rrd")
     with pytest.raises(OSError, match="it is a folder"):
-        view(how="save", save=tmp_path)
+        view(save=tmp_path)
     assert not (tmp_path / "nowhere").exists()
     (tmp_path / "x.rrd").write_bytes(b"mine")
     with pytest.raises(FileExistsError, match=r"x.rrd is there already: name another file"):
-        view(how="save", save=tmp_path / "x.rrd")
+        view(save=tmp_path / "x.rrd")
     assert (tmp_path / "x.rrd").read_bytes() == b"mine"
 
 

@@ -179,7 +179,7 @@ def test_files_of_rays_are_beside_the_settings(tmp_path):
 def test_what_needs_a_pinhole_says_so():
     lens = {"kind": "equidistant", **SIZE}
     events = {"kind": "event_camera", "lens": lens, "max_displacement_px": 0.5}
-    scene = {"kind": "apartment", "rooms": 1}
+    scene = {"kind": "hall", "size_m": [8, 6, 3]}
     config = load_config({"duration_s": 0.1, "device": "cpu", "scene": scene, "sensors": {"events": events}})
     with pytest.raises(ValueError, match="max_displacement_px of events needs a lens of kind pinhole"):
         next(iter(run(config)))

@@ -215,8 +215,7 @@ def test_the_seed_is_found_in_the_room_and_not_in_solids_or_outside():
     assert (space.seed_m > [0.0, 0.0, 0.0]).all()
     assert (space.seed_m < [4.0, 3.0, 2.5]).all()
     assert not ((space.seed_m > 1.0) & (space.seed_m < 2.4)).all()
-    assert "floor below and walls on four sides" in space.seed_rule
-    assert space.seed_rule in space.notes[-1]
+    assert "floor below and walls on four sides" in space.notes[-1]
     reached = space.centers(np.argwhere(space.reachable(0.1)))
     assert (reached > 0.0).all()
     assert (reached < [4.0, 3.0, 2.5]).all()
@@ -225,7 +224,7 @@ def test_the_seed_is_found_in_the_room_and_not_in_solids_or_outside():
 def test_open_ground_has_free_space_above_it():
     rocks = [box((x, x, 0.0), (x + 1.0, x + 1.0, 2.0)) for x in (-4.0, 3.0)]
     space = make_free_space(as_scene(box((-5.0, -5.0, -0.1), (5.0, 5.0, 0.0)), *rocks), FreeSpaceConfig())
-    assert "no room has walls" in space.seed_rule
+    assert "no room has walls" in space.notes[-1]
     assert space.reachable(0.3).any()
 
 

@@ -778,6 +778,7 @@ def test_seed_of_a_run():
                 "duration_s": 0.1,
                 "device": "cpu",
                 "renderer": "synthetic",
+                "scene": {"kind": "hall", "size_m": [8, 6, 3]},
                 "path": {"kind": "hover"},
                 "sensors": {
                     "events": {

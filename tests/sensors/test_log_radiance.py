@@ -39,7 +39,7 @@ def test_events_are_the_steps_of_log_radiance():
 
 
 def test_worlds_refuse_it_by_name():
-    scene = {"kind": "apartment", "rooms": 1}
+    scene = {"kind": "hall", "size_m": [8, 6, 3]}
     sensors = {"radiance": {"kind": "log_radiance", "lens": LENS, "rate_hz": 50}}
     with pytest.raises(ValueError, match="radiance: pictures of log radiance are for single runs"):
         ns.Simulation({"device": "cpu", "scene": scene, "sensors": sensors}, worlds=2)

@@ -19,14 +19,12 @@ W, H, F = 48, 36, 40.0
 PINHOLE = {"width": W, "height": H, "fx": F, "fy": F, "cx": W / 2, "cy": H / 2}
 LENSES = {
     "pinhole": PINHOLE,
-    "radtan": {"kind": "radtan", **PINHOLE, "distortion": [-0.2, 0.03, 1e-3, -7e-4]},
     "rational": {
         "kind": "rational", **PINHOLE, "distortion": [0.2, 0.05, 1e-3, -5e-4, 0.003, 0.42, 0.12, 0.01],
     },
     "equidistant": {
         "kind": "equidistant", **PINHOLE, "fx": 15.0, "fy": 15.0, "distortion": [0.01, 0.002, 0, 0],
     },
-    "double_sphere": {"kind": "double_sphere", **PINHOLE, "fx": 12.0, "fy": 12.0, "xi": -0.2, "alpha": 0.59},
 }  # fmt: skip
 COLUMNS, ROWS = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
 R_BC = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # an optical frame that looks along x
@@ -158,9 +156,9 @@ def truth(lens_settings, stamp_ns, body, pixels, ranges, odometry, to_ns):
     return project(lens, p_C)
 
 
-@pytest.fixture(params=[*LENSES, "ray_table"])
+@pytest.fixture(params=["pinhole", "rational", "equidistant", "ray_table"])
 def lens(request, tmp_path):
-    """A lens of each kind; the table has the rays of a fisheye, some of which are missing."""
+    """Some of the lenses that `test_lenses` projects through; the table lacks some rays of a fisheye."""
     if request.param != "ray_table":
         return LENSES[request.param]
     rays = OpticalFlowConfig(lens=LENSES["equidistant"]).lens.ray_table().astype(np.float64)

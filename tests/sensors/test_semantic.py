@@ -87,6 +87,7 @@ def test_the_apartment_has_labels():
         {
             "duration_s": 0.01,
             "device": "cpu",
+            "scene": {"kind": "apartment", "rooms": 1},
             "render": {"lighting": {"mode": "unshadowed"}},
             "sensors": {"semantic": {"kind": "semantic", **CAMERA}},
         }

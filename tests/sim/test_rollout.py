@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from controller_commands import command_of
 
 import neurosim_core as ns
 from neurosim_core import sim
@@ -574,14 +575,15 @@ def test_an_event_camera_that_comes_back_starts_from_what_it_sees(outside_model)
     ],
 )
 def test_a_setpoint_is_what_its_controller_makes_of_the_state(outside_model, mode, setpoint):
-    """Independent: the controller's host form computes rotor speeds, which are commanded as such."""
+    """Independent: the controller computes rotor speeds by itself, which are commanded as such."""
     model = outside_model
     direct, by_hand = sim.make_state(model), sim.make_state(model)
     controller = make_controller(mode, model.airframe, model.config.control.gains, device=model.device)
     for _ in range(6):
         a = sim.step(model, direct, setpoint, mode=mode)
         now = sim.observe(by_hand)
-        speeds = controller.command(
+        speeds = command_of(
+            controller,
             setpoint,
             position=now.position,
             velocity=now.velocity,

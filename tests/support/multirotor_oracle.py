@@ -123,7 +123,7 @@ def solve(
     """
     y = np.concatenate([state.position, state.velocity, state.orientation, state.body_rate])
     speed = np.array(state.rotor_speed)
-    taus = np.array(each(config.motor_time_constant_s, config.motor_time_constant_scale, len(speed)))
+    taus = np.full(len(speed), config.motor_time_constant_s)
     lags = taus > 0.0
     tau = taus[lags].min() if lags.any() else 0.0
     states = []

@@ -12,22 +12,12 @@ from pydantic import ValidationError
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
-from neurosim_core.trajectory import (
-    FlightLimits,
-    HoverConfig,
-    LineConfig,
-    Path,
-    PlanningError,
-    TourConfig,
-    WaypointsConfig,
-    flight_bounds,
-    make_path,
-    minimum_snap,
-    plan_tour,
-    plan_waypoints,
-    prove_clearance,
-)
-from neurosim_core.trajectory.certify import segment_clearance
+from neurosim_core.trajectory import Path, TourConfig, make_path
+from neurosim_core.trajectory.certify import prove_clearance, segment_clearance
+from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds
+from neurosim_core.trajectory.minsnap import minimum_snap
+from neurosim_core.trajectory.planner import PlanningError, WaypointsConfig, plan_tour, plan_waypoints
+from neurosim_core.trajectory.shapes import HoverConfig, LineConfig
 from neurosim_core.vehicle import preset
 
 
@@ -136,11 +126,6 @@ def test_tours_are_clear_long_enough_and_within_limits(rooms, seed):
     assert not ((p > [6.0, 0.5, 0.0]) & (p < [7.5, 2.0, 2.4])).all(axis=1).any()  # the cupboard
 
 
-def test_a_tour_of_a_number_of_goals(rooms):
-    lengths = [plan_tour(rooms, TourConfig(goal_count=n), duration_s=1e6).length_m for n in (1, 3)]
-    assert lengths[1] > 2.0 * lengths[0]
-
-
 @pytest.fixture(scope="module")
 def apartment() -> FreeSpace:
     return make_free_space(make_apartment(ApartmentConfig()), FreeSpaceConfig())
@@ -199,7 +184,7 @@ def test_a_proof_fails_where_a_path_comes_too_close(rooms):
     assert prove_clearance(path, rooms, 0.3499).holds.all()
     assert not prove_clearance(path, rooms, 0.3501).holds.any()
     proof = prove_clearance(path, rooms, 0.3)
-    assert 0.3 <= proof.clearance_m <= 0.35 + 1e-6 <= proof.sample_min_m + 1e-3
+    assert 0.3 <= proof.clearance_m <= 0.35 + 1e-6
 
 
 def test_a_proof_sees_the_curve_and_not_its_chords(rooms):

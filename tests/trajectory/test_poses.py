@@ -8,8 +8,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 import neurosim_core as ns
-from neurosim_core.trajectory import PosesConfig, pose_path
-from neurosim_core.trajectory.poses import read_poses
+from neurosim_core.trajectory import PosesConfig
+from neurosim_core.trajectory.poses import pose_path, read_poses
 
 COUNT = 12
 TIMES_S = np.cumsum(np.random.default_rng(0).uniform(0.05, 0.15, COUNT)) + 1.7e9  # as of a clock
@@ -44,7 +44,8 @@ def write(folder, kind):
 
 
 def settings(path, **more):
-    return {"duration_s": 1.0, "device": "cpu", "path": {"kind": "poses", **path}, "sensors": SENSORS, **more}
+    common = {"duration_s": 1.0, "device": "cpu", "scene": {"kind": "hall", "size_m": [8, 6, 3]}}
+    return {**common, "path": {"kind": "poses", **path}, "sensors": SENSORS, **more}
 
 
 @pytest.mark.parametrize("kind", ["tum", "euroc", "csv"])

@@ -188,7 +188,7 @@ def test_a_redone_interval_is_that_of_adaptive_steps(device):
 def test_a_run_counts_redone_intervals(caplog, device):
     settings = {
         "device": device,
-        "scene": {"kind": "apartment", "rooms": 1},
+        "scene": {"kind": "hall", "size_m": [8, 6, 3]},
         "vehicle": {"parameters": {"inertia_kg_m2": scaled_inertia(1e-4)}},
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
         "path": {"kind": "hover"},

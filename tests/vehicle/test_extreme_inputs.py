@@ -9,30 +9,27 @@ import math
 
 import numpy as np
 import pytest
+from controller_commands import command_of
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.control import MODES, PathFollower, Se3Config, make_controller, mode_kernel
 from neurosim_core.frames import Mount, as_rows, heading_rad
-from neurosim_core.trajectory import (
+from neurosim_core.trajectory import Path, TourConfig
+from neurosim_core.trajectory.feasibility import FlightLimits
+from neurosim_core.trajectory.path import PathCursor, upload_paths
+from neurosim_core.trajectory.planner import WaypointsConfig
+from neurosim_core.trajectory.shapes import (
     CircleConfig,
     FigureEightConfig,
-    FlightLimits,
     HoverConfig,
     LineConfig,
     LissajousConfig,
-    Path,
-    PathCursor,
-    TourConfig,
-    WaypointsConfig,
     circle,
     figure_eight,
     hover,
     line,
     lissajous,
-    minimum_snap,
-    upload_paths,
 )
-from neurosim_core.trajectory.heading import follow_travel
 from neurosim_core.vehicle import DynamicsError, Multirotor, preset
 
 NAN, INF = math.nan, math.inf
@@ -127,43 +124,13 @@ def test_setpoints_are_finite(mode, bad, path):
         one.set(row)
 
 
-@pytest.mark.parametrize("bad", BAD)
-@pytest.mark.parametrize("field", STATE)
-def test_states_of_a_controller_are_finite(field, bad, path):
-    state = {**STATE, field: np.full(len(STATE[field]), bad)}
-    with pytest.raises(ValueError, match=f"{field} must be finite"):
-        controller("path", path).command(**state)
-
-
-@pytest.mark.parametrize("bad", [(0, 0, 0, 0), (0, 0, 0, 5), (1e-200, 0, 0, 0)])
-def test_orientations_of_a_controller_are_unit_quaternions(bad, path):
-    with pytest.raises(ValueError, match="orientation must be unit quaternions"):
-        controller("path", path).command(**{**STATE, "orientation": bad})
-
-
-@pytest.mark.parametrize("field", ["position", "velocity", "body_rate"])
-def test_a_controller_gives_no_command_that_is_not_finite(field, path):
-    """1e308 is finite, its square is not."""
-    with pytest.raises(ValueError, match="too large"):
-        controller("path", path).command(**{**STATE, field: np.full(3, 1e308)})
-
-
 @pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "path"])
-def test_absurd_setpoints_saturate_or_are_refused(mode, path):
+def test_absurd_setpoints_saturate(mode, path):
+    one = controller(mode, path)
     for size in (1e12, 1e308):
-        command = command_or_error(controller(mode, path), size)
-        if isinstance(command, str):
-            assert "too large" in command
-        else:
-            assert (command >= 0.0).all()
-            assert (command <= HUMMINGBIRD.rotor_speed_max_rad_s).all()
-
-
-def command_or_error(one, size):
-    try:
-        return one.command([size] * len(one.layout), **STATE)
-    except ValueError as error:
-        return str(error)
+        command = command_of(one, [size] * len(one.layout), **STATE)
+        assert (command >= 0.0).all()
+        assert (command <= HUMMINGBIRD.rotor_speed_max_rad_s).all()
 
 
 def test_what_a_device_controller_cannot_command_the_vehicle_reports(path):
@@ -175,14 +142,9 @@ def test_what_a_device_controller_cannot_command_the_vehicle_reports(path):
         vehicle.check()
 
 
-def test_stamps_of_a_controller_are_integers_of_64_bits(path):
+def test_stamps_of_a_controller_have_64_bits(path):
     one = controller("path", path)
-    for bad in (1.5, NAN):
-        with pytest.raises(TypeError, match="interpreted as an integer"):
-            one.command(**STATE, stamp_ns=bad)
-    with pytest.raises(ValueError, match="64 bits"):
-        one.command(**STATE, stamp_ns=2**63)
-    before, after = one.command(**STATE, stamp_ns=-(2**63)), one.command(**STATE, stamp_ns=2**63 - 1)
+    before, after = (command_of(one, **STATE, stamp_ns=ns) for ns in (-(2**63), 2**63 - 1))
     assert np.isfinite([before, after]).all()  # a path rests at its ends
 
 
@@ -224,20 +186,13 @@ def test_paths_are_finite_polynomials(path):
     for coefficients in (np.full((1, 4, 2), NAN), np.full((1, 4, 2), INF)):
         with pytest.raises(ValueError, match="coefficients must be finite"):
             Path(knots, coefficients)
-    with pytest.raises(ValueError, match="must have shape"):
-        Path(knots, np.zeros((1, 4, 0)))
-    with pytest.raises(ValueError, match="at least 2 integers"):
-        Path([0.0, NAN], np.zeros((1, 4, 1)))
-    with pytest.raises(ValueError, match="must increase"):
-        Path([10, 10], np.zeros((1, 4, 1)))
+    for bad in ([0.0, NAN], [10, 10]):
+        with pytest.raises(ValueError, match="increasing integers"):
+            Path(bad, np.zeros((1, 4, 1)))
     with pytest.raises(ValueError, match="empty"):
         upload_paths([], "cpu")
-    for yaw, message in ((np.full((len(path.coefficients), 1), INF), "finite"), (np.zeros(3), "shape")):
-        with pytest.raises(ValueError, match=message):
-            path.with_yaw(yaw)
-    for parts in (0, -1, 1.5, NAN):
-        with pytest.raises(ValueError, match="parts must be integers >= 1"):
-            path.subdivided(parts)
+    with pytest.raises(ValueError, match="finite"):
+        path.with_yaw(np.full((len(path.coefficients), 1), INF))
 
 
 def test_paths_are_evaluated_at_integers_of_64_bits(path):
@@ -250,14 +205,6 @@ def test_paths_are_evaluated_at_integers_of_64_bits(path):
     for bad in (NAN, 1.5, None):
         with pytest.raises(TypeError):
             PathCursor(path).at(bad)
-
-
-@pytest.mark.parametrize("bad", BAD)
-def test_waypoints_are_finite(bad):
-    with pytest.raises(ValueError, match="finite"):
-        minimum_snap([[0.0, 0.0, 0.0], [1.0, bad, 0.0]], [0, 10**9])
-    with pytest.raises(ValueError, match="increasing integers"):
-        minimum_snap([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [0.0, bad])
 
 
 @pytest.mark.parametrize("bad", [*BAD, -1.0])
@@ -324,11 +271,3 @@ def test_lines_that_take_longer_than_stamps_last_are_refused(settings):
     given = {"start_m": (0.0, 0.0, 0.0), "end_m": (1.0, 0.0, 0.0), **settings}
     with pytest.raises(ValueError, match="increasing integers"):
         line(LineConfig(**given))
-
-
-@pytest.mark.parametrize("bad", [*BAD, 0.0, -1.0])
-def test_headings_look_ahead_at_a_rate(bad, path):
-    with pytest.raises(ValueError, match="lookahead_s must be"):
-        follow_travel(path, lookahead_s=bad, rate_max_rad_s=1.0)
-    with pytest.raises(ValueError, match="rate_max_rad_s must be"):
-        follow_travel(path, lookahead_s=0.3, rate_max_rad_s=bad)

@@ -218,7 +218,7 @@ def start_run(**start) -> tuple[sim.Model, sim.State]:
     settings = {
         "device": "cpu",
         "duration_s": 6.0,
-        "scene": {"kind": "apartment", "rooms": 1},
+        "scene": {"kind": "hall", "size_m": [8, 6, 3]},
         "vehicle": {"parameters": {"ground": {"height_m": 0.0}}},
         "path": {"kind": "hover"},
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},

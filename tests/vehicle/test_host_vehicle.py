@@ -50,7 +50,7 @@ def settings(**vehicle):
         {
             "duration_s": 0.2,
             "device": "cpu",
-            "scene": {"kind": "apartment", "rooms": 1},
+            "scene": {"kind": "hall", "size_m": [8, 6, 3]},
             "vehicle": {"kind": "stone", "on_collision": "report", **vehicle},
             "path": {"kind": "hover"},
             "sensors": {"imu": {"kind": "imu", "rate_hz": 100}, "odometry": {"kind": "odometry"}},

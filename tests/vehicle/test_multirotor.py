@@ -87,7 +87,7 @@ def test_derivatives_of_an_odd_airframe(device):
     states = random_states(config, 20)
     vehicle = Multirotor(config, count=20, device=device, terms=TERMS)
     vehicle.reset(*states)
-    assert set(TERMS) - set(config.terms()) == {"rotor_lags", "turbulence", "ground", "ground_effect"}
+    assert set(TERMS) - set(config.terms()) == {"turbulence", "ground", "ground_effect"}
     rates = np.array([derivative(config, np.concatenate([*s[:4]]), s[4]) for s in zip(*states, strict=True)])
     assert relative(vehicle.acceleration.linear, rates[:, 3:6]) < 1e-12
     assert relative(vehicle.acceleration.angular, rates[:, 10:13]) < 1e-12

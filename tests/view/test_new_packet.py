@@ -23,7 +23,10 @@ from typing_extensions import TypeAliasType
 from neurosim_core import packets as packets_module
 from neurosim_core.packets import PACKET_CLASSES, FieldSpec, GenericPacket, Image, Packet, schema_of
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
-from neurosim_core.view import FlightSummary, RerunLogger, open_rerun, save_overview
+from neurosim_core.view.overview import FlightSummary
+from neurosim_core.view.overview_plot import save_overview
+from neurosim_core.view.rerun_log import RerunLogger
+from neurosim_core.view.rerun_sdk import open_rerun
 
 HEADER = RecordingHeader(config_yaml="", seed=0, version="")
 MS = 1_000_000

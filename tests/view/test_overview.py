@@ -11,7 +11,8 @@ import trimesh
 from test_plan import make_scene
 
 from neurosim_core.packets import Events, Image, ImuSample, Odometry
-from neurosim_core.view import FlightSummary, save_overview
+from neurosim_core.view.overview import FlightSummary
+from neurosim_core.view.overview_plot import save_overview
 
 MS = 1_000_000
 WIDTH, HEIGHT = 40, 30

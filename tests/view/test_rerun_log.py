@@ -208,7 +208,7 @@ def test_collisions_clearance_and_path(tmp_path):
         logger.log(
             Collision(stamp_ns=7, sensor="collision", position=np.array([1.0, 2.0, 3.0]), clearance_m=-0.1)
         )
-        logger.log_scalar("clearance", 5, 0.25)
+        logger.log_values("plots/drone/clearance", 5, {"clearance": 0.25})
     rows = read(tmp_path / "f.rrd")
     assert [(t, v["positions"]) for t, v in rows["/world/collisions/drone"]] == [(7, [[1.0, 2.0, 3.0]])]
     [(stamp_ns, line)] = rows["/plots/drone/collisions"]

@@ -16,7 +16,8 @@ import pytest
 import rerun as rr
 from processes import SOON_S, wait_for
 
-from neurosim_core.view import RerunViewer, ViewerEnded, rerun_viewer
+from neurosim_core.view import rerun_viewer
+from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
@@ -71,7 +72,7 @@ def test_a_port_is_kept_to():
 
 def test_it_ends_with_a_parent_that_is_killed():
     code = (
-        "from neurosim_core.view import RerunViewer\n"
+        "from neurosim_core.view.rerun_viewer import RerunViewer\n"
         "viewer = RerunViewer(web=True)\n"
         "print(viewer._process.pid, flush=True)\n"
         "input()\n"

@@ -43,7 +43,8 @@ void follow(CortexReader reader) {
     std::uint64_t words[frame_bytes / 8];
     std::memcpy(words, data, frame_bytes);
     for (const std::uint64_t word : words) expect(word == number, "frames are whole and in order");
-    expect(cortex_reader_take(&reader, size) == 1, "a reliable reader is never overrun");
+    CortexBody none;
+    expect(cortex_reader_finish(&reader, data, size, &none) == 1, "a reliable reader is never overrun");
     ++number;
   }
 }
@@ -53,7 +54,10 @@ void follow(CortexReader reader) {
 int main() {
   std::vector<std::uint64_t> memory((CORTEX_HEAD_BYTES + capacity) / 8);
   std::vector<CortexPage> pages(readers);
+  CortexMap map{};
+  map.slot_count = 1;  // a ring with slots does not grow
   CortexWriter writer{};
+  writer.map = &map;
   writer.ring = reinterpret_cast<CortexRing*>(memory.data());
   writer.data = reinterpret_cast<std::uint8_t*>(memory.data()) + CORTEX_HEAD_BYTES;
   writer.capacity = capacity;

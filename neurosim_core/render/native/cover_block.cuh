@@ -1,7 +1,8 @@
-// CUDA: the threads of a warp find together what the points of each of 4 x 4 pixels show, as `list_seen_faces.cuh` and
-// `cover_lanes.cuh` do on a CPU. Leaves pairs of a pixel and a surface that it shows in shared memory. Returns their number;
-// the first of the pixel and how many; how many of its points show none, -1: it has to be rendered by rays; whether the sky
-// is behind; where the pairs are.
+// CUDA: the threads of a warp find together what the points of 4 x 4 pixels show in two instants, as `list_seen_faces.cuh` and
+// `cover_lanes.cuh` do on a CPU. A thread is a pixel in an instant; with one instant, `alone`, half of them are idle. Leaves
+// pairs of a thread and a surface that it shows in shared memory. Returns their number, -1: the instants show so many faces that
+// they have to be taken one by one; the first of the thread and how many; how many of its points show none, -1: it has to be
+// rendered by rays; whether the sky is behind; where the pairs are.
 wp::vec_t<6, int> result;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
@@ -9,211 +10,228 @@ wp::vec_t<6, int> result;
 __shared__ Block blocks[2];
 Block& block = blocks[threadIdx.x / 32 % 2];
 constexpr unsigned ALL = 0xffffffffu;
-const int lane = threadIdx.x % 32, pixel = lane % 16, half = lane / 16;
-if (half == 0)
-    for (int axis = 0; axis < 3; ++axis) {
-        block.ray[axis][pixel] = center[axis];
-        block.ray[3 + axis][pixel] = across[axis];
-        block.ray[6 + axis][pixel] = down[axis];
-    }
+const int lane = threadIdx.x % 32, pixel = lane % 16, half = alone ? 0 : lane / 16;
+const bool idle = alone && lane >= 16;
+const unsigned below = (1u << lane) - 1u, ours = 0xffffu << (16 * half); // threads before; those of the instant
+static_assert(MOST <= 2 * ROOM, "one instant uses the room of both");
+const int room = alone ? MOST : ROOM, width_of_row = alone ? 16 : 32, base_of_faces = half * ROOM;
+int *const seen = block.seen + base_of_faces, *const part_of = block.part + base_of_faces;
+unsigned char* const first_of = block.first + base_of_faces;
+Quad* const plane_of = block.plane + base_of_faces;
+unsigned* const own_shown = block.shown[0] + 16 * half + pixel; // of entry: at entry * width_of_row
+using Entries = unsigned long long; // a bit for each
+auto lowest = [](Entries entries) { return __ffsll(entries) - 1; };
+#include "edge_functions.cuh"
+auto along = [](const Quad& function, const wp::vec3& toward) {
+    return fmaf(function.x, toward[0], fmaf(function.y, toward[1], function.z * toward[2]));
+};
+// Bits of the points where a function, of which the value at the centre and the slopes are given, is negative.
+auto negative_at = [](float value, float slope_x, float slope_y) {
+    float at[SAMPLES], step[SAMPLES]; // of the samples 1, 2, 4, ... from sample 0
+#pragma unroll
+    for (int bit = 0; 1 << bit < SAMPLES; ++bit) step[1 << bit] = fmaf((float)(1 << bit) / SAMPLES, slope_x, 0.5f / (1 << bit) * slope_y);
+    at[0] = fmaf(0.5f / SAMPLES - 0.5f, slope_x + slope_y, value);
+#pragma unroll
+    for (int sample = 1; sample < SAMPLES; ++sample) at[sample] = at[sample & (sample - 1)] + step[sample & -sample];
+    unsigned negative = 0;
+#pragma unroll
+    for (int sample = SAMPLES - 1; sample >= 0; --sample) negative = __funnelshift_l(__float_as_uint(at[sample]), negative, 1);
+    return negative;
+};
 const int upper = wp::max(wp::min(top - 1, height - 6), 0), leftmost = wp::max(wp::min(left - 1, width - 6), 0);
-int count = 0;
-bool sky = false, listed = true;
-for (int place = lane; place < 64; place += 32) {
-    const int y = upper + place / 6, x = leftmost + place % 6;
+const int* const first_row = faces.data + (size_t)instant * height * width;
+int count = 0, parts[3], wholes[3];
+bool sky = false;
+#pragma unroll
+for (int turn = 0; turn < 3; ++turn) {
+    const int place = 16 * turn + pixel, y = upper + place / 6, x = leftmost + place % 6;
     const bool inside = place < 36 && y < height && x < width;
-    const int part = inside ? *wp::address(faces, instant, y, x) : -1;
-    sky |= inside && part < 0;
-    const int face = part >= 0 ? scene.whole_of_face.data[part] : -1;
-    const unsigned same = __match_any_sync(ALL, face);
+    parts[turn] = inside ? first_row[y * width + x] : -1;
+    sky |= inside && parts[turn] < 0;
+}
+#pragma unroll
+for (int turn = 0; turn < 3; ++turn) wholes[turn] = parts[turn] >= 0 ? scene.whole_of_face.data[parts[turn]] : -1;
+#pragma unroll 1
+for (int turn = 0; turn < 3; ++turn) {
+    const int face = wholes[0], part = parts[0];
+    wholes[0] = wholes[1];
+    wholes[1] = wholes[2];
+    parts[0] = parts[1];
+    parts[1] = parts[2];
+    const unsigned same = __match_any_sync(ALL, face) & ours;
     bool added = face >= 0 && __ffs(same) - 1 == lane;
-    for (int entry = 0; entry < count; ++entry) added &= block.seen[entry] != face;
-    const unsigned additions = __ballot_sync(ALL, added);
-    listed = count + __popc(additions) <= MOST;
-    if (!listed) break;
-    if (added) {
-        const int entry = count + __popc(additions & ((1u << lane) - 1));
-        block.seen[entry] = face;
-        block.part[entry] = part;
+#pragma unroll 1
+    for (int entry = 0; entry < wp::min(count, room); ++entry) added &= seen[entry] != face;
+    const unsigned additions = __ballot_sync(ALL, added) & ours;
+    const int entry = count + __popc(additions & below);
+    if (added && entry < room) {
+        seen[entry] = face;
+        part_of[entry] = part;
     }
     count += __popc(additions);
     __syncwarp();
 }
-sky = __any_sync(ALL, sky);
-#include "edge_functions.cuh"
-unsigned long long reaching = 0; // entries that reach the pixel
-int edges = 0; // pairs of a pixel and a face whose edges cross it
-for (int begin = 0; listed && begin < count;) {
-    const int end = wp::min(begin + 32, count), entry = begin + lane;
-    int surface = -1;
-    if (entry < end) { // each thread prepares a face
-        const int face = block.seen[entry];
+bool full = count > room; // there are more than have room
+count = full ? 0 : count;
+sky = (__ballot_sync(ALL, sky) & ours) != 0;
+Entries reaching = 0; // those that reach the pixel
+int looked = 0, edges = 0; // edges that cross pixels: how many are looked at, and how many there are
+bool more = true;
+for (int begin = 0; more;) {
+    more = __any_sync(ALL, begin < count); // if not, the last edges are looked at
+    const int number = wp::max(wp::min(count - begin, 16), 0), most = wp::max(number, __shfl_xor_sync(ALL, number, 16));
+    const int entry = begin + pixel;
+    bool solid = false;
+    if (pixel < number) { // each thread prepares a face
+        const int face = seen[entry];
         const wp::vec3* corner = scene.whole_corner.data + 3 * (size_t)face;
         float function[3][3];
-        if (functions_of(corner[0] - origin, corner[1] - origin, corner[2] - origin, function) != 0.0f)
-            surface = scene.whole_surface.data[face];
+        solid = functions_of(corner[0] - origin, corner[1] - origin, corner[2] - origin, function) != 0.0f;
         for (int side = 0; side < 3; ++side)
-            for (int axis = 0; axis < 3; ++axis) block.function[3 * side + axis][entry] = function[side][axis];
-        for (int axis = 0; axis < 3; ++axis)
-            block.plane[axis][entry] = function[0][axis] + function[1][axis] + function[2][axis];
-        block.surface[entry] = surface;
+            block.function[side][lane] = {function[side][0], function[side][1], function[side][2], 0.0f};
+        plane_of[entry] = {function[0][0] + function[1][0] + function[2][0], function[0][1] + function[1][1] + function[2][1],
+                           function[0][2] + function[1][2] + function[2][2], __int_as_float(scene.whole_surface.data[face])};
     }
+    const unsigned solids = __ballot_sync(ALL, solid);
     __syncwarp();
-    for (int pair_of_faces = begin; pair_of_faces < end; pair_of_faces += 2) { // each half of the threads: which pixels one reaches
-        const bool there = pair_of_faces + half < end;
-        const int at = there ? pair_of_faces + half : begin;
-        bool reached = there && block.surface[at] >= 0;
-        unsigned cut = 0;
+    unsigned crossed = 0; // of the face of this thread: edges that cross pixels; 8: it reaches one
+    for (int turn = 0; turn < wp::max(most, 1); ++turn) {
+        if (more) {
+            const int at = 16 * half + turn;
+            bool reached = !idle && (solids >> at) & 1u;
+            float value[3][3], cut_at[3];
 #pragma unroll
-        for (int side = 0; side < 3; ++side) {
-            const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at], block.function[3 * side + 2][at]};
-            auto along = [&](const wp::vec3& toward) {
-                return fmaf(function[0], toward[0], fmaf(function[1], toward[1], function[2] * toward[2]));
-            };
-            const float middle = along(center), extent = 0.5f * (wp::abs(along(across)) + wp::abs(along(down)));
-            reached &= middle + extent >= 0.0f;
-            cut |= (unsigned)(middle - extent < 0.0f) << side;
+            for (int side = 0; side < 3; ++side) {
+                const Quad function = block.function[side][at];
+                value[side][0] = along(function, center);
+                value[side][1] = along(function, across);
+                value[side][2] = along(function, down);
+                const float extent = 0.5f * (wp::abs(value[side][1]) + wp::abs(value[side][2]));
+                reached &= value[side][0] + extent >= 0.0f;
+                cut_at[side] = value[side][0] - extent;
+            }
+            if (reached) {
+                reaching |= (Entries)1 << (begin + turn);
+                own_shown[(begin + turn) * width_of_row] = ALL_POINTS;
+            }
+            const unsigned reaches = __ballot_sync(ALL, reached);
+            if (pixel == turn && reaches & ours) crossed |= 8u;
+            float near[3];
+#pragma unroll
+            for (int term = 0; term < 3; ++term) near[term] = OVERLAP * (value[0][term] + value[1][term] + value[2][term]);
+#pragma unroll
+            for (int side = 0; side < 3; ++side) {
+                const bool cut = reached && cut_at[side] < 0.0f;
+                const unsigned cuts = __ballot_sync(ALL, cut);
+                if (pixel == turn && cuts & ours) crossed |= 1u << side;
+                if (cut)
+                    block.edge[(edges + __popc(cuts & below)) % 128] = {value[side][0] + near[0], value[side][1] + near[1],
+                                                                       value[side][2] + near[2],
+                                                                       __int_as_float((begin + turn) * width_of_row + 16 * half + pixel)};
+                edges += __popc(cuts);
+            }
         }
-        if (!reached) cut = 0;
-        const unsigned half_of_lanes = 0xffffu << (16 * half);
-        unsigned reach = __ballot_sync(ALL, reached) & half_of_lanes ? 8u : 0u;
-#pragma unroll
-        for (int side = 0; side < 3; ++side)
-            if (__ballot_sync(ALL, cut & 1u << side) & half_of_lanes) reach |= 1u << side;
-        const bool edged = cut != 0;
-        const unsigned all_edged = __ballot_sync(ALL, edged);
-        if (edged) block.listed[edges + __popc(all_edged & ((1u << lane) - 1))] = (unsigned short)(pixel | at << 4 | cut << 10);
-        edges += __popc(all_edged);
-        if (reached) reaching |= 1ull << at;
-        if (there) block.shown[at][pixel] = reached ? ALL_POINTS : 0u;
-        if (pixel == 0 && there) block.reach[at] = (unsigned char)reach; // edges that cross pixels; 8: it reaches one
+        while (edges - looked >= (more ? 32 : 1)) { // each thread finds which points of a pixel are outside an edge
+            __syncwarp();
+            if (looked + lane < edges) {
+                const Quad edge = block.edge[(looked + lane) % 128];
+                atomicAnd(&block.shown[0][__float_as_int(edge.w)], ~negative_at(edge.x, edge.y, edge.z));
+            }
+            looked = wp::min(looked + 32, edges);
+            __syncwarp();
+        }
     }
+    if (pixel < number && crossed == 0) plane_of[entry].w = __int_as_float(-1); // no pixel shows it
     __syncwarp();
-    if (entry < end) {
-        if (block.reach[entry] == 0) surface = -1;
-        block.surface[entry] = surface;
+    if (pixel < number) {
+        const float surface = plane_of[entry].w;
+        int first = entry;
+#pragma unroll 1
+        for (int other = entry - 1; other >= 0; --other)
+            if (__float_as_int(plane_of[other].w) == __float_as_int(surface)) first = other;
+        first_of[entry] = (unsigned char)first;
     }
-    __syncwarp();
-    if (entry < end) {
-        int first = entry; // entry of the same surface
-        for (int other = entry - 1; other >= 0 && surface >= 0; --other)
-            if (block.surface[other] == surface) first = other;
-        block.first[entry] = (unsigned char)first;
-    }
-    for (int base = 3 * begin; listed && base < 3 * end; base += 32) { // each thread looks beyond an edge
-        const int at = wp::min((base + lane) / 3, end - 1), side = (base + lane) % 3;
+    for (int base = 0; base < 3 * most; base += 16) { // each thread looks beyond an edge
+        const int at = wp::min((base + pixel) / 3, 15), side = (base + pixel) % 3;
+        const unsigned crossings = __shfl_sync(ALL, crossed, at, 16);
         int beyond = -1;
-        if (base + lane < 3 * end && (block.reach[at] >> side) & 1)
-            beyond = scene.whole_neighbor.data[3 * (size_t)block.seen[at] + side];
-        for (int other = 0; other < count; ++other)
-            if (block.seen[other] == beyond) beyond = -1;
+        if (!full && base + pixel < 3 * number && (crossings >> side) & 1u)
+            beyond = scene.whole_neighbor.data[3 * (size_t)seen[begin + at] + side];
+#pragma unroll 1
+        for (int other = 0; beyond >= 0 && other < count; ++other)
+            if (seen[other] == beyond) beyond = -1;
         if (beyond >= 0) {
-            const float function[3] = {block.function[3 * side][at], block.function[3 * side + 1][at],
-                                       block.function[3 * side + 2][at]};
+            const Quad edge = block.function[side][16 * half + at];
+            const float function[3] = {edge.x, edge.y, edge.z};
             if (!is_beyond(beyond, function)) beyond = -1;
         }
-        for (unsigned waiting; listed && (waiting = __ballot_sync(ALL, beyond >= 0));) {
-            const int face = __shfl_sync(ALL, beyond, __ffs(waiting) - 1);
-            listed = count < MOST;
-            if (listed && lane == 0) {
-                block.seen[count] = face;
-                block.part[count] = -1 - face;
+        for (unsigned waiting; (waiting = __ballot_sync(ALL, beyond >= 0)) != 0u;) {
+            const int next = __ffs(waiting & ours) - 1, face = __shfl_sync(ALL, beyond, next & 31);
+            if (next < 0) continue;
+            full |= count == room;
+            if (lane == next && !full) {
+                seen[count] = face;
+                part_of[count] = -1 - face;
             }
-            count += listed;
-            if (beyond == face) beyond = -1;
+            count += !full;
+            if (beyond == face || full) beyond = -1;
         }
         __syncwarp();
     }
-    begin = end;
+    begin += number;
+    if (full) count = begin = 0;
+}
+if (!alone && __any_sync(ALL, full)) {
+    result[0] = -1;
+    return result;
 }
 unsigned taken = 0; // points that show a face
-unsigned long long surfaces = 0; // first entries of the surfaces that the pixel shows
-if (listed) {
-    reaching |= __shfl_xor_sync(ALL, reaching, 16);
-    for (int base = 0; base < edges; base += 32) { // each thread looks at the points of a pixel and the edges of a face
-        const unsigned code = base + lane < edges ? block.listed[base + lane] : 0u;
-        const int at = code & 15, entry = (code >> 4) & 63;
-        wp::vec3 toward[3];
-        float near[3];
-#pragma unroll
-        for (int term = 0; term < 3; ++term) {
-#pragma unroll
-            for (int axis = 0; axis < 3; ++axis) toward[term][axis] = block.ray[3 * term + axis][at];
-            near[term] = OVERLAP * fmaf(block.plane[0][entry], toward[term][0],
-                                        fmaf(block.plane[1][entry], toward[term][1], block.plane[2][entry] * toward[term][2]));
+Entries surfaces = 0, holding = 0; // first entries of the surfaces that the pixel shows; entries that hold points
+for (Entries rest = reaching; rest; rest &= rest - 1) { // which of several shows where they are
+    const int entry = lowest(rest);
+    unsigned inside = own_shown[entry * width_of_row], overlap = inside & taken;
+    const Quad own = plane_of[entry];
+    for (Entries others = holding; overlap && others; others &= others - 1) {
+        const int other = lowest(others);
+        const unsigned contested = own_shown[other * width_of_row] & overlap;
+        if (!contested) continue;
+        overlap &= ~contested; // no two hold a point
+        const Quad against = plane_of[other];
+        unsigned won = 0;
+        if (__float_as_int(against.w) != __float_as_int(own.w)) {
+            const Quad behind = {fmaf(NEARER, against.x, -own.x), fmaf(NEARER, against.y, -own.y), fmaf(NEARER, against.z, -own.z), 0.0f};
+            const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
+            const float extent = 0.5f * (wp::abs(slope_x) + wp::abs(slope_y));
+            won = middle < -extent ? contested : 0u;
+            if (wp::abs(middle) <= extent) won = contested & negative_at(middle, slope_x, slope_y);
         }
-        unsigned outside = 0;
-        for (unsigned cut = code >> 10; cut; cut &= cut - 1) {
-            const int side = 3 * (__ffs(cut) - 1);
-            float value[3];
-#pragma unroll
-            for (int term = 0; term < 3; ++term)
-                value[term] = fmaf(block.function[side][entry], toward[term][0],
-                                   fmaf(block.function[side + 1][entry], toward[term][1],
-                                        fmaf(block.function[side + 2][entry], toward[term][2], near[term])));
-            unsigned negative = 0;
-#pragma unroll
-            for (int sample = SAMPLES - 1; sample >= 0; --sample) {
-                const float at_point = fmaf(points[1][sample], value[2], fmaf(points[0][sample], value[1], value[0]));
-                negative = __funnelshift_l(__float_as_uint(at_point), negative, 1);
-            }
-            outside |= negative;
-        }
-        if (code >> 10) block.shown[entry][at] = ALL_POINTS & ~outside;
+        own_shown[other * width_of_row] &= ~won;
+        inside &= ~(contested & ~won);
     }
-    __syncwarp();
-    unsigned long long holding = 0; // entries before that hold points
-    for (unsigned long long rest = half ? 0u : reaching; rest; rest &= rest - 1) { // which of several shows where they are
-        const int entry = __ffsll(rest) - 1;
-        unsigned inside = block.shown[entry][pixel], overlap = inside & taken;
-        for (unsigned long long others = holding; overlap && others; others &= others - 1) {
-            const int other = __ffsll(others) - 1;
-            const unsigned contested = block.shown[other][pixel] & overlap;
-            overlap &= ~contested; // no two hold a point
-            if (block.first[other] == block.first[entry]) inside &= ~contested;
-            if (!contested || block.first[other] == block.first[entry]) continue;
-            float nearer[3], plane[3];
-#pragma unroll
-            for (int axis = 0; axis < 3; ++axis) plane[axis] = fmaf(-NEARER, block.plane[axis][other], block.plane[axis][entry]);
-            nearer[0] = fmaf(plane[0], center[0], fmaf(plane[1], center[1], plane[2] * center[2]));
-            nearer[1] = fmaf(plane[0], across[0], fmaf(plane[1], across[1], plane[2] * across[2]));
-            nearer[2] = fmaf(plane[0], down[0], fmaf(plane[1], down[1], plane[2] * down[2]));
-            const float extent = 0.5f * (wp::abs(nearer[1]) + wp::abs(nearer[2]));
-            unsigned won = nearer[0] > extent ? contested : 0u;
-            if (wp::abs(nearer[0]) <= extent)
-                for (unsigned points_left = contested; points_left; points_left &= points_left - 1) {
-                    const int sample = __ffs(points_left) - 1;
-                    const float x = ((float)sample + 0.5f) / SAMPLES - 0.5f;
-                    const float y = ((float)(__brev(sample) / (0x80000000u / (SAMPLES / 2))) + 0.5f) / SAMPLES - 0.5f;
-                    if (fmaf(y, nearer[2], fmaf(x, nearer[1], nearer[0])) > 0.0f) won |= 1u << sample;
-                }
-            block.shown[other][pixel] &= ~won;
-            inside &= ~(contested & ~won);
-        }
-        block.shown[entry][pixel] = inside;
-        if (inside) holding |= 1ull << entry;
-        taken |= inside;
-    }
-    for (unsigned long long rest = holding; rest; rest &= rest - 1) { // faces of one surface are taken together
-        const int entry = __ffsll(rest) - 1, first = block.first[entry];
-        const unsigned shown = block.shown[entry][pixel];
-        if (first < entry) block.shown[first][pixel] |= shown;
-        if (shown) surfaces |= 1ull << first;
-    }
+    own_shown[entry * width_of_row] = inside;
+    if (inside) holding |= (Entries)1 << entry;
+    taken |= inside;
+}
+for (Entries rest = holding; rest; rest &= rest - 1) { // faces of one surface are taken together
+    const int entry = lowest(rest), first = first_of[entry];
+    const unsigned shown = own_shown[entry * width_of_row];
+    if (!shown) continue;
+    if (first < entry) own_shown[first * width_of_row] = shown | ((surfaces >> first) & 1 ? own_shown[first * width_of_row] : 0u);
+    surfaces |= (Entries)1 << first;
 }
 const int bare = SAMPLES - __popc(taken);
-const bool resolved = listed && (sky || 2 * bare <= SAMPLES);
-if (half || outside || !resolved) surfaces = 0;
+const bool resolved = !full && (sky || 2 * bare <= SAMPLES);
+if (outside || !resolved) surfaces = 0;
 const int pairs = __popcll(surfaces);
 int before = pairs;
 #pragma unroll
-for (int step = 1; step < 16; step *= 2) {
-    const int other = __shfl_up_sync(ALL, before, step, 16);
-    if (pixel >= step) before += other;
+for (int step = 1; step < 32; step *= 2) {
+    const int other = __shfl_up_sync(ALL, before, step, 32);
+    if (lane >= step) before += other;
 }
-result[0] = __shfl_sync(ALL, before, 15);
+result[0] = __shfl_sync(ALL, before, 31);
 before -= pairs;
-for (int pair = before; surfaces; surfaces &= surfaces - 1) block.listed[pair++] = (unsigned short)(pixel | (__ffsll(surfaces) - 1) << 4);
+for (int pair = before; surfaces; surfaces &= surfaces - 1) block.pair[pair++] = (unsigned short)(lane | lowest(surfaces) << 5);
 __syncwarp();
 result[1] = before;
 result[2] = pairs;

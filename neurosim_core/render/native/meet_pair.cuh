@@ -1,35 +1,32 @@
-// CUDA: what a pixel sees of a surface, of the pairs that `cover_block.cuh` leaves: the pixel; the number of points that
-// show it; the part to shade (see `part_of` in `cover_lanes.cuh`), as bits; the direction; distance, weights of the first two
-// corners and the normal of the front where it meets the plane of the part.
-wp::vec_t<14, float> met;
+// CUDA: what a pixel sees of a surface, of the pairs that `cover_block.cuh` leaves: the number of points that show it; the width
+// of a ray [rad]; the part to shade (see `part_of` in `cover_lanes.cuh`), as bits; direction and origin. All threads of a warp
+// call it, with what is theirs of the pixels.
+wp::vec_t<9, float> met;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
 #include "sample_points.cuh"
-const int pixel = block.listed[pair] & 15, first = block.listed[pair] >> 4;
+const int code = block.pair[pair], owner = code % 32, first = code / 32, face = alone ? first : first + owner / 16 * ROOM;
+auto of_owner = [&](const wp::vec3& value) {
+    wp::vec3 theirs;
+    for (int axis = 0; axis < 3; ++axis) theirs[axis] = __shfl_sync(0xffffffffu, value[axis], owner);
+    return theirs;
+};
 float x, y;
-const float number = mean_of(block.shown[first][pixel], x, y);
+met[0] = mean_of(block.shown[0][first * (alone ? 16 : 32) + owner], x, y);
+met[1] = __shfl_sync(0xffffffffu, spread_rad, owner);
+const wp::vec3 middle = of_owner(center), sideways = of_owner(across), downwards = of_owner(down), origin = of_owner(position);
 wp::vec3 toward;
-for (int axis = 0; axis < 3; ++axis)
-    toward[axis] = fmaf(y, block.ray[6 + axis][pixel], fmaf(x, block.ray[3 + axis][pixel], block.ray[axis][pixel]));
+for (int axis = 0; axis < 3; ++axis) toward[axis] = fmaf(y, downwards[axis], fmaf(x, sideways[axis], middle[axis]));
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
-#include "edge_functions.cuh"
 #include "nearest_part.cuh"
-const int own = *wp::address(faces, instant, top + pixel / 4, left + pixel % 4), hit = block.part[first];
+const int own = __shfl_sync(0xffffffffu, own_part, owner), hit = block.part[face];
 int part = own;
-if (own < 0 || scene.face_surface.data[own] != block.surface[first])
-    part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
-#include "meet_plane.cuh"
-met[0] = (float)pixel;
-met[1] = number;
+if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[face].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
 met[2] = __int_as_float(part);
-met[6] = length * near;
-met[7] = corner[0] * near;
-met[8] = corner[1] * near;
 for (int axis = 0; axis < 3; ++axis) {
     met[3 + axis] = toward[axis];
-    met[9 + axis] = normal[axis];
+    met[6 + axis] = origin[axis];
 }
-for (int side = 0; side < 2; ++side) met[12 + side] = slope[side];
 #endif
 return met;

@@ -1,12 +1,21 @@
-// CUDA: what the threads of a warp share about 4 x 4 pixels, see `cover_block.cuh`.
+// CUDA: what the threads of a warp share about a block of 4 x 4 pixels in two instants, or in one, see `cover_block.cuh`. Each
+// instant has room for ROOM faces; one alone has all of it, for MOST.
+struct alignas(16) Quad {
+    float x, y, z, w;
+};
 struct Block {
     union {
-        float function[9][MOST];
-        float light[3][32]; // of the pairs that are shaded together
+        struct {
+            Quad function[3][32]; // edge functions of the 16 faces of each instant that are looked at
+            Quad edge[128];       // values of edge functions at the centres of pixels, their slopes, and whose they are
+        };
+        struct {
+            float light[3][32];             // of the pairs that are shaded together
+            unsigned short pair[32 * SAMPLES]; // threads in 5 bits, and entries above
+        };
     };
-    float plane[3][MOST], ray[9][16];
-    int seen[MOST], part[MOST], surface[MOST]; // part: -1 - face: no ray hit one
-    unsigned shown[MOST][16]; // of each face and pixel: bits of the points that show it
-    unsigned short listed[16 * MOST]; // pixels in 4 bits and entries above: of edges to look at, then of pairs
-    unsigned char first[MOST], reach[MOST]; // first: of the same surface
+    Quad plane[2 * ROOM];           // the nearness [1/m] along a direction is its product with this; then the surface, as bits
+    int seen[2 * ROOM], part[2 * ROOM]; // part: -1 - face: no ray hit one
+    unsigned shown[2 * ROOM][16]; // of each face and pixel: bits of the points that show it
+    unsigned char first[2 * ROOM]; // entry of the same surface
 };

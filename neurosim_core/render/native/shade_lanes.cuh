@@ -1,6 +1,7 @@
 // Radiance of N lanes: from `ray`, `spread`, `faces`, `ts`, `us`, `vs` and `normal` to `radiance`. Textures are
 // looked up twice, as `shading.py` says: `slope` [2][N] is the change of us and vs along the footprint [1/rad], 0: once.
-constexpr float COSINE_MIN = 0.05f, SCALE_RG = (float)(1.0 / 2047), SCALE_B = (float)(1.0 / 1023);
+constexpr float COSINE_MIN = 0.05f;
+constexpr float TEXEL_UNIT[3] = {1.0f / (2047 * 2047), 1.0f / (2047 * 2047), 1.0f / (1023 * 1023)}; // as in `materials.py`
 alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
 alignas(64) float light[3][3][N], emitted[3][N];
 alignas(64) int face[N], material[N];
@@ -145,7 +146,7 @@ if (sampled) {
                     for (int corner = 0; corner < 4; ++corner) {
                         const uint32_t bits = channel == 2 ? code[corner][lane] >> 22
                                                            : (code[corner][lane] >> (11 * channel)) & 2047u;
-                        const float root = (float)((int)(bits)) * (channel == 2 ? SCALE_B : SCALE_RG);
+                        const float root = (float)((int)(bits));
                         texel[corner] = root * root;
                     }
                     const float above = texel[0] * (1.0f - blend_x[lane]) + texel[1] * blend_x[lane];
@@ -165,9 +166,9 @@ if (sampled) {
     }
     const float each = twice ? 0.5f : 1.0f;
     for (int lane = 0; lane < N; ++lane) {
-        red[lane] = level_count[lane] ? red[lane] * (each * mean[0][lane]) : red[lane];
-        green[lane] = level_count[lane] ? green[lane] * (each * mean[1][lane]) : green[lane];
-        blue[lane] = level_count[lane] ? blue[lane] * (each * mean[2][lane]) : blue[lane];
+        red[lane] = level_count[lane] ? red[lane] * (each * (TEXEL_UNIT[0] * mean[0][lane])) : red[lane];
+        green[lane] = level_count[lane] ? green[lane] * (each * (TEXEL_UNIT[1] * mean[1][lane])) : green[lane];
+        blue[lane] = level_count[lane] ? blue[lane] * (each * (TEXEL_UNIT[2] * mean[2][lane])) : blue[lane];
     }
 }
 alignas(64) float radiance[3][N];

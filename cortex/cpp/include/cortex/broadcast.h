@@ -30,16 +30,21 @@ enum {
     CORTEX_HEAD_BYTES = 1 << 16, /* before the frames: a multiple of every page size */
     CORTEX_PAGE_BYTES = 4096,
     CORTEX_ENTRY_BYTES = 8,      /* before each frame: its size, and what it is */
+    CORTEX_FRAME_BYTES = 64,     /* of a frame's header, which is all of a frame that names a slot */
     CORTEX_SPARE_BYTES = 128,    /* kept free of messages, so that the last entry always finds room */
     CORTEX_WIDE_BYTES = 1 << 21, /* of a ring that a reliable reader has once been a whole ring behind in */
     CORTEX_SLOTS = 1024,         /* at most: each reader's page has a byte for each */
+    CORTEX_SMALL_BYTES = 4 << 20,  /* what small slots take in all, so that they stay in cache; most that growing ones have to spare */
+    CORTEX_DEEP_BYTES = 16 << 20,  /* what slots take, and how many there are, where a reader keeps more messages than by default */
+    CORTEX_DEEP_SLOTS = 128,
+    CORTEX_PRIVATE_BYTES = 64 << 20, /* most that a reader copies of what it may lease no more */
     CORTEX_STREAM_BYTES = 8 << 20, /* of an array that is copied past the caches, which it would sweep out */
 };
 
 enum { CORTEX_FRAME = 0, CORTEX_MOVED = 1 };                          /* what an entry is */
 enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a ring is to its reader */
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
-enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT }; /* what a reader finds in a slot */
+enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT, CORTEX_CROWDED }; /* what a reader finds in a slot */
 
 #define CORTEX_RING_MAGIC 0x3254534143585443u /* "CTXCAST2" */
 
@@ -130,6 +135,14 @@ typedef struct {
     CortexMap *map;
     uint32_t slot;
 } CortexLease;
+
+/* The body of a message that came in a slot: leased, or copied where the reader has enough leases. */
+typedef struct {
+    CortexLease lease; /* of a copy only the seat, where its bytes are counted */
+    uint8_t *data;
+    uint64_t size;
+    int is_leased;
+} CortexBody;
 
 typedef struct {
     uint64_t source, reader;
@@ -237,10 +250,15 @@ static inline void cortex_writer_append(CortexWriter *writer, const void *frame,
     writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_FRAME, frame, size);
 }
 
-/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
-static inline void cortex_writer_share(CortexWriter *writer) {
+static inline uint64_t cortex_writer_readers(const CortexWriter *writer) {
     uint64_t readers = 0;
     for (int index = 0; index < writer->count; ++index) readers += writer->members[index].used && !writer->members[index].left;
+    return readers;
+}
+
+/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
+static inline void cortex_writer_share(CortexWriter *writer) {
+    const uint64_t readers = cortex_writer_readers(writer);
     const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
     __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
 }
@@ -305,101 +323,7 @@ static inline void cortex_writer_dissolve(CortexWriter *writer) {
     cortex_writer_wake(writer);
 }
 
-/* Slots, of the publisher. */
-
-static inline uint8_t *cortex_slot_memory(const CortexMap *map, int slot) { return map->slots + (uint64_t)slot * map->slot_bytes; }
-
-/* Whether a reader looks at a slot, or a reliable one that is not late has not come to it. */
-static inline int cortex_member_wants(CortexWriter *writer, CortexMember *member, int slot) {
-    if (!member->used) return 0;
-    if (member->strict && !member->late && !member->left && member->tail < writer->slots[slot].end) {
-        member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it leases before that, we see */
-        if (member->tail < writer->slots[slot].end) return 1;
-    }
-    return __atomic_load_n(&member->page->generation, __ATOMIC_ACQUIRE) == writer->map->generation
-        && __atomic_load_n(&member->page->leases[slot], __ATOMIC_ACQUIRE);
-}
-
-static inline int cortex_slot_is_wanted(CortexWriter *writer, int slot) {
-    for (int index = 0; index < writer->count; ++index)
-        if (cortex_member_wants(writer, &writer->members[index], slot)) return 1;
-    return 0;
-}
-
-/* Whether every reader has come to a slot, lossy ones, too. */
-static inline int cortex_slot_is_read(CortexWriter *writer, int slot) {
-    for (int index = 0; index < writer->count; ++index) {
-        CortexMember *member = &writer->members[index];
-        if (!member->used || member->left || member->tail >= writer->slots[slot].end) continue;
-        member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
-        if (member->tail < writer->slots[slot].end) return 0;
-    }
-    return 1;
-}
-
-/* Take a slot to be written; 0 if somebody has just leased it. */
-static inline int cortex_slot_take(CortexWriter *writer, int slot) {
-    const uint64_t word = __atomic_load_n(&writer->ring->words[slot], __ATOMIC_RELAXED);
-    __atomic_store_n(&writer->ring->words[slot], 0, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_reader_lease` */
-    if (cortex_slot_is_wanted(writer, slot)) {
-        __atomic_store_n(&writer->ring->words[slot], word, __ATOMIC_RELEASE);
-        return 0;
-    }
-    writer->slots[slot].busy = 1;
-    writer->slots[slot].written = ++writer->clock;
-    return 1;
-}
-
-/* A slot to write, until `cortex_slot_commit` or `cortex_slot_abandon`; -1 if none is free. Of those that all have read the
-   one that was written last, as it is in the cache; else the one that was written first, so that who lags loses the oldest. */
-static inline int cortex_slot_acquire(CortexWriter *writer) {
-    cortex_writer_tidy(writer);
-    for (uint64_t tries = 0; tries < 2 * writer->map->slot_count; ++tries) {
-        int best = -1, best_is_read = 0;
-        for (int slot = 0; slot < (int)writer->map->slot_count; ++slot) {
-            const CortexSlot *known = &writer->slots[slot];
-            if (known->busy || cortex_slot_is_wanted(writer, slot)) continue;
-            const int is_read = cortex_slot_is_read(writer, slot);
-            const int better = best < 0 || is_read > best_is_read
-                || (is_read == best_is_read && (known->written > writer->slots[best].written) == is_read);
-            if (!better) continue;
-            best = slot;
-            best_is_read = is_read;
-        }
-        if (best < 0) return -1;
-        if (cortex_slot_take(writer, best)) return best;
-    }
-    return -1;
-}
-
-/* Whether a reliable reader has still to come to a slot: then one may become free when it has. */
-static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *member) {
-    if (!member->used || member->left || !member->strict || member->late) return 0;
-    uint64_t end = 0;
-    for (uint64_t slot = 0; slot < writer->map->slot_count; ++slot)
-        if (writer->slots[slot].end > end) end = writer->slots[slot].end;
-    if (member->tail >= end) return 0;
-    member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
-    if (member->tail < end) member->strict = !cortex_is_gone(member->socket);
-    return member->strict && member->tail < end;
-}
-
-static inline void cortex_slot_abandon(CortexWriter *writer, int slot) {
-    writer->slots[slot].busy = 0;
-    writer->slots[slot].end = 0;
-}
-
-/* Send the frame that names a slot which has been written; with CORTEX_FULL it is still to be sent. */
-static inline int cortex_slot_commit(CortexWriter *writer, int slot, uint64_t sequence, const void *frame, size_t size, int mind) {
-    __atomic_store_n(&writer->ring->words[slot], sequence + 1, __ATOMIC_RELEASE);
-    const uint64_t before = writer->head;
-    const int found = cortex_writer_put(writer, frame, size, mind);
-    if (found == CORTEX_FULL) return found;
-    writer->slots[slot].busy = 0;
-    writer->slots[slot].end = writer->head == before ? 0 : writer->head;
-    return found;
-}
+#include "broadcast_slots.h"
 
 /* A reader. Not for several threads at once. */
 
@@ -427,7 +351,7 @@ static inline void cortex_reader_skip(CortexReader *reader) {
     cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
 }
 
-/* The next frame where it lies, to be copied before `cortex_reader_take`; 0 if there is none, -1 if none will come, see `state`. */
+/* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
     while (reader->state == CORTEX_SOUND) {
         const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
@@ -449,14 +373,7 @@ static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **f
     return -1;
 }
 
-/* Done with a frame of so many bytes; 0 if it was written over meanwhile, and what was copied is worth nothing. */
-static inline int cortex_reader_take(CortexReader *reader, int64_t size) {
-    if (!cortex_reader_is_whole(reader)) return 0;
-    cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
-    return 1;
-}
-
-/* Lease the slot that a frame names, before `cortex_reader_take`. CORTEX_COPY: the reader has enough of them, but may copy the
+/* Lease the slot that a frame names. CORTEX_COPY: the reader has enough of them, but may copy the
    message and then call `cortex_reader_has`; CORTEX_NO_SLOT: the frame is wrong. */
 static inline int cortex_reader_lease(CortexReader *reader, uint64_t slot, uint64_t sequence, uint64_t size, CortexLease *lease) {
     CortexMap *map = reader->map;
@@ -502,6 +419,59 @@ static inline void cortex_lease_end(const CortexLease *lease) {
     __atomic_fetch_sub(&seat->held, 1, __ATOMIC_RELAXED);
     cortex_map_end(lease->map);
     cortex_seat_end(seat);
+}
+
+/* Let go of a body; any thread may. */
+static inline void cortex_body_end(CortexBody *body) {
+    if (body->is_leased) {
+        cortex_lease_end(&body->lease);
+    } else if (body->data != NULL) {
+        __atomic_fetch_sub(&body->lease.seat->private_bytes, body->size, __ATOMIC_RELAXED);
+        cortex_seat_end(body->lease.seat);
+        free(body->data);
+    }
+    memset(body, 0, sizeof *body);
+}
+
+/* Copy what may not be leased: CORTEX_COPY, CORTEX_OVERWRITTEN, or CORTEX_CROWDED if too much is kept already. */
+static inline int cortex_body_copy(const CortexReader *reader, CortexBody *body, uint64_t sequence) {
+    CortexSeat *seat = reader->seat;
+    const uint64_t many = CORTEX_PRIVATE_BYTES, most = body->size < many / 4 ? many : 4 * body->size;
+    if (__atomic_load_n(&seat->private_bytes, __ATOMIC_RELAXED) + body->size > most) return CORTEX_CROWDED;
+    body->data = (uint8_t *)malloc((size_t)cortex_most(body->size, 1));
+    if (body->data == NULL) return CORTEX_CROWDED;
+    body->lease.seat = seat;
+    __atomic_fetch_add(&seat->users, 1, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&seat->private_bytes, body->size, __ATOMIC_RELAXED);
+    cortex_copy(body->data, cortex_slot_memory(reader->map, (int)body->lease.slot), (size_t)body->size);
+    return cortex_reader_has(reader, body->lease.slot, sequence) ? CORTEX_COPY : CORTEX_OVERWRITTEN;
+}
+
+/* Done with a frame that was copied from where `cortex_reader_peek` found it: 1. If it names a slot, `body` gets what is there; its
+   data is NULL if there is nothing, as the frame is wrong. 0: frame or body were written over meanwhile. -1: the message has to
+   wait until the user lets others go, or to be passed over. */
+static inline int cortex_reader_finish(CortexReader *reader, const uint8_t *frame, int64_t size, CortexBody *body) {
+    int found = CORTEX_NO_SLOT;
+    memset(body, 0, sizeof *body);
+    if (!cortex_reader_is_whole(reader)) return 0;
+    if (size == CORTEX_FRAME_BYTES && frame[3] == 'S') {
+        uint64_t rest[5]; /* sequence, two times, size, slot */
+        memcpy(rest, frame + CORTEX_FRAME_BYTES - sizeof rest, sizeof rest);
+        found = cortex_reader_lease(reader, rest[4], rest[0], rest[3], &body->lease);
+        body->size = rest[3];
+        body->is_leased = found == CORTEX_LEASED;
+        if (body->is_leased) body->data = cortex_slot_memory(body->lease.map, (int)body->lease.slot);
+        if (found == CORTEX_COPY) found = cortex_body_copy(reader, body, rest[0]);
+        if (found == CORTEX_CROWDED) return -1;
+        if (found == CORTEX_OVERWRITTEN) cortex_body_end(body);
+    }
+    cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
+    return found != CORTEX_OVERWRITTEN;
+}
+
+/* Leave out the message that has to wait. */
+static inline void cortex_reader_pass_over(CortexReader *reader) {
+    cortex_reader_move(reader, reader->tail + cortex_entry_bytes(CORTEX_FRAME_BYTES));
 }
 
 /* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring

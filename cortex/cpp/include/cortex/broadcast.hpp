@@ -2,8 +2,6 @@
 // The ring that carries a publisher's frames to the readers of its host; what it does is in `broadcast.h`.
 #pragma once
 
-#include <algorithm>
-#include <atomic>
 #include <cerrno>
 #include <cstddef>
 #include <cstdint>
@@ -23,19 +21,6 @@
 namespace cortex::detail {
 
 constexpr std::size_t ring_bytes = 1 << 19;
-constexpr std::uint64_t slots_bytes = 4u << 20;  // small slots stay in cache
-constexpr std::uint64_t slots_bytes_max = std::uint64_t{2} << 30;
-constexpr std::uint64_t private_bytes_max = 64u << 20;  // that wait for a socket, or that a reader copies
-
-// Keeps a message in its slot.
-struct Lease {
-  explicit Lease(const CortexLease& taken) noexcept : lease(taken) {}
-  Lease(const Lease&) = delete;
-  Lease& operator=(const Lease&) = delete;
-  ~Lease() { cortex_lease_end(&lease); }
-  CortexLease lease;
-};
-
 // Where a node's local readers ask for rings. Without one they go on with ZeroMQ.
 class Listener {
  public:
@@ -120,18 +105,10 @@ class Broadcast {
   // Whether a reliable reader has still to come to a slot.
   bool is_behind(int member) noexcept { return cortex_member_is_behind(&writer_, &writer_.members[member]) != 0; }
 
-  // Makes slots for bodies of a size and so many readers, if need be; false if there is no memory for them.
-  bool provide(std::size_t size, bool exact, std::uint64_t readers) noexcept {
-    const std::uint64_t before = writer_.map->slot_bytes;
-    const std::uint64_t wanted = 2 * readers + 2;
-    const bool fits = before >= size;
-    if (fits && writer_.map->slot_count >= wanted) return true;
-    std::uint64_t slot_bytes = std::max<std::uint64_t>(exact ? size : size + size / 4, before);
-    slot_bytes = (slot_bytes + CORTEX_PAGE_BYTES - 1) / CORTEX_PAGE_BYTES * CORTEX_PAGE_BYTES;
-    std::uint64_t slots = std::max(std::clamp<std::uint64_t>(slots_bytes / slot_bytes, 4, 64), wanted);
-    slots = std::max<std::uint64_t>(4, std::min(slots, slots_bytes_max / slot_bytes));
-    return (fits && writer_.map->slot_count >= slots) ||
-           cortex_writer_grow(&writer_, writer_.capacity, slots, slot_bytes) == 0 || fits;
+  // Makes slots for bodies of a size, if need be; false if there is no memory for them.
+  bool provide(std::size_t size, bool exact) noexcept {
+    cortex_writer_provide(&writer_, size, exact ? 1 : 0, 0);
+    return writer_.map->slot_bytes >= size;
   }
 
   // A slot to be written; without a buffer if none is free.
@@ -186,7 +163,7 @@ class RingReader {
   bool is_crowded() const noexcept { return is_crowded_; }
   // Leaves it out.
   void pass_over() noexcept {
-    if (is_crowded_) cortex_reader_move(&reader_, reader_.tail + cortex_entry_bytes(wire::header_size));
+    if (is_crowded_) cortex_reader_pass_over(&reader_);
     is_crowded_ = false;
   }
   // The body that the last frame names, and what keeps it; null if it names none.
@@ -204,14 +181,15 @@ class RingReader {
       std::int64_t size = 0;
       while ((size = cortex_reader_peek(&reader_, &data)) > 0) {
         frame_.assign(data, data + size);
-        if (cortex_reader_is_whole(&reader_) == 0) {
-          cortex_reader_take(&reader_, size);
-          continue;
-        }
-        const bool taken = size != wire::header_size || frame_[3] != 'S' || take_slot();
+        CortexBody found;
+        const int counts = cortex_reader_finish(&reader_, frame_.data(), size, &found);
+        is_crowded_ = counts < 0;
         if (is_crowded_) return {};
-        cortex_reader_move(&reader_, reader_.tail + cortex_entry_bytes(static_cast<std::uint64_t>(size)));
-        if (!taken) continue;  // it was written over meanwhile
+        if (counts == 0) continue;  // it was written over meanwhile
+        if (found.data != nullptr) {
+          owner_ = std::make_shared<Body>(found);
+          body_ = {found.data, static_cast<std::size_t>(found.size)};
+        }
         cortex_reader_disarm(&reader_);
         return {frame_.data(), frame_.size()};
       }
@@ -222,41 +200,14 @@ class RingReader {
  private:
   RingReader() = default;
 
-  // Takes the body that the frame names; false if the message is lost, or has to wait.
-  bool take_slot() {
-    const auto sequence = wire::load<std::uint64_t>(frame_.data() + 24);
-    const auto size = wire::load<std::uint64_t>(frame_.data() + 48);
-    const auto slot = wire::load<std::uint64_t>(frame_.data() + 56);
-    CortexLease lease;
-    const int found = cortex_reader_lease(&reader_, slot, sequence, size, &lease);
-    if (found == CORTEX_OVERWRITTEN) return false;
-    if (found == CORTEX_NO_SLOT) return true;  // the frame is wrong, as who reads it finds
-    const std::uint8_t* at = cortex_slot_memory(reader_.map, static_cast<int>(slot));
-    if (found == CORTEX_LEASED) {
-      owner_ = std::make_shared<Lease>(lease);
-      body_ = {at, static_cast<std::size_t>(size)};
-      return true;
-    }
-    return copy_slot(at, static_cast<std::size_t>(size), slot, sequence);
-  }
-
-  // Copies what may not be leased.
-  bool copy_slot(const std::uint8_t* at, std::size_t size, std::uint64_t slot, std::uint64_t sequence) {
-    if (*copied_ + size > (size < private_bytes_max / 4 ? private_bytes_max : 4 * size)) {
-      is_crowded_ = true;
-      return false;
-    }
-    *copied_ += size;
-    const std::shared_ptr<std::vector<std::uint8_t>> copy(
-        new std::vector<std::uint8_t>(at, at + size), [copied = copied_](const std::vector<std::uint8_t>* bytes) {
-          *copied -= bytes->size();
-          delete bytes;
-        });
-    if (cortex_reader_has(&reader_, slot, sequence) == 0) return false;
-    owner_ = copy;
-    body_ = {copy->data(), size};
-    return true;
-  }
+  // Keeps the body of a message.
+  struct Body {
+    explicit Body(const CortexBody& taken) noexcept : body(taken) {}
+    Body(const Body&) = delete;
+    Body& operator=(const Body&) = delete;
+    ~Body() { cortex_body_end(&body); }
+    CortexBody body;
+  };
 
   CortexReader reader_{};
   bool open_ = false;
@@ -264,7 +215,6 @@ class RingReader {
   std::vector<std::uint8_t> frame_;
   Span<const std::uint8_t> body_;
   std::shared_ptr<const void> owner_;
-  std::shared_ptr<std::atomic<std::size_t>> copied_ = std::make_shared<std::atomic<std::size_t>>(0);
 };
 
 }  // namespace cortex::detail

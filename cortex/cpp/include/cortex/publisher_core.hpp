@@ -342,7 +342,7 @@ class PublisherCore {
   // Header and body, the body from where it lies.
   bool send_large(Lock& lock, PubSocket& pub_socket, const Slot& slot, const std::string& head, std::size_t size,
                   bool& passed_over) {
-    const auto fits = [&] { return *private_bytes_ + size <= std::max<std::size_t>(private_bytes_max, 4 * size); };
+    const auto fits = [&] { return *private_bytes_ + size <= std::max<std::size_t>(CORTEX_PRIVATE_BYTES, 4 * size); };
     if (!fits() && !(pub_socket.strict && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
       passed_over = true;
       return !pub_socket.strict;
@@ -363,7 +363,7 @@ class PublisherCore {
   // their sockets, and waited for a little.
   bool provide(Lock& lock, std::size_t size) {
     if (!readers_.has_members()) return false;
-    if (readers_.ring().provide(size, exact_, readers_.member_count())) return true;
+    if (readers_.ring().provide(size, exact_)) return true;
     complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
     readers_.dissolve();
     const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(pub_sockets_->lossy), readers_.timeout_ms(pub_sockets_->strict)});

@@ -92,7 +92,6 @@ class Readers {
 
   // The ring; there is one if it has members.
   Broadcast& ring() noexcept { return *ring_; }
-  std::size_t member_count() const noexcept { return members_; }
 
   // The shortest time for which a reliable reader that has no room in the ring, or with size 0 has not come to all slots,
   // may hold up the publisher; UINT32_MAX: there is none.

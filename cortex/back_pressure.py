@@ -7,22 +7,22 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 
-from cortex.gate import Gate
+from cortex.fast_send import FastSend
 from cortex.pub_socket import Backoff, PubSockets
 
 
-class Patience:
+class BackPressure:
     """The waiting of one publisher. A block of it is the time of one message; the caller holds the lock.
 
     Args:
         sockets: Whose lock it is; who has come and gone meanwhile is looked at after each sleep.
-        gate: Lets no other message pass meanwhile.
+        fast_send: Lets no other message pass meanwhile.
         check_open: Raises once the publisher is closed.
     """
 
-    def __init__(self, pub_sockets: PubSockets, gate: Gate, check_open: Callable[[], None]) -> None:
+    def __init__(self, pub_sockets: PubSockets, fast_send: FastSend, check_open: Callable[[], None]) -> None:
         self._pub_sockets = pub_sockets
-        self._gate = gate
+        self._fast_send = fast_send
         self._check_open = check_open
         self.until_s = math.inf
         """Nobody is waited for after this, on the monotonic clock [s]; set by any thread, without lock."""
@@ -31,7 +31,7 @@ class Patience:
 
     def __enter__(self) -> None:
         self.is_waiting = True
-        self._gate.refresh_ns = 0  # other threads look at this
+        self._fast_send.refresh_ns = 0  # other threads look at this
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -10,11 +10,11 @@ PATIENCE_S = 2.0
 """After so long the holder may be the one who asks: a receiver gives the lock up within 20 ms."""
 
 
-class Turn:
+class ReceiveLock:
     """A receiver holds `lock` while it blocks in a socket: the quickest way to wait for a message.
 
-    Everybody else enters with `with turn:`, which counts as `waiting` until the lock is theirs. A receiver
-    looks at that before it blocks, and blocks for short times only.
+    Everybody else enters with `with`, which counts as `waiting` until the lock is theirs. A receiver looks at
+    that before it blocks, and blocks for short times only.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Turn:
         """Return whether somebody else's function has been called from one that uses this lock."""
         others = False
         while frame is not None:
-            own = getattr(frame.f_locals.get("self"), "_turn", None) is self
+            own = getattr(frame.f_locals.get("self"), "_receive_lock", None) is self
             if own and others:
                 return True
             others |= not own

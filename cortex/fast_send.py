@@ -7,10 +7,10 @@ from typing import Any
 
 import zmq
 
-from cortex.native import NativeGate
+from cortex.native import NativeFastSend
 
 
-class Gate:
+class FastSend:
     """Sends the messages of one publisher, and counts them: in C. Without C each takes the slow path."""
 
     prepare: Callable[[int], None]
@@ -50,15 +50,15 @@ class Gate:
         return None
 
 
-def make_gate(
+def make_fast_send(
     coder: Any,
     lock: Any,
     *,
     slowly: Callable[[Any], bool],
     retry: Callable[[bytes, Callable[..., Any]], bool],
     limit: int,
-) -> Gate:
-    """Build the gate of one publisher.
+) -> FastSend:
+    """Build the fast path of one publisher.
 
     Args:
         coder: Packs its messages in C, see `coder_of`; None: Python does.
@@ -68,7 +68,7 @@ def make_gate(
         limit: Most bytes of a body that is sent so.
     """
     if coder is None:
-        return Gate(slowly)
-    gate: Gate = NativeGate(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
-    gate.sends = ()
-    return gate
+        return FastSend(slowly)
+    fast_send: FastSend = NativeFastSend(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
+    fast_send.sends = ()
+    return fast_send

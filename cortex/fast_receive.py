@@ -13,9 +13,9 @@ from typing import Any
 import zmq
 
 from cortex.link import Item, Link
-from cortex.native import NativeInlet
+from cortex.native import NativeFastReceive
+from cortex.receive_lock import ReceiveLock
 from cortex.stats import SubscriberCounters
-from cortex.turn import Turn
 
 PAUSE_NS = 1_000_000
 PAUSE_COUNT = 1024
@@ -29,7 +29,7 @@ class _Nothing:
 NOTHING: Any = _Nothing()
 
 
-class Inlet:
+class FastReceive:
     """Takes the messages of one subscriber, and counts them: in C. Without C it takes none."""
 
     def __init__(self) -> None:
@@ -59,18 +59,23 @@ class Inlet:
         return NOTHING
 
 
-def make_inlet(
-    turn: Turn, queue: deque[Item], counters: SubscriberCounters, accept: Callable[[Link, bytes], None]
-) -> Inlet:
-    """Build the inlet of one subscriber.
+def make_fast_receive(
+    receive_lock: ReceiveLock,
+    queue: deque[Item],
+    counters: SubscriberCounters,
+    accept: Callable[[Link, bytes], None],
+) -> FastReceive:
+    """Build the fast path of one subscriber.
 
     Args:
-        turn: Its lock.
+        receive_lock: Its lock.
         queue: What has to be taken before.
         counters: Their `received` and `latency` are kept.
         accept: Called with the lock held, a link, and a frame that does not simply follow.
     """
-    if NativeInlet is None:
-        return Inlet()
-    inlet: Inlet = NativeInlet(turn.lock, turn, queue, counters, zmq.Again, accept, NOTHING)
-    return inlet
+    if NativeFastReceive is None:
+        return FastReceive()
+    fast_receive: FastReceive = NativeFastReceive(
+        receive_lock.lock, receive_lock, queue, counters, zmq.Again, accept, NOTHING
+    )
+    return fast_receive
