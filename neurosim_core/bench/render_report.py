@@ -162,6 +162,8 @@ def draw_plot(plot: Plot) -> bytes:
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:
+    from matplotlib.ticker import LogLocator
+
     number = -1
     for series in panel.series:
         law = series.style == "law"
@@ -177,5 +179,12 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     axes.set(xscale="log" if "x" in panel.log else axes.get_xscale())
     axes.set(yscale="log" if "y" in panel.log else "linear", ylim=(panel.y_min, panel.y_max))
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = sorted(axis.get_view_interval())
+        if axis.get_scale() == "log":
+            axis.set_minor_formatter("")
+            if high < 100.0 * low:  # one or two decades
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+                axis.set_major_formatter("{x:g}")
     if len(axes.get_legend_handles_labels()[1]) > 1:
         axes.legend()

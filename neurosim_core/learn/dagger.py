@@ -47,13 +47,6 @@ class DaggerConfig:
     hint_weight: float = 2.0
     """Of the error of the estimated velocity, against that of the action."""
     gradient_max: float = 1.0
-    inverted: float = 0.0
-    """Share of the stretches that are learnt from with brighter and darker exchanged, as in a negative."""
-    shifted_px: int = 0
-    """Most pixels by which pictures are shifted, all of a gradient step alike."""
-    cut: float = 0.0
-    """Share of the worlds that begin anew with each iteration: more is seen of what episodes begin with."""
-    weight_decay: float = 0.0
     hidden: int = 128
     """Width of the student's GRU,"""
     widths: tuple[int, ...] = (32, 48, 48, 48, 48)
@@ -82,9 +75,7 @@ class Dagger:
         self.policy = EventPolicy(channels, height, width, vector.shape[1], **sizes).to(env.device)
         if env.device.type == "cuda":
             self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.descent = Descent(
-            self.policy, self._loss, gradient_max=config.gradient_max, weight_decay=config.weight_decay
-        )
+        self.descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
         self._pushed = torch.zeros((env.num_envs, 4), device=env.device)
@@ -150,10 +141,6 @@ class Dagger:
         self._action = torch.zeros((env.num_envs, 4), device=env.device)
         self._act = Replayed(self._decide, on_cuda=env.device.type == "cuda")
         self._rows = torch.zeros(config.batch, dtype=torch.int64, device=env.device)
-        self._inverted = torch.zeros((config.batch, 1, 1, 1, 1, 1), dtype=torch.bool, device=env.device)
-        edges = self._now["events"].shape[2:]
-        self._pixels = [torch.arange(size, device=env.device) for size in edges]
-        self._shifted = [pixels.clone() for pixels in self._pixels]
         self._losses = torch.zeros(2, device=env.device)
         self._flown = 0
 
@@ -166,9 +153,6 @@ class Dagger:
         draw = torch.rand(env.num_envs, generator=self._generator, device=env.device)
         led = (draw < lead)[:, None]
         push = 2.0 * config.disturbance * (draw / lead)[:, None]
-        if config.cut > 0.0:
-            drawn = torch.rand(env.num_envs, generator=self._generator, device=env.device)
-            env.episode_length.masked_fill_(drawn < config.cut, env.episode_steps)
         decay = math.exp(-1.0 / (env.task.rate_hz * config.disturbance_s))
         for step in range(config.horizon):
             seen = self._seen
@@ -210,14 +194,6 @@ class Dagger:
                 stretches, (config.batch,), generator=self._generator, device=self.env.device
             )
             self._rows.copy_(rows)
-            drawn = torch.rand(self._inverted.shape, generator=self._generator, device=self.env.device)
-            torch.lt(drawn, config.inverted, out=self._inverted)
-            if config.shifted_px:
-                span = 2 * config.shifted_px + 1
-                shifts = torch.randint(span, (2,), generator=self._generator, device=self.env.device)
-                for pixels, shifted, shift in zip(self._pixels, self._shifted, shifts, strict=True):
-                    moved = pixels + shift - config.shifted_px
-                    torch.clamp(moved, 0, len(pixels) - 1, out=shifted)
             self.descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()
         return {"imitation": imitation, "hint": hint}
@@ -226,12 +202,6 @@ class Dagger:
         """Return the loss of the stretches that `_rows` names; adds to `_losses`."""
         part = {name: value.flatten(0, 1).index_select(0, self._rows) for name, value in self._kept.items()}
         memory = part.pop("memory")
-        if self.config.inverted > 0.0:
-            pairs = part["surface"].unflatten(2, (-1, 2))  # off and on
-            part["surface"] = torch.where(self._inverted, pairs.flip(3), pairs).flatten(2, 3)
-        if self.config.shifted_px:
-            rows, columns = self._shifted
-            part["surface"] = part["surface"].index_select(3, rows).index_select(4, columns)
         part = {name: value.transpose(0, 1) for name, value in part.items()}
         action, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
         errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()

@@ -66,20 +66,14 @@ class Descent:
         loss: Callable[[], torch.Tensor],
         *,
         gradient_max: float,
-        weight_decay: float = 0.0,
         **settings: Any,
     ) -> None:
         self._module, self._loss, self._gradient_max = module, loss, gradient_max
         device = next(module.parameters()).device
         self._on_cuda = device.type == "cuda"
         self._rate = torch.zeros((), device=device) if self._on_cuda else 0.0
-        self.optimizer = torch.optim.AdamW(
-            module.parameters(),
-            lr=self._rate,
-            capturable=self._on_cuda,
-            fused=self._on_cuda,
-            weight_decay=weight_decay,
-            **settings,
+        self.optimizer = torch.optim.Adam(
+            module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
         )
         self._differentiate = Replayed(self._backward, on_cuda=self._on_cuda)
         self._improve = Replayed(self._step, on_cuda=self._on_cuda)

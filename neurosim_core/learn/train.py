@@ -29,7 +29,6 @@ from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, te
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
-from neurosim_core.learn.task import Task
 from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
@@ -52,8 +51,6 @@ class TrainConfig:
     """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
-    rays_per_pixel: int | None = None
-    """Rays that a pixel takes the mean of in training; None: as the task says, as in tests."""
     randomise: str = "training"
     """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
     learn, or nothing (`none`)."""
@@ -102,7 +99,7 @@ class Training:
         if config.randomise == "training" and drawn is not None:
             randomise = drawn
         self.env = make_env(
-            _task_of(config),
+            config.task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
@@ -116,7 +113,7 @@ class Training:
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
             teacher_env = make_env(
-                _task_of(config),
+                config.task,
                 worlds=config.teacher.worlds,
                 device=config.device,
                 observe=states,
@@ -231,13 +228,6 @@ class Training:
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
-def _task_of(config: TrainConfig) -> Task:
-    """Return the task as it is trained."""
-    task = find_task(config.task)
-    task.rays_per_pixel = config.rays_per_pixel or task.rays_per_pixel
-    return task
-
-
 def prepare_torch() -> None:
     """Choose how PyTorch computes in this process."""
     torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
@@ -271,19 +261,18 @@ def default_config(
             "updates": 8,
             "replay": 10,
             "learning_rate": 2e-3,
-            "inverted": 0.5,
         }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         return dataclasses.replace(
             config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=75
         )
-    many = {"worlds": 1024, "iterations": 90, "replay": 4, "updates": 26, "batch": 160}
+    many = {"worlds": 1024, "iterations": 82, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,
         teacher=PpoConfig(**({"worlds": 1024, "iterations": 50} | teacher)),
         student=DaggerConfig(**(many | student)),
-        block=45,
+        block=41,
         evaluation_worlds=512,
     )
 
@@ -409,7 +398,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "mount": dict(task.mount),
         "threshold": task.threshold,
         "renders_per_step": task.renders_per_step,
-        "rays_per_pixel": find_task(name).rays_per_pixel,
+        "rays_per_pixel": task.rays_per_pixel,
         "surface": env.surface_card,
         "hover_thrust_n": env.view.vehicle.hover_thrust_n,
         "thrust_span": task.thrust_span,

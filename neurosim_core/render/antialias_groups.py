@@ -44,8 +44,10 @@ _INSTANTS = wp.constant(4)
 """Instants of a pixel in a block that shows one surface, of a thread."""
 _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
-_COVER_BOUNDS = (64, 12)
+_COVER_BOUNDS = (64, 10)
 """Threads of a block, and blocks of a multiprocessor."""
+_ROOM = 36
+"""Faces of a block for which a warp has room in each of two instants."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
@@ -105,7 +107,7 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
 def _cover_block(
     scene: SceneData,
     faces: wp.array3d[int],
@@ -125,7 +127,7 @@ def _cover_block(
     ...
 
 
-@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
 def _meet_pair(
     scene: SceneData,
     place: int,
@@ -142,15 +144,15 @@ def _meet_pair(
     ...
 
 
-@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
 def _store_pair(place: int, pair: int, light: wp.vec3):
     """Keep the light of a pair."""
     ...
 
 
-@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
-def _sum_pairs(place: int, first: int, count: int, step: int) -> wp.vec3:
-    """Return the light of those of consecutive pairs that are among the 32 of a step."""
+@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
+def _sum_pairs(place: int, first: int, count: int, step: int, total: wp.vec3) -> wp.vec3:
+    """Return `total` and the light of those of consecutive pairs that are among the 32 of a step."""
     ...
 
 
@@ -313,7 +315,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(
                     4 * (tile * view.instant_count + instant) + quarter, pixels
                 )
-            if kind == _SEVERAL:
+            if kind == _SEVERAL and in_picture:
                 uneven = uneven | (1 << (instant - begin))
             even = kind != _SEVERAL and kind != _BODY
             if at.outside or not even:
@@ -330,7 +332,6 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     SHARPNESS * ray_C[3],
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
-        uneven = wp.where(in_picture, uneven, 0)
         if view.instant_count == 1:
             votes = _warp_votes(uneven != 0)
             bits = (votes & 1) | ((votes >> 15) & 2)
@@ -340,9 +341,8 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             for pair in range(_INSTANTS // 2):
                 bits = (uneven >> (2 * pair)) & 3
                 if lane == 0 and bits != 0:
-                    lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(
-                        4 * tile + quarter, begin + 2 * pair, bits
-                    )
+                    uneven_block = wp.vec3i(4 * tile + quarter, begin + 2 * pair, bits)
+                    lists.uneven[wp.atomic_add(lists.count, 0, 1)] = uneven_block
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
@@ -424,7 +424,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                         footprint_width(met[0]) * met[1],
                     )
                     _store_pair(covered[5], pair, met[0] * light)
-                total += _sum_pairs(covered[5], covered[1], covered[2], step)
+                total = _sum_pairs(covered[5], covered[1], covered[2], step, total)
             whole = float(SAMPLE_COUNT)
             if covered[4] != 0:
                 total += float(covered[3]) * scene.sky

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -33,18 +34,22 @@ def cached_arrays(
     """
     digest = hashlib.blake2b(digest_size=16)
     for part in inputs:
-        array = isinstance(part, np.ndarray)
-        digest.update(np.ascontiguousarray(part).data if array else repr(part).encode())
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype} {part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        else:
+            digest.update(repr(part).encode())
     entry = Path(str(wp.config.kernel_cache_dir), "light", f"{digest.hexdigest()}.npz")
     with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):  # not there, or damaged
         with entry.open("rb") as source, np.load(source) as kept:
             found = dict(kept)
-        os.utime(entry)
+        with contextlib.suppress(OSError):  # a cache that cannot be written to is read all the same
+            os.utime(entry)
         return found
     made = compute()
     with contextlib.suppress(OSError):  # a folder that cannot be written to, a full disk
         entry.parent.mkdir(parents=True, exist_ok=True)
-        part_file = entry.with_suffix(f".{os.getpid()}")
+        part_file = entry.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
         try:
             with part_file.open("wb") as file:
                 np.savez(file, **cast(Any, made))
@@ -56,7 +61,7 @@ def cached_arrays(
 
 
 def _remove_oldest(folder: Path) -> None:
-    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*.npz")), reverse=True)
+    entries = sorted(((file.stat().st_mtime, file) for file in folder.glob("*")), reverse=True)
     total = 0
     for _, file in entries:
         total += file.stat().st_size

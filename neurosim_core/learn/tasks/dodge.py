@@ -34,10 +34,10 @@ _AWAY_M = 1.0
 
 @register("task", "dodge")
 class Dodge(Task):
-    """Hover where the episode began, facing the same way, and be hit by none of three spheres.
+    """Hover where the episode began, and be hit by none of three spheres.
 
-    The student sees event surfaces, and what an autopilot knows: velocity, gravity, body rates, its place and
-    its heading. The teacher is told where the sphere is that comes next, once it has left the floor.
+    The student sees event surfaces, and what an autopilot knows: velocity, gravity, body rates and its place.
+    The teacher is told where the sphere is that comes next, once it has left the floor.
     """
 
     episode_s = 5.0
@@ -51,7 +51,6 @@ class Dodge(Task):
         f"sphere_{index}": {
             "shape": {"kind": "sphere", "radius_m": _RADIUS_M},
             "surface": {"kind": "checker"},
-            "motion": {"spin_rad_s": (0.0, 6.0, 3.0)},
         }
         for index in range(_SPHERES)
     }
@@ -59,7 +58,7 @@ class Dodge(Task):
     student: Mapping[str, Any] = {"disturbance": 0.1}
     hint = "threat"
     mirror: Mapping[str, Sequence[float]] = {
-        "proprioception": (*(1, -1, 1), *(1, -1, 1), *(-1, 1, -1), *(1, -1, 1), *(1, -1), *MIRROR_ACTION),
+        "proprioception": (*(1, -1, 1, 1, -1, 1), *MIRROR_ACTION, *(1, -1, 1, -1, 1, -1)),
         "threat": (1, -1, 1),
     }
 
@@ -90,14 +89,11 @@ class Dodge(Task):
         return position[:, None] - hit_s[..., None] * (velocity - 0.5 * fallen), velocity - fallen
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
-        """Note the heading, and that nothing has been hit."""
-        ahead = _ahead(view)
-        if not hasattr(self, "_heading"):
-            self._heading, self._hit = ahead.clone(), torch.zeros_like(mask)
-            self._before = (view.bodies[..., :3] - view.position[:, None]).clone()
-        torch.where(mask[:, None], ahead, self._heading, out=self._heading)
-        self._hit.masked_fill_(mask, False)
+        """Note where spheres are, and that none has hit."""
         now = view.bodies[..., :3] - view.position[:, None]
+        if not hasattr(self, "_before"):
+            self._hit, self._before = torch.zeros_like(mask), now
+        self._hit.masked_fill_(mask, False)
         torch.where(mask[:, None, None], now, self._before, out=self._before)
 
     def advance(self, view: View) -> None:
@@ -110,13 +106,11 @@ class Dodge(Task):
         self._before.copy_(now)
 
     def observe(self, view: View) -> Observations:
-        """Return state (31), proprioception (18), threat (3) and events (surfaces)."""
-        ahead = _ahead(view)
-        turned = ahead[:, 0] * self._heading[:, 1] - ahead[:, 1] * self._heading[:, 0]
-        place = [view.goal_B, (ahead * self._heading).sum(1, keepdim=True), turned[:, None], view.action]
+        """Return state (26), proprioception (16), threat (3) and events (surfaces)."""
         position, velocity = self._threat(view)
-        told = [view.velocity_B, view.gravity_B, 0.3 * view.body_rate, *place, view.last_action]
-        measured = [view.velocity_B, view.gravity_measured, 0.3 * view.gyro, *place]
+        known = [view.velocity_B, view.goal_B, view.action]
+        told = [*known, view.gravity_B, 0.3 * view.body_rate, view.last_action]
+        measured = [*known, view.gravity_measured, 0.3 * view.gyro]
         seen = {
             "state": torch.cat([*told, 0.3 * position, 0.1 * velocity], dim=1),
             "proprioception": torch.cat(measured, dim=1),
@@ -127,11 +121,10 @@ class Dodge(Task):
         return seen
 
     def reward(self, view: View) -> torch.Tensor:
-        """Pay for being in its place and facing the same way; to be hit costs as much as a crash."""
+        """Pay for being in its place; to be hit costs as much as a crash."""
         away = view.goal_B.norm(dim=1)
-        turned = 1.0 - (_ahead(view) * self._heading).sum(1)
         change = (view.action - view.last_action).norm(dim=1)
-        cost = 0.1 * view.velocity.norm(dim=1) + turned + 0.1 * view.body_rate.norm(dim=1) + 0.1 * change
+        cost = 0.1 * view.velocity.norm(dim=1) + 0.1 * view.body_rate.norm(dim=1) + 0.1 * change
         return 0.5 + torch.exp(-away) - 0.2 * away - cost - 20.0 * (view.crashed | self._hit)
 
     def terminated(self, view: View) -> torch.Tensor:
@@ -157,14 +150,6 @@ class Dodge(Task):
         velocity = velocity - view.velocity[:, None]
         comes = ((position * velocity).sum(2) < 0.0) & (view.bodies[..., 2] > 0.0)
         nearest = torch.where(comes, position.norm(dim=2), torch.inf).argmin(dim=1)
-        rows = torch.arange(len(nearest), device=nearest.device)
-        ways = (position[rows, nearest], velocity[rows, nearest])
+        ways = (each.take_along_dim(nearest[:, None, None], 1)[:, 0] for each in (position, velocity))
         first, second = (comes.any(1)[:, None] * turn(view.orientation, way, back=True) for way in ways)
         return first, second
-
-
-def _ahead(view: View) -> torch.Tensor:
-    """Return the direction that each vehicle faces, levelly, in W, [N, 2]."""
-    x, y, z, w = view.orientation.unbind(1)
-    ahead = torch.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], dim=1)
-    return ahead / ahead.norm(dim=1, keepdim=True).clamp(min=1e-6)

@@ -1,5 +1,6 @@
-// CUDA: the light of those of `count` pairs that are among the 32 of a step. All threads of a warp call it.
-wp::vec3 sum(0.0f, 0.0f, 0.0f);
+// CUDA: adds the light of those of `count` pairs that are among the 32 of a step, one by one: so the sum does not depend on
+// how the pairs of a pixel are split into steps. All threads of a warp call it.
+wp::vec3 sum = total;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
