@@ -249,12 +249,13 @@ def default_config(
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
+    cuda = device.startswith("cuda") or find_device(device) != "cpu"  # which a cluster may have, if not we
     if algorithm == "ppo":
         ppo = RecurrentPpoConfig()
-        if find_device(device).startswith("cuda"):
+        if cuda:
             ppo = RecurrentPpoConfig(worlds=1024, iterations=300)
         return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
-    if not find_device(device).startswith("cuda"):
+    if not cuda:
         few: dict[str, Any] = {
             "worlds": 64,
             "iterations": 150,
