@@ -137,7 +137,8 @@ def fly(
     sees_events = any(isinstance(sensor, EventSensorConfig) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
-    threading.Thread(target=_load_matplotlib, daemon=True).start()  # for the overview, beside the flight
+    loading = threading.Thread(target=_load_matplotlib, daemon=True)
+    loading.start()  # for the overview, beside the flight
     with stop_at_signals(stop), _Files(model, folder, rerun=rerun, console=console) as files:
         try:
             with _progress(console) as progress:
@@ -168,6 +169,7 @@ def fly(
     report.flight_s = time.perf_counter() - begin
     report.event_count = summary.event_count
     begin = time.perf_counter()
+    loading.join()
     if _has("matplotlib", console, "overview.png"):
         track = None if report.positions else _planned_track(model, state.stamp_ns)
         factor = report.real_time_factor

@@ -20,8 +20,6 @@ from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
 from cortex.bench.report import make_console, print_case, print_header, print_summary, write_csv
 
-_AGAIN = 4
-"""So many times as many repetitions are made at most, where a bar lies within the noise."""
 _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
 _QUICK_COUNT = 5_000
@@ -39,8 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         help="cases to run, all by default; `tcp` stands for every `tcp-…`; a wrong name lists them",
     )
-    add("--repeats", type=int, default=9, help=f"repetitions of each contestant (9), {_AGAIN} times as many "
-        "where a bar lies within the noise")  # fmt: skip
+    add("--repeats", type=int, default=9, help="repetitions of each contestant (9)")
     add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
     add(
         "--against", type=Path, metavar="CHECKOUT", help="measure Cortex of this checkout (built) beside ours"
@@ -71,7 +68,6 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
     quick = options.quick
     settings = Settings(
         repeats=min(options.repeats, _QUICK_REPEATS) if quick else options.repeats,
-        repeats_max=0 if quick else _AGAIN * options.repeats,
         seconds=min(options.seconds, _QUICK_SECONDS) if quick else options.seconds,
         count_max=_QUICK_COUNT if quick else 0,
     )
@@ -80,8 +76,7 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
         _make_place(stack, options.against)
         print_header(console)
         console.print(
-            f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved, up to "
-            f"{max(settings.repeats, settings.repeats_max)} where a bar lies within the noise;\n"
+            f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved; "
             "median ± half of its 95 % interval\n"
         )
         try:

@@ -2,7 +2,7 @@
 
 What a machine does besides changes by the second, and from process to process: so repetitions are short,
 their order is turned round each time, ratios are taken within each, and a bar that lies within the interval
-of what was measured is measured again, up to a limit, whichever side of it the median is on.
+of what was measured is said to: `--repeats` narrows it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,6 @@ class Settings(NamedTuple):
     """How long and how often to measure."""
 
     repeats: int = 5
-    repeats_max: int = 0
-    """Up to which a bar is measured again that lies within the noise; 0: it is not."""
     seconds: float = 0.5
     count_max: int = 0
     """Bounds the messages of cases that count them; 0: no bound."""
@@ -150,13 +148,10 @@ def run_case(case: Case, settings: Settings) -> CaseResult:
     A repetition that fails is recorded, and the next one begins afresh.
     """
     repeats = min(settings.repeats, case.repeats or settings.repeats)
-    repeats_max = max(repeats, 0 if case.repeats else settings.repeats_max)
     absent = {c.name: [{"absent": missing(c.peer)}] if missing(c.peer) else [] for c in case.contestants}
     result = CaseResult(case, absent)
     present = [contestant for contestant in case.contestants if not absent[contestant.name]]
-    for repetition in range(repeats_max):
-        if repetition >= repeats and not any(verdict.is_open for verdict in result.verdicts()):
-            break
+    for repetition in range(repeats):
         for contestant in reversed(present) if repetition & 1 else present:
             result.reports[contestant.name].append(_repeat(case, contestant, settings))
     return result

@@ -54,13 +54,8 @@ class _Loop:
         self.endpoints: dict[_Endpoint, None] = {}
         self._closed = False
         self._wait_set: Any = None
-        self.node: Any = rclpy.create_node(
-            name,
-            context=context,
-            namespace=namespace,
-            use_global_arguments=False,
-            start_parameter_services=False,
-        )
+        options = {"use_global_arguments": False, "start_parameter_services": False}
+        self.node: Any = rclpy.create_node(name, context=context, namespace=namespace, **options)
         self._guard = self.node.create_guard_condition(lambda: None)
         context.on_shutdown(self._wake)
         self._thread = threading.Thread(target=self._run, name=f"executor {name}", daemon=True)
@@ -113,11 +108,14 @@ class _Loop:
     def remove(self, endpoint: _Endpoint) -> None:
         """Destroy the handle of an endpoint, after the callbacks that run now."""
         handle, endpoint.handle = endpoint.handle, None
-        self.endpoints.pop(endpoint, None)
 
         def destroy() -> None:
-            getattr(self.node, endpoint.destroyer)(handle)
             self._wait_set = None
+            try:
+                getattr(self.node, endpoint.destroyer)(handle)
+            except Exception:  # errors of rclpy have no public base; the others go on
+                _log.exception("what rclpy has for %s is not destroyed", endpoint.topic)
+            self.endpoints.pop(endpoint, None)  # until here discovery tells of it
 
         self.defer(destroy)
 
@@ -202,15 +200,12 @@ class RclpyBackend:
         self._closed = False
         self._context = Context()
         try:
-            rclpy.init(
-                args=[],
-                context=self._context,
-                domain_id=domain,
-                signal_handler_options=SignalHandlerOptions.NO,
-            )
+            options = {"domain_id": domain, "signal_handler_options": SignalHandlerOptions.NO}
+            rclpy.init(args=[], context=self._context, **options)
             self._loop = _Loop(self._context, name, namespace)
             self._service_loop = _Loop(self._context, f"_{name}{_SERVICES}", namespace)
         except Exception as error:  # rclpy has many, of modules without public names
+            self._context.try_shutdown()  # ends what has begun
             raise BackendError(f"rclpy does not start: {error}") from error
 
     @property
@@ -363,6 +358,7 @@ class RclpyService(_Endpoint):
 
     def __init__(self, loop: _Loop, name: str, type_name: str, callback: Serve) -> None:
         self._callback = callback
+        self._busy = threading.RLock()
         super().__init__(loop, name, type_name, Qos())
 
     def make(self, node: Any) -> Any:
@@ -370,12 +366,19 @@ class RclpyService(_Endpoint):
         return node.create_service(self._kind, self.topic, self.answer)
 
     def answer(self, request: Any, response: Any) -> Any:
-        """Answer a request; an empty response where the callback raises."""
-        try:
-            return self._callback(request, response)
-        except Exception:  # whatever it raises: the client gets an answer, and the node goes on
-            _log.exception("the service %s failed", self.topic)
-            return type(response)()
+        """Answer a request; an empty response where the callback raises, or once the service is closed."""
+        with self._busy:
+            try:
+                return response if self.handle is None else self._callback(request, response)
+            except Exception:  # whatever it raises: the client gets an answer, and the node goes on
+                _log.exception("the service %s failed", self.topic)
+                return type(response)()
+
+    def close(self) -> None:
+        """Withdraw the service; waits for an answer that another thread is giving."""
+        super().close()
+        if self._busy.acquire(timeout=_CLOSE_S):
+            self._busy.release()
 
 
 _ENDS: tuple[type[_Endpoint], ...] = (RclpyPublisher, RclpySubscription)

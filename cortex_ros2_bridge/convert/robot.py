@@ -59,6 +59,8 @@ def events(message: Any, context: Context) -> messages.Events:
             columns = columns._replace(t=columns.t // 1000)
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
+    inside = (columns.x < message.width) & (columns.y < message.height)
+    columns = EventColumns(*(column[inside] for column in columns))
     end_ns = int(columns.t[-1]) * 1000 if len(columns.t) else stamp_ns
     rate_hz = context.option("packet_rate_hz")
     if rate_hz is not None:
@@ -93,6 +95,8 @@ def _decode_evt3(message: Any, stamp_us: int, context: Context) -> EventColumns:
 def _decode_timed(message: Any) -> EventColumns:
     """Return the events of a packet that tells its time, in nanoseconds."""
     data, base_ns = message.events, message.time_base
+    if base_ns >= 2**62:
+        raise ConvertError(f"EventPacket.time_base must be below 2^62 ns, got {base_ns}")
     match message.encoding:
         case "mono":
             return decode_mono(data, base_ns=base_ns)

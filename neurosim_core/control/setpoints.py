@@ -26,7 +26,9 @@ class Setpoint:
         Fields stand side by side in their order.
         """
         columns = [np.asarray(getattr(self, field.name), dtype=np.float64) for field in fields(self)]
-        columns = [c if index == self.vector else c[..., None] for index, c in enumerate(columns)]
+        columns = [
+            np.atleast_1d(c) if index == self.vector else c[..., None] for index, c in enumerate(columns)
+        ]
         shape = np.broadcast_shapes(*(column.shape[:-1] for column in columns))
         return np.concatenate([np.broadcast_to(c, (*shape, c.shape[-1])) for c in columns], axis=-1)
 

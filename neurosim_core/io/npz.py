@@ -16,6 +16,7 @@ from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
 from neurosim_core.packets import EventArrays, join_events
 
 _OTHER_NAMES = {"t": ("ts", "timestamps"), "x": (), "y": (), "p": ("polarity",)}
+_NAMES = {"width", "height", *_OTHER_NAMES, *(other for others in _OTHER_NAMES.values() for other in others)}
 
 
 class NpzSource:
@@ -29,11 +30,21 @@ class NpzSource:
             with zipfile.ZipFile(path) as archive:
                 found = {}
                 for member in archive.namelist():
+                    if member.removesuffix(".npy") not in _NAMES:
+                        continue
                     with archive.open(member) as file:
                         found[member.removesuffix(".npy")] = np.lib.format.read_array(
                             file, allow_pickle=False
                         )
-        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            RuntimeError,
+            ValueError,
+            OSError,
+            MemoryError,
+        ) as error:
             raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         columns = []
         for name, others in _OTHER_NAMES.items():
@@ -48,7 +59,8 @@ class NpzSource:
         t, x, y, p = columns
         self._events = events_of(t, x, y, np.where(p == -1, 0, p) if p.dtype.kind == "i" else p)
         known = [found[name] for name in ("width", "height") if name in found]
-        self.size = (int(known[0]), int(known[1])) if len(known) == 2 else None
+        sized = len(known) == 2 and all(array.size == 1 for array in known)
+        self.size = (int(known[0].item()), int(known[1].item())) if sized else None
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""

@@ -175,6 +175,8 @@ def _learn(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
     config = dataclasses.replace(config, student=student, teacher=teacher, wandb=arguments.wandb)
     if arguments.ray is not None:
+        if arguments.resume:
+            raise ValueError("--resume continues one run, and does not go with --ray")
         from neurosim_core.learn.population import train_population
 
         seeds = range(arguments.seed, arguments.seed + arguments.seeds)

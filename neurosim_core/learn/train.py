@@ -249,12 +249,13 @@ def default_config(
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
+    cuda = device.startswith("cuda") or find_device(device) != "cpu"  # which a cluster may have, if not we
     if algorithm == "ppo":
         ppo = RecurrentPpoConfig()
-        if find_device(device).startswith("cuda"):
+        if cuda:
             ppo = RecurrentPpoConfig(worlds=1024, iterations=300)
         return dataclasses.replace(config, student=ppo, evaluation_worlds=512)
-    if not find_device(device).startswith("cuda"):
+    if not cuda:
         few: dict[str, Any] = {
             "worlds": 64,
             "iterations": 150,
@@ -306,7 +307,11 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    policy.load_state_dict(state["weights"])
+    weights = {
+        "motion.weight": policy.motion.weight,
+        **state["weights"],
+    }  # runs of old have no such layer: zeros
+    policy.load_state_dict(weights)
     return policy
 
 

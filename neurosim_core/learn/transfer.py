@@ -62,6 +62,8 @@ def evaluate_transfer(
     for name, changes in CONDITIONS.items():
         count = worlds or config.evaluation_worlds
         task = _changed_task(config.task, changes)
+        if "lost" in changes and not isinstance(task.surface, LeakySurface):
+            continue  # what other surfaces show without a packet is not known
         env = make_env(
             task,
             worlds=min(count, _NOISY_WORLDS) if task.pixel else count,

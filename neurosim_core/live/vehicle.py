@@ -248,7 +248,8 @@ class VehicleNode:
 
     def close_loans(self) -> None:
         """Give back the memory of pictures that are never published; call it before the topics close."""
-        self.state.planned = None
+        if hasattr(self, "state"):  # not where the start failed
+            self.state.planned = None
         self.publisher.close_loans()
 
     def configure(self, config: SimulationConfig) -> None:

@@ -28,11 +28,11 @@ def read_rows(column: Any, begin: int, end: int) -> NDArray[Any]:
     octets = rows.view(np.uint8).reshape(-1, width)
     for first in range(begin // size * size, end, size):
         try:
-            _, stored = column.id.read_direct_chunk((first,))
+            skipped, stored = column.id.read_direct_chunk((first,))
             flat = np.frombuffer(isal.decompress(stored, bufsize=size * width), np.uint8)
         except (OSError, RuntimeError, isal.error):
             return np.asarray(column[begin:end])
-        if len(flat) != size * width:
+        if skipped or len(flat) != size * width:  # a chunk may have gone around a filter
             return np.asarray(column[begin:end])
         low, high = max(begin, first), min(end, first + size)
         for octet, plane in enumerate(flat.reshape(width, size)):

@@ -6,9 +6,9 @@
 
 1. A thread is a pixel. Blocks of 4 x 4 pixels that show one plane surface, or the sky, are shaded; the others
    are listed.
-2. A warp is a listed block in two instants, which see nearly the same (of a single instant: two blocks side
-   by side); a thread is a pixel. The threads prepare the faces, look at the edges that cross pixels and shade
-   the surfaces together. Blocks with many faces are taken one by one. Pixels that need rays are listed.
+2. A warp is a listed block in two instants, which see nearly the same; a thread is a pixel. The threads
+   prepare the faces, look at the edges that cross pixels, and shade the surfaces that pixels show together.
+   Instants that show many faces are taken one by one. Pixels that have to be rendered by rays are listed.
 3. A thread is a ray of such a pixel.
 """
 
@@ -44,10 +44,8 @@ _INSTANTS = wp.constant(4)
 """Instants of a pixel in a block that shows one surface, of a thread."""
 _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
-_COVER_BOUNDS = (64, 10)
+_COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
-_ROOM = 36
-"""Faces of a block for which a warp has room in each of two instants."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
@@ -61,7 +59,7 @@ class BlockLists:
 
     uneven: wp.array[wp.vec3i]
     """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
-    its blocks; the first instant; a bit for each of the two. Of a single instant: one of two side by side."""
+    its blocks; the first instant; a bit for each of the two."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
     count: wp.array[int]
@@ -107,7 +105,7 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
+@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _cover_block(
     scene: SceneData,
     faces: wp.array3d[int],
@@ -127,7 +125,7 @@ def _cover_block(
     ...
 
 
-@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, ROOM=_ROOM))
+@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _meet_pair(
     scene: SceneData,
     place: int,
@@ -144,13 +142,13 @@ def _meet_pair(
     ...
 
 
-@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
+@wp.func_native(read_native(__file__, "store_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _store_pair(place: int, pair: int, light: wp.vec3):
     """Keep the light of a pair."""
     ...
 
 
-@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, ROOM=_ROOM))
+@wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _sum_pairs(place: int, first: int, count: int, step: int, total: wp.vec3) -> wp.vec3:
     """Return `total` and the light of those of consecutive pairs that are among the 32 of a step."""
     ...
@@ -315,7 +313,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(
                     4 * (tile * view.instant_count + instant) + quarter, pixels
                 )
-            if kind == _SEVERAL and in_picture:
+            if kind == _SEVERAL:
                 uneven = uneven | (1 << (instant - begin))
             even = kind != _SEVERAL and kind != _BODY
             if at.outside or not even:
@@ -332,17 +330,12 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     SHARPNESS * ray_C[3],
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
-        if view.instant_count == 1:
-            votes = _warp_votes(uneven != 0)
-            bits = (votes & 1) | ((votes >> 15) & 2)
-            if bits != 0 and (first + wp.tid()) % 32 == 0:
-                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(4 * tile + quarter, 0, bits)
-        else:
-            for pair in range(_INSTANTS // 2):
-                bits = (uneven >> (2 * pair)) & 3
-                if lane == 0 and bits != 0:
-                    uneven_block = wp.vec3i(4 * tile + quarter, begin + 2 * pair, bits)
-                    lists.uneven[wp.atomic_add(lists.count, 0, 1)] = uneven_block
+        for pair in range(_INSTANTS // 2):
+            bits = (uneven >> (2 * pair)) & 3
+            if lane == 0 and in_picture and bits != 0:
+                lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(
+                    4 * tile + quarter, begin + 2 * pair, bits
+                )
 
     @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=_COVER_BOUNDS)
     def cover_uneven_blocks(
@@ -365,11 +358,8 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             listed = lists.uneven[entry]
             bits = wp.where(waiting != 0, waiting & -waiting, listed[2])
             alone = bits != 3
-            second = wp.where(alone, bits // 2, lane // 16)
-            several = view.instant_count > 1
-            instant = listed[1] + wp.where(several, second, 0)
-            quarter = listed[0] % 4 + wp.where(several, 0, second)
-            at = locate_pixel(listed[0] // 4, instant, quarter, lane % 16, view, worlds)
+            instant = listed[1] + wp.where(alone, bits // 2, lane // 16)
+            at = locate_pixel(listed[0] // 4, instant, listed[0] % 4, lane % 16, view, worlds)
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
             unwanted = at.outside or (alone and lane >= 16)
@@ -434,7 +424,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 write_radiance(scene, total / whole, 1, at.instant, at.slot, at.row, at.col, out)
             unresolved = _warp_votes(not unwanted and covered[3] < 0) >> (lane // 16 * 16) & 0xFFFF
             if unresolved != 0 and lane % 16 == 0:
-                block = 4 * (listed[0] // 4 * view.instant_count + instant) + quarter
+                block = 4 * (listed[0] // 4 * view.instant_count + instant) + listed[0] % 4
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
             waiting = waiting & ~bits
             if waiting == 0:

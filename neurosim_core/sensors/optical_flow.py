@@ -312,7 +312,7 @@ class FlowProcess(PixelProcess):
             setattr(model, name, wp.zeros(view_count, dtype=dtype, device=device))
         twist_count, view_count = (0, view_count) if config.window_ns else (view_count, 0)
         model.twist = wp.zeros(twist_count, dtype=wp.spatial_vectord, device=device)
-        body_count = 0 if context.motions is None else context.motions.shape[0]
+        body_count = 0 if context.motions is None else context.motions.shape[0] // len(context.lens_of_world)
         self._there = {
             "p_WC": wp.zeros(view_count, dtype=wp.vec3, device=device),
             "q_WC": wp.zeros(view_count, dtype=wp.quat, device=device),

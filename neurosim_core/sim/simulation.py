@@ -175,13 +175,20 @@ class Simulation:
             velocity: Its velocity then in W [m/s], likewise.
 
         Raises:
-            ValueError: A sensor measures how bodies move, which it knows of bodies of the configuration only.
+            ValueError: The shapes are others, or a sensor measures how bodies move, which it knows of bodies
+                of the configuration only.
         """
+        shape = (self._state.seeds.shape[0], len(self.model.config.bodies))
+        for name, rows in (("position", position), ("velocity", velocity)):
+            if tuple(rows.shape) != shape or rows.dtype is not wp.vec3d:
+                raise ValueError(f"{name} must be vec3d of shape {shape}, got {rows.dtype} {rows.shape}")
         for group in self._state.groups:
             if group.motions is None:
                 raise ValueError("there are no bodies to throw: say what they are in `bodies`")
             if any(each.processes for each in group.buffers) or group.rule is not None:
                 raise ValueError("bodies can be thrown where cameras give colour, depth and events only")
+        for group in self._state.groups:
+            assert group.motions is not None
             throw_bodies(group.motions, position, velocity, (0.0, 0.0, -GRAVITY_M_S2))
 
     @property

@@ -210,6 +210,28 @@ def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None
     other.close()
 
 
+def test_closing_a_service_waits_for_its_answer(fake: None) -> None:
+    node, other = RclpyBackend(), RclpyBackend(node_name="other")
+    begun, go, ended = threading.Event(), threading.Event(), []
+
+    def serve(request: Any, response: Any) -> Any:
+        begun.set()
+        assert go.wait(SOON_S)
+        ended.append(True)
+        return response
+
+    service = node.service("/reset", TRIGGER, serve)
+    asking = threading.Thread(target=lambda: other._loop.node.call("/reset"))
+    asking.start()
+    assert begun.wait(SOON_S)
+    threading.Timer(0.05, go.set).start()
+    service.close()
+    assert ended == [True]
+    asking.join(SOON_S)
+    node.close()
+    other.close()
+
+
 def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
     node, other = RclpyBackend(), RclpyBackend(node_name="other")
     go, got, replies = threading.Event(), [], []

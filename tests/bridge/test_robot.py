@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from processes import wait_for
 
 from cortex import messages as msg
 from cortex import reliable
+from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.config import ConfigError, load
 from cortex_ros2_bridge.convert import RULES, Context, ConvertError
 
@@ -88,6 +90,19 @@ def test_packets_that_cannot_be_read_are_refused():
         ConvertError, match=r"EventPacket\.encoding must be evt3, mono, libcaer or libcaer_cmp, got 'evt2'"
     ):
         conversion("Events", robot=True, direction="in")(other, Context(vehicle="drone"))
+
+
+def test_packets_beyond_the_sensor_or_of_no_time():
+    """Events beyond the sensor are left out; a time that no clock has is an error."""
+    options = Context(vehicle="drone", options={"encoding": "mono"})
+    data = conversion("Events", robot=False, direction="out")(window(1, 40), options)
+    packet = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
+    into = conversion("Events", robot=True, direction="in")
+    narrow = into(cdr.encode(dataclasses.replace(packet, width=20)), Context(vehicle="drone"))
+    sent = window(1, 40)
+    np.testing.assert_array_equal(narrow.x, sent.x[sent.x < 20])
+    with pytest.raises(ConvertError, match="time_base"):
+        into(cdr.encode(dataclasses.replace(packet, time_base=2**63)), Context(vehicle="drone"))
 
 
 def test_only_what_a_robot_has_crosses(runtime):

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -154,29 +153,6 @@ def test_the_interval_of_a_median_is_that_of_the_binomial(count: int):
     outside = max(0, int(stats.binom(count, 0.5).ppf(0.025)) - 1)
     assert (spread.low, spread.high) == (1.0 + outside, count - outside)
     assert spread.median == (count + 1) / 2.0
-
-
-@pytest.mark.parametrize(
-    ("rates_found", "repetitions"),
-    [([1.0, 1.2], 2), ([0.7, 0.8], 2), ([0.8, 1.0], 8), ([0.8, 1.0, 0.9], 8), ([1.0, 0.8], 8)],
-)
-def test_only_a_bar_within_the_noise_is_measured_again(
-    rates_found: list[float], repetitions: int, monkeypatch: pytest.MonkeyPatch
-):
-    """Met or missed so far: both alike."""
-    order: list[str] = []
-    found = {"a": cycle(rates_found), "b": cycle([1.0])}
-
-    def repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str, float]:
-        order.append(contestant.name)
-        return {"rate": next(found[contestant.name])}
-
-    monkeypatch.setattr("cortex.bench.measure._repeat", repeat)
-    case = Case(
-        "x", "", 10, (Contestant("a", "pyzmq"), Contestant("b", "pyzmq")), (Bar("a", ("b",), ">=", 0.9),)
-    )
-    run_case(case, Settings(repeats=2, repeats_max=8))
-    assert order == (["a", "b", "b", "a"] * repetitions)[: 2 * repetitions]
 
 
 def rates(*values: float, **more: object) -> list[Report]:

@@ -30,6 +30,7 @@ from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 from neurosim_core.learn.train import (  # noqa: E402
     TrainConfig,
     Training,
+    default_config,
     evaluate_run,
     load_student,
     make_card,
@@ -371,3 +372,9 @@ def test_two_processes_train_one_policy(tmp_path, hall):
     assert first["position"] != second["position"]
     assert not set(first["digests"]) & set(alone["digests"])
     assert (tmp_path / "both" / "checkpoint.pt").exists()
+
+
+def test_a_cluster_may_have_the_gpus_that_this_machine_has_not():
+    """Settings for CUDA devices are made anywhere; only a training looks for the device."""
+    config = default_config("hover", device="cuda:7")
+    assert (config.device, config.student.worlds, config.pixels) == ("cuda:7", 1024, None)

@@ -13,8 +13,7 @@ constexpr unsigned ALL = 0xffffffffu;
 const int lane = threadIdx.x % 32, pixel = lane % 16, half = alone ? 0 : lane / 16;
 const bool idle = alone && lane >= 16;
 const unsigned below = (1u << lane) - 1u, ours = 0xffffu << (16 * half); // threads before; those of the instant
-static_assert(MOST <= 2 * ROOM, "one instant uses the room of both");
-const int room = alone ? MOST : ROOM, width_of_row = alone ? 16 : 32, base_of_faces = half * ROOM;
+const int room = alone ? MOST : MOST / 2, width_of_row = alone ? 16 : 32, base_of_faces = half * room;
 int *const seen = block.seen + base_of_faces, *const part_of = block.part + base_of_faces;
 unsigned char* const first_of = block.first + base_of_faces;
 Quad* const plane_of = block.plane + base_of_faces;

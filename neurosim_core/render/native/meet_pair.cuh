@@ -6,7 +6,7 @@ wp::vec_t<9, float> met;
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
 #include "sample_points.cuh"
-const int code = block.pair[pair], owner = code % 32, first = code / 32, face = alone ? first : first + owner / 16 * ROOM;
+const int code = block.pair[pair], owner = code % 32, first = code / 32, face = alone ? first : first + owner / 16 * (MOST / 2);
 auto of_owner = [&](const wp::vec3& value) {
     wp::vec3 theirs;
     for (int axis = 0; axis < 3; ++axis) theirs[axis] = __shfl_sync(0xffffffffu, value[axis], owner);

@@ -1,5 +1,5 @@
 // CUDA: what the threads of a warp share about a block of 4 x 4 pixels in two instants, or in one, see `cover_block.cuh`. Each
-// instant has room for ROOM faces; one alone has all of it, for MOST.
+// instant has its half of the faces and of the points that show them; one alone has them all.
 struct alignas(16) Quad {
     float x, y, z, w;
 };
@@ -14,8 +14,8 @@ struct Block {
             unsigned short pair[32 * SAMPLES]; // threads in 5 bits, and entries above
         };
     };
-    Quad plane[2 * ROOM];           // the nearness [1/m] along a direction is its product with this; then the surface, as bits
-    int seen[2 * ROOM], part[2 * ROOM]; // part: -1 - face: no ray hit one
-    unsigned shown[2 * ROOM][16]; // of each face and pixel: bits of the points that show it
-    unsigned char first[2 * ROOM]; // entry of the same surface
+    Quad plane[MOST];            // the nearness [1/m] along a direction is its product with this; then the surface, as bits
+    int seen[MOST], part[MOST];  // part: -1 - face: no ray hit one
+    unsigned shown[MOST][16];    // of each face and pixel: bits of the points that show it
+    unsigned char first[MOST];   // entry of the same surface
 };

@@ -101,6 +101,7 @@ typedef struct {
     uint8_t *data;
     uint64_t capacity, source, head, clock;
     int fd;
+    int narrow; /* there was no memory for a larger ring: it is not tried again while this one lasts */
     int count; /* of members, those that have left between them included */
     CortexMember members[CORTEX_MEMBERS];
     CortexSlot slots[CORTEX_SLOTS];
@@ -284,7 +285,9 @@ static inline int cortex_writer_fits(CortexWriter *writer, uint64_t bytes) {
 /* Go on in a larger ring where a reliable reader is a whole one behind; 0 if it stays as it is. The publisher's sleep then is
    a small part of what waits, and the reader finds work all the time: 512 kB of 4 kB messages last for 0.1 ms. */
 static inline int cortex_writer_widen(CortexWriter *writer) {
-    return writer->capacity < CORTEX_WIDE_BYTES && !writer->map->slot_count && !cortex_writer_grow(writer, CORTEX_WIDE_BYTES, 0, 0);
+    if (writer->narrow || writer->capacity >= CORTEX_WIDE_BYTES || writer->map->slot_count) return 0;
+    writer->narrow = cortex_writer_grow(writer, CORTEX_WIDE_BYTES, 0, 0) < 0;
+    return !writer->narrow;
 }
 
 /* Let go of who has left and looks at nothing any more, or has ended. */
