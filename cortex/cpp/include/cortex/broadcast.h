@@ -257,13 +257,6 @@ static inline uint64_t cortex_writer_readers(const CortexWriter *writer) {
     return readers;
 }
 
-/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
-static inline void cortex_writer_share(CortexWriter *writer) {
-    const uint64_t readers = cortex_writer_readers(writer);
-    const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
-    __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
-}
-
 /* Wake who sleeps: it has set `sleeping` and then looked at `head`, we have set `head` and now look at `sleeping`. */
 static inline void cortex_writer_wake(CortexWriter *writer) {
     __atomic_thread_fence(__ATOMIC_SEQ_CST);

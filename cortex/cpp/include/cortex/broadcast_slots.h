@@ -85,6 +85,13 @@ static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *me
 static inline uint64_t cortex_most(uint64_t a, uint64_t b) { return a > b ? a : b; }
 static inline uint64_t cortex_least(uint64_t a, uint64_t b) { return a < b ? a : b; }
 
+/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
+static inline void cortex_writer_share(CortexWriter *writer) {
+    const uint64_t readers = cortex_writer_readers(writer);
+    const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
+    __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
+}
+
 /* How many slots of a size its readers want. */
 static inline uint64_t cortex_slots_wanted(const CortexWriter *writer, uint64_t slot_bytes, int deep) {
     const uint64_t least = 2 * cortex_writer_readers(writer) + 2;
