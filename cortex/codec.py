@@ -60,8 +60,6 @@ class Codec:
         is_fixed = not has_tail(self.schema)
         self.fixed_size: int | None = block if is_fixed else None
         """Bytes of every body, if they are always the same."""
-
-        """Structured dtype of a body of fixed size."""
         self.stamp_of: Callable[[Any], int] | None = None
         """Gets the stamp of a message, if the type has an integer field `stamp_ns`."""
         for field in self.schema.fields:

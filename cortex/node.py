@@ -153,9 +153,11 @@ class Node:
                 ask for [s]. None: 1 s, for the types of `cortex.messages.commands` 0.1 s.
 
         Raises:
-            ValueError: The topic is not one, or `max_wait_s` is not 0 to 86400.
+            ValueError: The topic is not one, `inline_max` is negative, or `max_wait_s` is not 0 to 86400.
         """
         self._check_open()
+        if inline_max < 0:
+            raise ValueError(f"inline_max must not be negative, got {inline_max}")
         if max_wait_s is None:
             is_command = message_type.__module__ == "cortex.messages.commands"
             max_wait_s = COMMAND_MAX_WAIT_S if is_command else MAX_WAIT_S

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import resource
 import select
 import socket
 import threading
@@ -167,6 +168,36 @@ def test_a_reliable_reader_holds_up_the_publisher(ring):
     assert ring.writer.in_the_way(1064) == []
     assert takes(ring.writer, frame(count, 1000))
     assert read_all(reader) == list(range(1, count + 1))
+
+
+def test_slots_for_nothing(ring):
+    """Bodies of 0 bytes have slots, too."""
+    ring.writer.provide(0, True, False)
+
+
+def test_a_ring_that_finds_no_memory_tries_once(ring):
+    """Each attempt costs more than a message."""
+    ring.join(strict=True)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    free = os.dup(0)
+    os.close(free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (free, before[1]))
+    try:
+        count = fill(ring, 1000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert RING_BYTES - 2000 < count * 1072 < RING_BYTES
+    assert not takes(ring.writer, frame(count, 1000))
+
+
+def test_a_ring_grows_while_one_of_its_readers_stands_still(ring):
+    """What it had not read waits in the old one; both get all, in order."""
+    (still, _), (steady, _) = ring.join(strict=True), ring.join(strict=True)
+    count, got = 3 * RING_BYTES // 1072, []
+    for number in range(count):
+        assert takes(ring.writer, frame(number, 1000))
+        got += read_all(steady)
+    assert got == read_all(still) == list(range(count))
 
 
 def test_who_is_late_keeps_what_it_has_and_loses_what_comes(ring):

@@ -106,6 +106,30 @@ def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, 
     assert not thread.is_alive()
 
 
+def test_nobody_holds_up_a_node_for_long(make_node, start_child):
+    """A reader that stands still, and may hold up `publish` for a day."""
+    node = make_node()
+    publisher = node.publisher("/blocks", Block, max_wait_s=86_400.0)
+    (child,) = subscribe(publisher, start_child, ["reliable", {"timeout_s": 86_400.0}])
+    before = len(os.listdir("/proc/self/fd"))
+    sent = Sent(publisher, 1000)
+
+    def publish() -> None:
+        with contextlib.suppress(Closed):
+            while True:
+                sent()
+
+    with child.stopped():
+        threads = [threading.Thread(target=publish), threading.Thread(target=node.close)]
+        threads[0].start()
+        wait_for(lambda: publisher._back_pressure.is_waiting)
+        threads[1].start()
+        for thread in reversed(threads):
+            thread.join(SOON_S)
+            assert not thread.is_alive()
+        assert len(os.listdir("/proc/self/fd")) < before
+
+
 def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
     """The reader learns of it as it has room again, and the publisher is still there so long."""
     publisher = make_node().publisher("/blocks", Block)

@@ -165,6 +165,22 @@ def test_killed_cpp_reader_that_holds_up_its_publisher(
     assert writer.process.poll() is None
 
 
+def test_killed_cpp_publisher_is_followed_by_another(start: Callable[..., Peer]) -> None:
+    """What a dead publisher wrote does no harm, and the next one is another source."""
+    reader = start("count", "/scan", "reliable", 200, 3, 100_000_000)
+    first = start("publish", "/scan", -1, SIZES)
+    wait_for(lambda: share_a_ring(reader, first.process.pid))
+    time.sleep(random.random() * 0.2)  # it dies at any moment
+    first.process.kill()
+    reader.process.kill()
+
+    reader = start("count", "/scan", "reliable", 0, 3, 500)
+    second = start("publish", "/scan", -1, "10")
+    wait_for(lambda: share_a_ring(reader, second.process.pid) or reader.has_line())  # or it was quick
+    result = result_of(reader)
+    assert (result["wrong"], result["lost"], result["rejected"]) == (0, 0, 0)
+
+
 def nothing(flags: int) -> bytes:
     """A socket to which nothing comes."""
     raise zmq.Again

@@ -50,6 +50,15 @@ def is_shared(message):
 # Leases
 
 
+def test_an_array_that_is_copied_past_the_caches(node):
+    """In 64-byte steps, and what is left of them."""
+    publisher, subscriber = connected(node, Block, reliable())
+    for number in range(4):  # after the first they take the fast path
+        block = make_block(number, (8 << 20) + 13)
+        assert publisher.publish(block)
+        assert np.array_equal(subscriber.recv(SOON_S).data, block.data)
+
+
 def test_a_large_message_is_a_view(node):
     publisher, subscriber = connected(node, Scan, keep_last())
     publisher.publish(scan(1))

@@ -201,6 +201,27 @@ def test_back_pressure_of_large_messages(node):
     assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
 
 
+def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
+    """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
+    publisher = node.publisher("/scans", Scan)
+    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=4, timeout_s=1.0))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    ranges = np.zeros(50_000, np.float32)
+    delivered = []
+    while all(delivered):
+        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    begin = time.monotonic()
+    for _ in range(20):
+        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert time.monotonic() - begin < 10.0  # 20 s if each waited
+    assert not any(delivered[-20:])
+    received = [subscriber.recv(SOON_S).stamp_ns for _ in range(sum(delivered))]
+    assert received == [number for number, came in enumerate(delivered) if came]
+    assert publisher.publish(Scan(-1, ranges))
+    assert subscriber.recv(SOON_S).stamp_ns == -1
+    assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
+
+
 def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
     publisher, subscriber = connected(node, reliable(depth=4, timeout_s=60.0))
     received = []

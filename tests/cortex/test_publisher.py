@@ -12,7 +12,7 @@ import pytest
 from peer import Number, Scan
 from processes import SOON_S, wait_for
 
-from cortex import keep_last, reliable
+from cortex import keep_last, message, reliable
 from cortex.publisher import Closed
 
 LARGE = 100_000
@@ -60,6 +60,25 @@ def test_a_topic_has_a_form(node, topic):
         with pytest.raises(ValueError, match="a topic or service is named like"):
             make(topic, Number)
     assert node.topics() == []
+
+
+@message
+class Nothing:
+    pass
+
+
+@pytest.mark.parametrize("inline_max", [0, 1])
+def test_a_message_may_be_empty(node, inline_max):
+    publisher = node.publisher("/nothing", Nothing, inline_max=inline_max)
+    subscriber = node.subscriber("/nothing", Nothing)
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert publisher.publish(Nothing())
+    assert subscriber.recv(SOON_S) == Nothing()
+
+
+def test_a_size_is_not_negative(node):
+    with pytest.raises(ValueError, match="inline_max must not be negative, got -1"):
+        node.publisher("/nothing", Nothing, inline_max=-1)
 
 
 # Snapshots and order

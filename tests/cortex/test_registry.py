@@ -307,6 +307,25 @@ def test_a_record_that_no_node_of_ours_would_send_is_rejected():
             check_record(bad)
 
 
+def test_a_heartbeat_on_another_connection_keeps_nobody_alive(context):
+    """And another's farewell ends nobody."""
+    record = make_record("x")
+    with serving() as registry:
+        mine, stranger = dealer(context), dealer(context)
+        mine.send(control_frame(Hello(False, record)))
+        receive(mine)
+        stranger.send(control_frame(Heartbeat(record.node, 1, 0)))
+        assert receive(stranger).held == 0
+        stranger.send(control_frame(Leave(record.node)))
+        stranger.send(control_frame(Heartbeat(record.node, 1, 0)))
+        receive(stranger)  # the farewell was read before
+        mine.send(control_frame(Heartbeat(record.node, 1, 0)))
+        assert receive(mine).held == 1
+        assert registry.node_count == 1
+        mine.close()
+        stranger.close()
+
+
 def test_a_node_belongs_to_the_process_that_came_with_it(make):
     """Another process of this host cannot put its record in its place, whatever revision it says."""
     with serving(), node_process("owner", node=0xACE) as owner:

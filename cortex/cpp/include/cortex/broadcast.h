@@ -101,6 +101,7 @@ typedef struct {
     uint8_t *data;
     uint64_t capacity, source, head, clock;
     int fd;
+    int narrow; /* there was no memory for a larger ring: it is not tried again while this one lasts */
     int count; /* of members, those that have left between them included */
     CortexMember members[CORTEX_MEMBERS];
     CortexSlot slots[CORTEX_SLOTS];
@@ -256,13 +257,6 @@ static inline uint64_t cortex_writer_readers(const CortexWriter *writer) {
     return readers;
 }
 
-/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
-static inline void cortex_writer_share(CortexWriter *writer) {
-    const uint64_t readers = cortex_writer_readers(writer);
-    const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
-    __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
-}
-
 /* Wake who sleeps: it has set `sleeping` and then looked at `head`, we have set `head` and now look at `sleeping`. */
 static inline void cortex_writer_wake(CortexWriter *writer) {
     __atomic_thread_fence(__ATOMIC_SEQ_CST);
@@ -284,7 +278,9 @@ static inline int cortex_writer_fits(CortexWriter *writer, uint64_t bytes) {
 /* Go on in a larger ring where a reliable reader is a whole one behind; 0 if it stays as it is. The publisher's sleep then is
    a small part of what waits, and the reader finds work all the time: 512 kB of 4 kB messages last for 0.1 ms. */
 static inline int cortex_writer_widen(CortexWriter *writer) {
-    return writer->capacity < CORTEX_WIDE_BYTES && !writer->map->slot_count && !cortex_writer_grow(writer, CORTEX_WIDE_BYTES, 0, 0);
+    if (writer->narrow || writer->capacity >= CORTEX_WIDE_BYTES || writer->map->slot_count) return 0;
+    writer->narrow = cortex_writer_grow(writer, CORTEX_WIDE_BYTES, 0, 0) < 0;
+    return !writer->narrow;
 }
 
 /* Let go of who has left and looks at nothing any more, or has ended. */

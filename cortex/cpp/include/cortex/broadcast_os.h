@@ -250,6 +250,7 @@ static inline int cortex_writer_make(CortexWriter *writer, uint64_t capacity, ui
     writer->data = map->data;
     writer->capacity = capacity;
     writer->fd = fd;
+    writer->narrow = 0;
     memset(writer->slots, 0, sizeof writer->slots);
     cortex_writer_share(writer);
     return 0;

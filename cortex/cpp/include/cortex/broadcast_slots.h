@@ -85,21 +85,29 @@ static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *me
 static inline uint64_t cortex_most(uint64_t a, uint64_t b) { return a > b ? a : b; }
 static inline uint64_t cortex_least(uint64_t a, uint64_t b) { return a < b ? a : b; }
 
+/* Say how many slots each reader may lease, so that who keeps many messages takes none from the others. */
+static inline void cortex_writer_share(CortexWriter *writer) {
+    const uint64_t readers = cortex_writer_readers(writer);
+    const uint64_t share = writer->map->slot_count < 2 ? 0 : (writer->map->slot_count - 1) / (readers ? readers : 1);
+    __atomic_store_n(&writer->ring->quota, share ? share : 1, __ATOMIC_RELAXED);
+}
+
 /* How many slots of a size its readers want. */
 static inline uint64_t cortex_slots_wanted(const CortexWriter *writer, uint64_t slot_bytes, int deep) {
     const uint64_t least = 2 * cortex_writer_readers(writer) + 2;
     return deep ? cortex_most(least, cortex_least(CORTEX_DEEP_SLOTS, CORTEX_DEEP_BYTES / cortex_most(slot_bytes, 1))) : least;
 }
 
-/* Make slots for bodies of a size, if need be: 1 if there are some, else 0; -1 if there are not, or not enough, as there is no
-   memory. With `exact` all bodies have this size, and nothing is kept for growth; `deep`: a reader keeps many messages. */
+/* Make slots for bodies of a size, if need be: 1 if there are some; -1 if there are not, or not enough, as there is no memory.
+   With `exact` all bodies have this size, and nothing is kept for growth; `deep`: a reader keeps many messages. */
 static inline int cortex_writer_provide(CortexWriter *writer, uint64_t size, int exact, int deep) {
     const uint64_t before = writer->map->slot_bytes, count = writer->map->slot_count;
     const int fits = before >= size;
     if (fits && count >= cortex_slots_wanted(writer, before, deep)) return 1;
     uint64_t bytes = exact ? size : size + size / 4;
     if (count && !exact && !fits) bytes = cortex_most(bytes, size + cortex_least(size, CORTEX_SMALL_BYTES)); /* these are to last */
-    bytes = (cortex_most(bytes, before) + CORTEX_PAGE_BYTES - 1) / CORTEX_PAGE_BYTES * CORTEX_PAGE_BYTES;
+    bytes = cortex_most(cortex_most(bytes, before), 1); /* a message may be empty */
+    bytes = (bytes + CORTEX_PAGE_BYTES - 1) / CORTEX_PAGE_BYTES * CORTEX_PAGE_BYTES;
     uint64_t slots = cortex_least(cortex_most(CORTEX_SMALL_BYTES / bytes, 4), 64);
     slots = cortex_most(slots, cortex_slots_wanted(writer, bytes, deep));
     slots = cortex_most(4, cortex_least(slots, ((uint64_t)2 << 30) / bytes));

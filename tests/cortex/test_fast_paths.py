@@ -1,0 +1,128 @@
+"""The fast paths of a message out and in: what is none of theirs, and errors, which leave no lock held."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zmq
+from peer import Number, Scan, make
+
+from cortex.codec import codec_of, coder_of
+from cortex.compiled import native
+from cortex.fast_receive import NOTHING, make_fast_receive
+from cortex.fast_send import make_fast_send
+from cortex.receive_lock import ReceiveLock
+from cortex.stats import SubscriberCounters
+from cortex.wire import MESSAGE, message_head
+
+pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
+
+
+def coder_with_head(kind: type) -> Any:
+    codec = codec_of(kind)
+    return coder_of(codec, message_head(MESSAGE, 7, codec.fingerprint, stamped=True))
+
+
+def frame_of(number: int) -> bytes:
+    return coder_with_head(Number).frame(Number(number, number), number, 0, 100)
+
+
+class Script:
+    """Hands out frames or raises errors, while the lock is held; then there is none."""
+
+    def __init__(self, lock: Any, *steps: bytes | Exception) -> None:
+        self.lock, self.steps, self.flags = lock, deque(steps), []
+
+    def __call__(self, flags: int) -> bytes:
+        assert self.lock.locked()
+        self.flags.append(flags)
+        step = self.steps.popleft() if self.steps else zmq.Again()
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+
+@pytest.fixture
+def receiver():
+    """A fast path, the script of its link, and its lock."""
+    lock, queue, counters = ReceiveLock(), deque(), SubscriberCounters()
+    script = Script(lock.lock, frame_of(0))
+
+    def accept(link, frame):
+        raise AttributeError("none of ours")
+
+    path = make_fast_receive(lock, queue, counters, accept)
+    coder = coder_with_head(Number)
+    path.open(SimpleNamespace(receive=script, coder=coder, expected=0, clock_offset_ns=0), coder)
+    return path, script, lock
+
+
+def test_a_full_queue_and_an_error_leave_the_lock_free():
+    lock, retried = threading.Lock(), []
+
+    def retry(frame, send):
+        assert lock.locked()
+        retried.append(send)
+        return False
+
+    def fail_with(error):
+        def send(frame, flags):
+            assert lock.locked()
+            raise error
+
+        return send
+
+    full, broken = fail_with(zmq.Again()), fail_with(zmq.ZMQError(zmq.ENOTSOCK))
+    send = make_fast_send(coder_with_head(Number), lock, slowly=pytest.fail, retry=retry, limit=1000)
+    send.refresh_ns, send.sends = 2**62, (full,)
+    assert send(Number(0, 0)) is False
+    assert retried == [full]
+    assert not lock.locked()
+    send.sends = (broken,)
+    with pytest.raises(zmq.ZMQError):
+        send(Number(0, 0))
+    assert not lock.locked()
+    with pytest.raises(TypeError, match="one message"):
+        send(Number(0, 0), Number(0, 0))
+
+
+def test_an_error_passes_and_gives_the_lock_back(receiver):
+    path, script, lock = receiver
+    script.steps.appendleft(OSError("gone"))
+    with pytest.raises(OSError, match="gone"):
+        path(False)
+    assert not lock.lock.locked()
+    assert path(False) == Number(0, 0)
+    script.steps.append(b"junk")
+    with pytest.raises(AttributeError, match="none of ours"):  # what `accept` raises, too
+        path(False)
+    assert not lock.lock.locked()
+
+
+def test_who_wants_the_lock_is_not_waited_past(receiver):
+    path, script, lock = receiver
+    lock.waiting = 1
+    assert path(True) is NOTHING
+    assert not script.flags
+    assert path(False) == Number(0, 0)  # that takes no time
+
+
+def test_drain_passes_errors_on():
+    lock = threading.Lock()
+    with lock, pytest.raises(OSError, match="gone"):
+        coder_with_head(Number).drain(
+            Script(lock, OSError("gone")), zmq.Again, deque(), 0, 4, [0] * 8, 0, False
+        )
+
+
+def test_frames_that_are_none_of_this_publisher():
+    coder, codec, value = coder_with_head(Scan), codec_of(Scan), make(Scan, 5, 40)
+    frame = coder.frame(value, 3, 4, 1 << 20)
+    assert coder.read(frame)[:2] == (3, 4)
+    for other in (b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)):
+        assert coder.read(other) is None
+    assert coder_of(codec, b"").read(frame) is None  # it has no head
