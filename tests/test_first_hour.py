@@ -68,7 +68,7 @@ def test_a_mistake_is_answered_in_one_line(typed, tmp_path, monkeypatch, capsys)
 
 
 def test_mistakes_in_python_are_answered_as_well():
-    with pytest.raises(AttributeError, match=r"known: .*'load_config'"):
+    with pytest.raises(AttributeError, match=r"known: .*\bload_config\b"):
         _ = ns.load_confg
     with pytest.raises(ns.ConfigError, match="duration: unknown key; did you mean 'duration_s'"):
         next(iter(ns.run({"duration": 1.0})))
