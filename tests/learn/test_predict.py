@@ -62,6 +62,7 @@ def test_pictures_are_those_of_the_network_which_forgets_at_a_reset(tmp_path, ru
         node.publisher("/simulation", Simulation, latch=True).publish(simulation)
         run.start()
         assert seen.wait_for_subscribers(timeout_s=SOON_S)
+        assert pictures.wait_for_publisher(timeout_s=SOON_S)
         expected: list[tuple[int, np.ndarray]] = []
         for packets in (3, 5):  # the second flight is watched to 0.2 s; the next packet completes a window
             memory = None
