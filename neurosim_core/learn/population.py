@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from neurosim_core.data.ray_source import cluster
-from neurosim_core.learn.train import Say, TrainConfig, train
+from neurosim_core.learn.train import Say, TrainConfig, is_for_cuda, train
 from neurosim_core.render.launch import limit_cores
-from neurosim_core.sim.model import find_device
 
 
 def train_population(
@@ -40,7 +39,7 @@ def train_population(
     with cluster(address) as ray:
         left = {}
         for name, config in configs.items():
-            gpus = int(find_device(config.device).startswith("cuda"))
+            gpus = int(is_for_cuda(config.device))
             config = dataclasses.replace(config, device="cuda:0" if gpus else "cpu")
             training = ray.remote(_train).options(num_cpus=1, num_gpus=gpus).remote(name, config)
             left[training] = name

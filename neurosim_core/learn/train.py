@@ -235,6 +235,11 @@ def prepare_torch() -> None:
     torch.set_float32_matmul_precision("high")
 
 
+def is_for_cuda(device: str) -> bool:
+    """Tell whether a training is for a GPU: one that is named may be a cluster's, and not of this machine."""
+    return device.startswith("cuda") or find_device(device) != "cpu"
+
+
 def default_config(
     task: str, *, device: str = "auto", seed: int = 0, algorithm: str = "dagger"
 ) -> TrainConfig:
@@ -249,7 +254,7 @@ def default_config(
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
     config = TrainConfig(task=task, device=device, seed=seed)
-    cuda = device.startswith("cuda") or find_device(device) != "cpu"  # which a cluster may have, if not we
+    cuda = is_for_cuda(device)
     if algorithm == "ppo":
         ppo = RecurrentPpoConfig()
         if cuda:
@@ -307,11 +312,8 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    weights = {
-        "motion.weight": policy.motion.weight,
-        **state["weights"],
-    }  # runs of old have no such layer: zeros
-    policy.load_state_dict(weights)
+    zeros = {"motion.weight": policy.motion.weight}  # runs of before have no such layer
+    policy.load_state_dict(zeros | state["weights"])
     return policy
 
 
