@@ -17,6 +17,8 @@ from neurosim_core.packets import EventArrays, join_events
 
 _OTHER_NAMES = {"t": ("ts", "timestamps"), "x": (), "y": (), "p": ("polarity",)}
 _NAMES = {"width", "height", *_OTHER_NAMES, *(other for others in _OTHER_NAMES.values() for other in others)}
+_DAMAGE = zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError, MemoryError
+"""What reading a damaged file raises."""
 
 
 class NpzSource:
@@ -36,15 +38,7 @@ class NpzSource:
                         found[member.removesuffix(".npy")] = np.lib.format.read_array(
                             file, allow_pickle=False
                         )
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            RuntimeError,
-            ValueError,
-            OSError,
-            MemoryError,
-        ) as error:
+        except _DAMAGE as error:
             raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         columns = []
         for name, others in _OTHER_NAMES.items():

@@ -97,8 +97,7 @@ def _late(actor: Actor, env: Env, share: float) -> Actor:
 def _lose_events(env: Env, share: float) -> None:
     """Let the events of a share of the steps get lost, in each world at times of its own."""
     task, surface = env.task, env.task.surface
-    if not isinstance(surface, LeakySurface):
-        raise ValueError(f"lost packets are for surfaces that decay, got {type(surface).__name__}")
+    assert isinstance(surface, LeakySurface)  # asked before
     tau_s = torch.tensor(surface.tau_s, device=env.device).repeat_interleave(2)
     decay = torch.exp(-1.0 / (task.rate_hz * tau_s))[:, None, None]
     generator = torch.Generator(device=env.device).manual_seed(0)
