@@ -97,10 +97,10 @@ class Hdf5Source:
             if not bool(file.attrs["clean"]):
                 self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
         known = (self._group[place] for place in _PLACES if place in self._group)
-        self._events, self._names = next(
-            ((found, names) for found in known for names in _NAMES if {*names} <= _parts_of(found)),
-            (None, ()),
-        )
+        fits = ((found, names) for found in known for names in _NAMES if {*names} <= _parts_of(found))
+        self._events: Any
+        self._names: tuple[str, ...]
+        self._events, self._names = next(fits, (None, ()))
         if self._events is None:
             raise EventFileError(
                 f"{self._path} has no events/t, x, y and p; known HDF5 files: "
