@@ -74,3 +74,12 @@ def test_the_page(tmp_path, capsys):
     picture = np.asarray(Image.open(tmp_path / "page.png").convert("L"))
     assert picture.shape == (900, 1400)
     assert (picture < 200).mean() > 0.02  # it is not empty
+
+
+def test_files_with_hardly_any_events(tmp_path):
+    """The smallest sensor that has their pixels has no frequencies to speak of."""
+    pytest.importorskip("matplotlib")
+    for name, text in (("none.csv", "t,x,y,p\n"), ("one.csv", "t,x,y,p\n5,0,0,1\n")):
+        (tmp_path / name).write_text(text)
+    assert cli.main(["compare", str(tmp_path), "--out", str(tmp_path / "page.png")]) == 0
+    assert measure_events(tmp_path / "one.csv").event_count == 1
