@@ -55,7 +55,7 @@ from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
+from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
 
 _CELLS = 4
 _SIDE = 4
@@ -153,6 +153,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree) if terms.embree else None
+    find_pose = pose_finder(terms)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
     def average_pixels(
@@ -179,8 +180,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
+        pose = find_pose(instant, 0, row * view.width + col, view)
+        origin = view.p_WC[pose]
+        q = view.q_WC[pose]
         pixel = place.first_ray + row * view.width + col
         center = wp.vec3(rays[0, pixel][0], rays[0, pixel][1], rays[0, pixel][2])
         across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
@@ -255,9 +257,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
                     hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
                 if wp.static(terms.bodies):
-                    hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
+                    hit, body = intersect_bodies(bodies, pose, direction_C, q, hit)
                 total += radiance_of(
-                    scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
+                    scene, bodies, pose, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
         write_radiance(scene, total / whole, instant, place.slot, row, col, out)
 
@@ -422,7 +424,8 @@ def _cpu_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 def _in_blocks(terms: RenderTerms) -> bool:
-    return bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
+    blocks = bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
+    return blocks and not terms.timed
 
 
 class Antialiasing:

@@ -64,6 +64,23 @@ class WorldData:
 
 
 @cache
+def pose_finder(terms: RenderTerms) -> wp.Function:
+    """Return the Warp function that finds the pose of a ray.
+
+    Its parameters: the row of the arrays of instants; the layer; the pixel of a lens; view.
+    """
+
+    @wp.func
+    def find_pose(instant: int, layer: int, pixel: int, view: ViewData) -> int:
+        pose = instant
+        if wp.static(terms.timed):
+            pose = instant * view.pose_count + view.pose[layer, pixel]
+        return pose
+
+    return find_pose
+
+
+@cache
 def tile_finder(terms: RenderTerms) -> wp.Function:
     """Return the Warp function that locates a tile; tiles are numbered row by row, then world by world.
 
