@@ -267,7 +267,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 @cache
-def _block_shader(*, textured: bool, emissive: bool) -> Any:
+def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
 
     Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
@@ -275,18 +275,15 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
 
     def shade_block(
         scene: SceneData,
+        view: ViewData,
         faces: wp.array3d[int],
         rays: wp.array2d[wp.vec4],
         first_pixel: int,
         instant: int,
         top: int,
         left: int,
-        height: int,
-        width: int,
         rows: int,
         columns: int,
-        origin: wp.vec3,
-        q_WC: wp.quat,
         radiance_out: wp.array[wp.vec3],
         unresolved_out: wp.array[int],
     ): ...
@@ -300,6 +297,7 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
         MOST=FACE_COUNT_MAX,
         TEXTURED=textured,
         EMISSIVE=emissive,
+        TIMED=timed,
         UNIT=True,
         LIGHT_WITHIN=True,
         SHARPNESS=round(100 * SHARPNESS),
@@ -312,8 +310,9 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
-    cast_packet = packet_caster(terms.embree)
-    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
+    cast_packet = packet_caster(terms.embree, origins=True)
+    find_pose = pose_finder(terms)
+    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
     shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -339,8 +338,6 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
         rows = wp.min(view.height - top, _SIDE)
         columns = wp.min(view.width - left, _SIDE)
         first_ray = place.first_ray + top * view.width + left
@@ -348,23 +345,21 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         unresolved_bits = wp.zeros(shape=(1,), dtype=int)
         shade_block(
             scene,
+            view,
             out.face,
             rays,
             first_ray,
             instant,
             top,
             left,
-            view.height,
-            view.width,
             rows,
             columns,
-            origin,
-            q,
             radiance,
             unresolved_bits,
         )
         unresolved = unresolved_bits[0]
         if unresolved != 0:
+            origins = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             ray = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             face = wp.zeros(shape=(_LANES,), dtype=int)
             t = wp.zeros(shape=(_LANES,), dtype=float)
@@ -382,10 +377,12 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
                             pixel = first_ray + y * view.width + x
                             sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                             toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                            ray[lane] = wp.quat_rotate(q, toward)
+                            pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
+                            origins[lane] = view.p_WC[pose]
+                            ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
                             spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
                 cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
+                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
                 )
                 shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
             for lane in range(_LANES):
@@ -424,8 +421,7 @@ def _cpu_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 def _in_blocks(terms: RenderTerms) -> bool:
-    blocks = bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
-    return blocks and not terms.timed
+    return bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
 
 
 class Antialiasing:

@@ -31,7 +31,7 @@ auto lowest = [](Entries entries) { return __ffsll(entries) - 1; };
 auto along = [](const Quad& function, const wp::vec3& toward) {
     return fmaf(function.x, toward[0], fmaf(function.y, toward[1], function.z * toward[2]));
 };
-auto remaining = [&](const Quad& plane) { return TIMED ? 1.0f - along(plane, shift) : 1.0f; }; // of the distance to it
+auto distance = [&](const Quad& plane) { return TIMED ? 1.0f - along(plane, shift) : 1.0f; }; // by that from the origin
 // Bits of the points where a function, of which the value at the centre and the slopes are given, is negative.
 auto negative_at = [](float value, float slope_x, float slope_y) {
     float at[SAMPLES], step[SAMPLES]; // of the samples 1, 2, 4, ... from sample 0
@@ -106,16 +106,16 @@ for (int begin = 0; more;) {
         if (more) {
             const int at = 16 * half + turn;
             bool reached = !idle && (solids >> at) & 1u;
-            float value[3][3], cut_at[3], shifted[3];
+            float value[3][3], cut_at[3], along_shift[3];
 #pragma unroll
             for (int side = 0; side < 3; ++side) {
                 const Quad function = block.function[side][at];
                 value[side][0] = along(function, center);
                 value[side][1] = along(function, across);
                 value[side][2] = along(function, down);
-                if constexpr (TIMED) shifted[side] = along(function, shift);
+                if constexpr (TIMED) along_shift[side] = along(function, shift);
             }
-            if constexpr (TIMED) shift_values(value, shifted);
+            if constexpr (TIMED) shift_values([&](int side, int term) -> float& { return value[side][term]; }, along_shift);
 #pragma unroll
             for (int side = 0; side < 3; ++side) {
                 const float extent = 0.5f * (wp::abs(value[side][1]) + wp::abs(value[side][2]));
@@ -211,7 +211,7 @@ for (Entries rest = reaching; rest; rest &= rest - 1) { // which of several show
         const Quad against = plane_of[other];
         unsigned won = 0;
         if (__float_as_int(against.w) != __float_as_int(own.w)) {
-            const float other_share = NEARER * remaining(own), share = remaining(against);
+            const float other_share = NEARER * distance(own), share = distance(against);
             const Quad behind = {fmaf(other_share, against.x, -share * own.x), fmaf(other_share, against.y, -share * own.y),
                                  fmaf(other_share, against.z, -share * own.z), 0.0f};
             const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
