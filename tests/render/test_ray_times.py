@@ -15,6 +15,7 @@ from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.ray_times import RayTimes, ShutterConfig
 from neurosim_core.render.renderer import make_renderer, upload_scene
+from neurosim_core.render.warp_renderer import ray_times_of
 from neurosim_core.scene.bodies import (
     BodyConfig,
     MotionConfig,
@@ -41,6 +42,22 @@ def half_white() -> object:
         Material(name="white", base_color=(1.0, 1.0, 1.0)),
     )
     return scene_of(*parts, materials=materials, part_material=(0, 1), ambient=WHITE)
+
+
+def boxes_above_a_floor() -> object:
+    rng = np.random.default_rng(3)
+    boxes = [
+        box(tuple(rng.uniform(0.05, 0.3, 3)), (*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.1, 0.5)))
+        for _ in range(12)
+    ]
+    shades = rng.uniform(0.05, 1.0, 13)
+    return scene_of(
+        plane(8.0),
+        *boxes,
+        materials=tuple(Material(name=str(k), base_color=(x, x, x)) for k, x in enumerate(shades)),
+        part_material=tuple(range(13)),
+        ambient=WHITE,
+    )
 
 
 def render(
@@ -74,17 +91,37 @@ def render(
 
 
 @pytest.mark.parametrize("traversal", ["embree", "warp"])
-@pytest.mark.parametrize("samples", [1, 4, "adaptive"])
+@pytest.mark.parametrize("samples", [1, 4])
 def test_one_time_for_all_rays_gives_the_same_bytes(traversal, samples):
     scene = textured_plane(checker(8, 4), size_m=4.0)
     pose = ([[0.1, 0.2, 1.5]], [Rotation.from_euler("xyz", [3.0, 0.2, 0.3]).as_quat()])
-    count = 1 if samples == "adaptive" else samples
-    layers = 1 + count if count > 1 else 1
-    times = RayTimes(np.zeros(1, np.int64), np.zeros((layers, 48 * 24), np.int32), count)
+    layers = 1 + samples if samples > 1 else 1
+    times = RayTimes(np.zeros(1, np.int64), np.zeros((layers, 48 * 24), np.int32), samples)
     own = render(scene, times, *pose, traversal=traversal, samples=samples)
     one = render(scene, None, *pose, traversal=traversal, samples=samples)
     for name in OUTPUTS:
         assert own[name].tobytes() == one[name].tobytes(), name
+
+
+@pytest.mark.parametrize("mode", ["baked", "unshadowed"])
+def test_one_time_for_all_rays_is_antialiased_to_the_same_bytes(device, mode):
+    pose = ([[0.05, 0.03, 1.6]], [Rotation.from_euler("xyz", [3.0, 0.2, 0.3]).as_quat()])
+    how = {"samples": "adaptive", "mode": mode, "device": device}
+    times = RayTimes(np.zeros(1, np.int64), np.zeros((1, 48 * 24), np.int32), 1)
+    own, one = (render(boxes_above_a_floor(), each, *pose, **how) for each in (times, None))
+    for name in OUTPUTS:
+        assert own[name].tobytes() == one[name].tobytes(), name
+
+
+def test_exposures_take_rays_in_place_of_adaptive_antialiasing():
+    arrays = upload_scene(
+        half_white(), RenderConfig(lighting=LightingConfig(mode="unshadowed")), device="cpu"
+    )
+    assert ray_times_of(ShutterConfig(readout_s=0.01), LENS, arrays).sample_count == 1
+    for count, rays in ((1, 1), (4, 16), (40, 40)):
+        shutter = ShutterConfig(readout_s=0.01, exposure_s=0.002, exposure_samples=count)
+        assert ray_times_of(shutter, LENS, arrays).sample_count == rays
+    assert ray_times_of(ShutterConfig(), LENS, arrays) is None
 
 
 @pytest.mark.parametrize(("traversal", "samples"), [("embree", 64), ("warp", 64), ("auto", "adaptive")])
@@ -120,19 +157,7 @@ def test_rolling_rows_shear_a_vertical_edge(device, traversal, samples):
 )
 def test_rolling_pixels_are_means_over_their_area(device, direction, moving, light):
     """In a fast turn through boxes, past a body: as close to 64 rays at the same times as the still camera is."""
-    rng = np.random.default_rng(3)
-    boxes = [
-        box(tuple(rng.uniform(0.05, 0.3, 3)), (*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.1, 0.5)))
-        for _ in range(12)
-    ]
-    shades = rng.uniform(0.05, 1.0, 13)
-    scene = scene_of(
-        plane(8.0),
-        *boxes,
-        materials=tuple(Material(name=str(k), base_color=(x, x, x)) for k, x in enumerate(shades)),
-        part_material=tuple(range(13)),
-        ambient=WHITE,
-    )
+    scene = boxes_above_a_floor()
     bodies = {
         "crate": BodyConfig(
             shape=BoxShape(size_m=(0.3, 0.3, 0.3)),
