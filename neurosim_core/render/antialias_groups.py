@@ -109,7 +109,6 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
 @cache
 def _block_coverer(timed: bool) -> Any:
     """Return the Warp function that finds what the points of the pixels of a block show; see the file."""
-
     code = read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, TIMED=timed)
 
     @wp.func_native(code)

@@ -156,7 +156,7 @@ def test_rolling_rows_shear_a_vertical_edge(device, traversal, samples):
     ("direction", "moving", "light"), [("down", False, "baked"), ("right", True, "unshadowed")]
 )
 def test_rolling_pixels_are_means_over_their_area(device, direction, moving, light):
-    """In a fast turn through boxes, past a body: as close to 64 rays at the same times as the still camera is."""
+    """In a fast turn past boxes and a body: as close to 64 rays at the same times as a still camera is."""
     scene = boxes_above_a_floor()
     bodies = {
         "crate": BodyConfig(
@@ -181,7 +181,7 @@ def test_rolling_pixels_are_means_over_their_area(device, direction, moving, lig
         return render(
             scene,
             times,
-            [0.05, 0.03, 1.6] + np.outer(t_s, [5.0, -3.0, 2.0]),
+            np.add([0.05, 0.03, 1.6], np.outer(t_s, [5.0, -3.0, 2.0])),
             turn.as_quat(),
             samples=samples,
             device=device,
