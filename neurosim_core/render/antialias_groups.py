@@ -14,7 +14,6 @@
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -106,7 +105,6 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@cache
 def _block_coverer(timed: bool) -> Any:
     """Return the Warp function that finds what the points of the pixels of a block show; see the file."""
     code = read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, TIMED=timed)
@@ -372,13 +370,12 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
             unwanted = at.outside or (alone and lane >= 16)
-            pixel = wp.where(at.outside, at.ray - (at.row - at.top) * view.width - at.col + at.left, at.ray)
+            back = wp.where(at.outside, (at.row - at.top) * view.width + at.col - at.left, 0)
+            pixel = at.ray - back
             part = int(-1)
             if not at.outside:
                 part = out.face[at.instant, at.row, at.col]
-            corner = at.top * view.width + at.left
-            own = wp.where(at.outside, corner, at.row * view.width + at.col)
-            pose = find_pose(at.instant, 0, own, view)
+            pose = find_pose(at.instant, 0, at.row * view.width + at.col - back, view)
             origin = view.p_WC[pose]
             q = view.q_WC[pose]
             center = wp.quat_rotate(q, _xyz(rays[0, pixel]))

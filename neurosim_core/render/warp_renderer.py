@@ -152,8 +152,8 @@ class WarpRenderer:
         self._pose_count = 1 if times is None else len(times.offsets_ns)
         if times is not None:
             self._view.pose_count = self._pose_count
-            instants = np.broadcast_to(times.instant, (len(rays), times.instant.shape[1]))
-            self._view.pose = wp.array(instants, dtype=int, device=device)
+            pose = np.broadcast_to(times.instant, (len(rays), times.instant.shape[1]))
+            self._view.pose = wp.array(pose, dtype=int, device=device)
         rows = worlds.count * instant_count * self._pose_count
         self._body_data = make_body_data(arrays.bodies, rows, device)
         self._world_data = self._make_world_data()
