@@ -194,3 +194,21 @@ class EventPolicy(nn.Module):
             memories.append(memory)
         remembered = torch.stack(memories)
         return self.head(torch.cat([remembered, vectors], dim=2)), remembered[..., self.hidden :]
+
+
+def make_event_policy(
+    surface: torch.Tensor, vector: torch.Tensor, hint: torch.Tensor, *, hidden: int, widths: Sequence[int]
+) -> EventPolicy:
+    """Return a policy for what is seen in an environment, on its device.
+
+    Args:
+        surface: Event surfaces, [N, C, H, W].
+        vector: What is seen besides, [N, n].
+        hint: What is estimated, [N, h].
+        hidden: See `EventPolicy`.
+        widths: See `EventPolicy`.
+    """
+    sizes: dict[str, Any] = {"hint_count": hint.shape[1], "hidden": hidden, "widths": widths}
+    policy = EventPolicy(*surface.shape[1:], vector.shape[1], **sizes).to(surface.device)
+    policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return policy
