@@ -31,8 +31,8 @@ class LargeSender:
     def acquire(self, size: int) -> NDArray[np.uint8]:
         """Return memory for a body of so many bytes, as large or larger; it is not cleared.
 
-        It is used again once nobody looks at it, sockets included: the C library would give its pages back, and
-        to get new ones takes longer than the copy. Any thread may let go of it.
+        It is used again once nobody looks at it, sockets included: the C library would give its pages back,
+        and to get new ones takes longer than the copy. Any thread may let go of it.
         """
         for index, memory in enumerate(self._free):
             if size <= len(memory) <= 4 * size:
@@ -41,9 +41,9 @@ class LargeSender:
         else:
             del self._free[:1]  # sizes have changed
             memory = np.empty(size, np.uint8)
-        lent = (ctypes.c_ubyte * len(memory)).from_buffer(memory)
+        lent = (ctypes.c_ubyte * len(memory)).from_buffer(memory.data)
         weakref.finalize(lent, self._release, memory).atexit = False
-        return np.frombuffer(lent, np.uint8)
+        return np.frombuffer(memoryview(lent), np.uint8)
 
     def _release(self, memory: NDArray[np.uint8]) -> None:
         kept = sum(map(len, self._free)) + len(memory)
