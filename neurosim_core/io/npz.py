@@ -50,8 +50,10 @@ class NpzSource:
         if len(shapes) > 1 or columns[0].ndim != 1 or any(c.dtype.kind not in "iub" for c in columns):
             kinds = ", ".join(f"{column.dtype} {column.shape}" for column in columns)
             raise EventFileError(f"{path}: t, x, y and p must be as long, and whole numbers: got {kinds}")
-        t, x, y, p = columns
-        self._events = events_of(t, x, y, np.where(p == -1, 0, p) if p.dtype.kind == "i" else p)
+        try:
+            self._events = events_of(*columns)
+        except ValueError as error:
+            raise EventFileError(f"{path}: {error}") from None
         known = [found[name] for name in ("width", "height") if name in found]
         sized = len(known) == 2 and all(array.size == 1 for array in known)
         self.size = (int(known[0].item()), int(known[1].item())) if sized else None
