@@ -50,7 +50,7 @@ def lazy_names(
         prepare()
         module, attribute = homes[name]
         collects = gc.isenabled()
-        gc.disable()  # what imports make stays: to look through it again and again takes a third of their time
+        gc.disable()  # what imports make stays: to look through it takes a quarter of their time
         try:
             if module == package:  # a module of the package itself
                 return importlib.import_module(f"{module}.{attribute}")
