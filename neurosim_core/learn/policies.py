@@ -208,7 +208,9 @@ def make_event_policy(
         hidden: See `EventPolicy`.
         widths: See `EventPolicy`.
     """
-    sizes: dict[str, Any] = {"hint_count": hint.shape[1], "hidden": hidden, "widths": widths}
-    policy = EventPolicy(*surface.shape[1:], vector.shape[1], **sizes).to(surface.device)
+    _, channels, height, width = surface.shape
+    policy = EventPolicy(
+        channels, height, width, vector.shape[1], hint_count=hint.shape[1], hidden=hidden, widths=widths
+    )
     policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return policy
+    return policy.to(surface.device)
