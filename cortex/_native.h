@@ -58,6 +58,15 @@ static inline PyObject *none_or_error(PyObject *made) {
     Py_RETURN_NONE;
 }
 
+/* What the types of this module do for the objects that they hold. */
+static inline int visit_held(PyObject *const *held, size_t count, visitproc visit, void *arg) {
+    for (size_t index = 0; index < count; ++index) Py_VISIT(held[index]);
+    return 0;
+}
+static inline void clear_held(PyObject **held, size_t count) {
+    for (size_t index = 0; index < count; ++index) Py_CLEAR(held[index]);
+}
+
 static inline int arguments_are(Py_ssize_t count, Py_ssize_t wanted) {
     if (count == wanted) return 1;
     PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", wanted, count);

@@ -111,12 +111,22 @@ def test_who_wants_the_lock_is_not_waited_past(receiver):
     assert path(False) == Number(0, 0)  # that takes no time
 
 
-def test_drain_passes_errors_on():
-    lock = threading.Lock()
-    with lock, pytest.raises(OSError, match="gone"):
-        coder_with_head(Number).drain(
-            Script(lock, OSError("gone")), zmq.Again, deque(), 0, 4, [0] * 8, 0, False
-        )
+def test_drain_passes_errors_on_and_keeps_count():
+    lock, messages = ReceiveLock(), deque()
+    path = make_fast_receive(lock, deque(), SubscriberCounters(), lambda link, frame: None)
+    script = Script(lock.lock, frame_of(0), frame_of(1), OSError("gone"), frame_of(2), frame_of(4), b"junk")
+    link = SimpleNamespace(receive=script, coder=coder_with_head(Number), expected=0, clock_offset_ns=0)
+    with lock.lock:
+        with pytest.raises(OSError, match="gone"):
+            path.drain(link, messages, 4, False)
+        assert (list(messages), link.expected) == ([Number(0, 0), Number(1, 1)], 2)
+        assert path.drain(link, messages, 4, False) == frame_of(4)
+        assert (len(messages), link.expected) == (3, 3)
+        assert path.drain(link, messages, 4, False) == b"junk"
+        assert path.drain(link, messages, 4, False) is None
+        link.coder = None
+        with pytest.raises(TypeError, match="coder"):
+            path.drain(link, messages, 4, False)
 
 
 def test_frames_that_are_none_of_this_publisher():
