@@ -317,8 +317,8 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
 
 
 def _is_other_text(path: Path) -> bool:
+    from neurosim_core.io import FORMATS, EventFileError
     from neurosim_core.io.csv import CsvSource
-    from neurosim_core.io.formats import FORMATS, EventFileError
 
     if path.suffix.lower() in FORMATS["csv"].suffixes:
         try:
