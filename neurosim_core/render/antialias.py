@@ -55,7 +55,7 @@ from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
+from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
 
 _CELLS = 4
 _SIDE = 4
@@ -153,6 +153,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree) if terms.embree else None
+    find_pose = pose_finder(terms)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
     def average_pixels(
@@ -179,8 +180,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
+        pose = find_pose(instant, 0, row * view.width + col, view)
+        origin = view.p_WC[pose]
+        q = view.q_WC[pose]
         pixel = place.first_ray + row * view.width + col
         center = wp.vec3(rays[0, pixel][0], rays[0, pixel][1], rays[0, pixel][2])
         across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
@@ -255,9 +257,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
                     hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
                 if wp.static(terms.bodies):
-                    hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
+                    hit, body = intersect_bodies(bodies, pose, direction_C, q, hit)
                 total += radiance_of(
-                    scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
+                    scene, bodies, pose, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
         write_radiance(scene, total / whole, instant, place.slot, row, col, out)
 
@@ -265,7 +267,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 @cache
-def _block_shader(*, textured: bool, emissive: bool) -> Any:
+def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
 
     Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
@@ -273,18 +275,15 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
 
     def shade_block(
         scene: SceneData,
+        view: ViewData,
         faces: wp.array3d[int],
         rays: wp.array2d[wp.vec4],
         first_pixel: int,
         instant: int,
         top: int,
         left: int,
-        height: int,
-        width: int,
         rows: int,
         columns: int,
-        origin: wp.vec3,
-        q_WC: wp.quat,
         radiance_out: wp.array[wp.vec3],
         unresolved_out: wp.array[int],
     ): ...
@@ -298,6 +297,7 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
         MOST=FACE_COUNT_MAX,
         TEXTURED=textured,
         EMISSIVE=emissive,
+        TIMED=timed,
         UNIT=True,
         LIGHT_WITHIN=True,
         SHARPNESS=round(100 * SHARPNESS),
@@ -310,8 +310,9 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
-    cast_packet = packet_caster(terms.embree)
-    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
+    cast_packet = packet_caster(terms.embree, origins=True)
+    find_pose = pose_finder(terms)
+    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
     shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -337,8 +338,6 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
         rows = wp.min(view.height - top, _SIDE)
         columns = wp.min(view.width - left, _SIDE)
         first_ray = place.first_ray + top * view.width + left
@@ -346,23 +345,21 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         unresolved_bits = wp.zeros(shape=(1,), dtype=int)
         shade_block(
             scene,
+            view,
             out.face,
             rays,
             first_ray,
             instant,
             top,
             left,
-            view.height,
-            view.width,
             rows,
             columns,
-            origin,
-            q,
             radiance,
             unresolved_bits,
         )
         unresolved = unresolved_bits[0]
         if unresolved != 0:
+            origins = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             ray = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             face = wp.zeros(shape=(_LANES,), dtype=int)
             t = wp.zeros(shape=(_LANES,), dtype=float)
@@ -380,10 +377,12 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
                             pixel = first_ray + y * view.width + x
                             sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                             toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                            ray[lane] = wp.quat_rotate(q, toward)
+                            pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
+                            origins[lane] = view.p_WC[pose]
+                            ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
                             spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
                 cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
+                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
                 )
                 shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
             for lane in range(_LANES):

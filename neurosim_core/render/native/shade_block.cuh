@@ -1,12 +1,28 @@
 // Radiance of 4 x 4 pixels from the faces that the first rays hit in and around them. `unresolved_out` has a bit for each
-// pixel that has to be rendered by rays. Each face is shaded once per pixel, at the middle of the points that show it.
+// pixel that has to be rendered by rays. Each face is shaded once per pixel, at the middle of the points that show it. With TIMED
+// each pixel has a pose of its own.
+const int width = view.width, height = view.height;
 #include "list_seen_faces.cuh"
 unresolved_out.data[0] = 0xffff;
 if (!listed) return;
-constexpr int LANES = 16, N = 16;
+constexpr int LANES = 16, N = 16, POSES = TIMED ? LANES : 1;
+auto pose_of = [&](int row, int column) {
+    return TIMED ? instant * view.pose_count + *wp::address(view.pose, 0, row * width + column) : instant;
+};
+const wp::vec3 origin = view.p_WC.data[pose_of(top, left)];
 #include "sample_points.cuh"
 alignas(64) float ray[3][3][LANES], pixel_spread[LANES];
 alignas(64) int own[LANES];
+alignas(64) float shift[3][POSES];
+wp::vec3 position[POSES];
+wp::quat q_WC[POSES];
+for (int lane = 0; lane < POSES; ++lane) {
+    const bool inside = lane % 4 < columns && lane / 4 < rows;
+    const int pose = pose_of(inside ? top + lane / 4 : top, inside ? left + lane % 4 : left);
+    position[lane] = view.p_WC.data[pose];
+    q_WC[lane] = view.q_WC.data[pose];
+    for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[lane][axis] - origin[axis];
+}
 for (int lane = 0; lane < LANES; ++lane) {
     const bool inside = lane % 4 < columns && lane / 4 < rows;
     own[lane] = *wp::address(faces, instant, inside ? top + lane / 4 : top, inside ? left + lane % 4 : left);
@@ -20,7 +36,7 @@ for (int lane = 0; lane < LANES; ++lane) {
 for (int term = 0; term < 3; ++term)
     for (int lane = 0; lane < LANES; ++lane) {
         const wp::vec3 turned =
-            wp::quat_rotate(q_WC, wp::vec3(ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]));
+            wp::quat_rotate(q_WC[TIMED ? lane : 0], wp::vec3(ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]));
         for (int axis = 0; axis < 3; ++axis) ray[term][axis][lane] = turned[axis];
     }
 #include "cover_lanes.cuh"
@@ -48,7 +64,7 @@ auto root = [](float square) {
     return __builtin_elementwise_sqrt(square); // a vector instruction without a branch
 #endif
 };
-alignas(64) float direction[3][N], spread[N], share[N];
+alignas(64) float direction[3][N], from[3][N], spread[N], share[N];
 alignas(64) int faces_of[N], owner[N];
 int filled = 0;
 auto shade = [&]() {
@@ -57,18 +73,24 @@ auto shade = [&]() {
         faces_of[lane] = faces_of[0];
         spread[lane] = spread[0];
         for (int axis = 0; axis < 3; ++axis) direction[axis][lane] = direction[axis][0];
+        if constexpr (TIMED)
+            for (int axis = 0; axis < 3; ++axis) from[axis][lane] = from[axis][0];
     }
     int other_faces = 0;
     for (int lane = 0; lane < N; ++lane) other_faces |= faces_of[lane] ^ faces_of[0];
     for (int lane = 0; lane < (other_faces ? N : 1); ++lane)
         for (int corner = 0; corner < 3; ++corner) {
             const wp::vec3& point = mesh.points[mesh.indices[3 * (size_t)faces_of[lane] + corner]];
-            for (int axis = 0; axis < 3; ++axis) tip[corner][axis][lane] = point[axis] - origin[axis];
+            for (int axis = 0; axis < 3; ++axis) tip[corner][axis][lane] = TIMED ? point[axis] : point[axis] - origin[axis];
         }
     if (!other_faces)
         for (int corner = 0; corner < 3; ++corner)
             for (int axis = 0; axis < 3; ++axis)
                 for (int lane = 1; lane < N; ++lane) tip[corner][axis][lane] = tip[corner][axis][0];
+    if constexpr (TIMED)
+        for (int corner = 0; corner < 3; ++corner)
+            for (int axis = 0; axis < 3; ++axis)
+                for (int lane = 0; lane < N; ++lane) tip[corner][axis][lane] -= from[axis][lane];
     for (int lane = 0; lane < N; ++lane) { // as in `meet_plane.cuh`
         float function[3][3], weight_of[3], unit[3], facing = 0.0f;
         for (int side = 0; side < 3; ++side)
@@ -124,7 +146,10 @@ for (int layer = 0; layer < layer_count; ++layer)
         for (int axis = 0; axis < 3; ++axis)
             toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
                            + middle[1][layer][lane] * ray[2][axis][lane];
-        faces_of[filled] = part_of(layer, own[lane], toward);
+        const wp::vec3& place = position[TIMED ? lane : 0];
+        faces_of[filled] = part_of(layer, own[lane], place, toward);
+        if constexpr (TIMED)
+            for (int axis = 0; axis < 3; ++axis) from[axis][filled] = place[axis];
         owner[filled] = lane;
         spread[filled] = footprint_width(number[layer][lane]) * pixel_spread[lane];
         share[filled] = number[layer][lane] * weight[lane];
