@@ -86,6 +86,7 @@ typedef struct {
     CortexPage *page;
     uint64_t tail; /* as last seen */
     uint64_t late_until;
+    uint32_t timeout_ms; /* longest time that it may hold up one message */
 } CortexMember;
 
 /* What the publisher knows of a slot. */
@@ -153,7 +154,7 @@ typedef struct {
 /* Processes: memory, sockets, bells. Each returns -1 with errno set if it fails, and where there is no memfd. */
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first); /* owns the hello */
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first); /* owns the hello */
 static inline void cortex_writer_remove(CortexWriter *writer, int member); /* its leases hold while its connection does */
 static inline void cortex_writer_forget(CortexWriter *writer, int member);
 static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes);
