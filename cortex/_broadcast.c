@@ -89,12 +89,26 @@ static PyObject *cast_send(Broadcast *cast, PyObject *const *arguments, Py_ssize
     return NULL;
 }
 
-int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size) {
-    if (!PyCFunction_CheckExact(send)) return -1;
+/* The ring whose `send` this is; NULL if it is something else, or closed. */
+static CortexWriter *writer_of(PyObject *send) {
+    if (!PyCFunction_CheckExact(send)) return NULL;
     PyObject *self = PyCFunction_GET_SELF(send);
-    if (self == NULL || !Py_IS_TYPE(self, &BroadcastType) || !((Broadcast *)self)->open) return -1;
-    return cortex_writer_put(&((Broadcast *)self)->writer, frame, (size_t)size, 1);
+    return self != NULL && Py_IS_TYPE(self, &BroadcastType) && ((Broadcast *)self)->open ? &((Broadcast *)self)->writer : NULL;
 }
+
+int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size) {
+    CortexWriter *writer = writer_of(send);
+    return writer == NULL ? -1 : cortex_writer_put(writer, frame, (size_t)size, 1);
+}
+
+char *broadcast_begin(PyObject *send, Py_ssize_t size) {
+    CortexWriter *writer = writer_of(send);
+    uint8_t *place = NULL;
+    if (writer != NULL) cortex_writer_begin(writer, (size_t)size, 1, &place);
+    return (char *)place;
+}
+
+void broadcast_finish(PyObject *send, Py_ssize_t size) { cortex_writer_finish(writer_of(send), (size_t)size); }
 
 static PyObject *cast_end(Broadcast *cast, PyObject *frame) {
     if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE) {

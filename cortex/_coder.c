@@ -20,19 +20,20 @@
 
 /* Writing */
 
-PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
-    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
-    if (frame == NULL) return NULL;
-    char *out = PyBytes_AS_STRING(frame);
+int write_frame(const Coder *coder, PyObject *message, char *out, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
     Pack pack;
-    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) {
-        Py_DECREF(frame);
-        return NULL;
-    }
+    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) return 0;
     memcpy(out, coder->head, HEAD_SIZE);
     const uint64_t rest[5] = {sequence, (uint64_t)pack.stamp_ns, (uint64_t)publish_ns, (uint64_t)size, 0};
     memcpy(out + HEAD_SIZE, rest, sizeof rest);
-    return frame;
+    return 1;
+}
+
+PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
+    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
+    if (frame == NULL || write_frame(coder, message, PyBytes_AS_STRING(frame), size, sequence, publish_ns)) return frame;
+    Py_DECREF(frame);
+    return NULL;
 }
 
 PyDoc_STRVAR(encode_doc,

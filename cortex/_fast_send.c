@@ -75,6 +75,16 @@ static PyObject *fast_send_frame(FastSend *fast, PyObject *frame) {
     return on_time < 0 ? NULL : PyBool_FromLong(on_time);
 }
 
+/* Write a small message where the only reader is the ring; 0 if it has to be sent as bytes, or is not as usual. */
+static int fast_write_frame(FastSend *fast, PyObject *message, Py_ssize_t size, int64_t now_ns) {
+    if (PyTuple_GET_SIZE(fast->sends) != 1) return 0;
+    PyObject *send = PyTuple_GET_ITEM(fast->sends, 0);
+    char *place = broadcast_begin(send, HEADER_SIZE + size);
+    if (place == NULL || !write_frame(fast->coder, message, place, size, fast->sequence, now_ns)) return 0;
+    broadcast_finish(send, HEADER_SIZE + size);
+    return 1;
+}
+
 /* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
 static int fast_relock(FastSend *fast) {
     PyObject *acquired, *type = NULL, *value = NULL, *traceback = NULL;
@@ -180,12 +190,13 @@ static PyObject *fast_send(FastSend *fast, PyObject *message) {
     const Py_ssize_t size = measure_body(fast->coder, message);
     if (size < 0) return NULL;
     if (size > fast->limit) return fast_send_slot(fast, message, size, now_ns);
-    PyObject *frame = make_frame(fast->coder, message, size, fast->sequence, now_ns);
-    if (frame == NULL) return NULL;
+    PyObject *frame = NULL, *sent;
+    const int is_written = fast_write_frame(fast, message, size, now_ns);
+    if (!is_written && (frame = make_frame(fast->coder, message, size, fast->sequence, now_ns)) == NULL) return NULL;
     fast->sequence += 1;
     fast->bytes += size;
-    PyObject *sent = fast_send_frame(fast, frame);
-    Py_DECREF(frame);
+    sent = is_written ? Py_NewRef(Py_True) : fast_send_frame(fast, frame);
+    Py_XDECREF(frame);
     return sent;
 }
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 import zmq
-from peer import Block, is_whole, make_block
+from peer import Block, Number, is_whole, make_block
 from processes import SOON_S, wait_for
 
 import cortex.link
@@ -333,6 +333,20 @@ def test_who_says_something_else_is_refused(ring, said):
             with pytest.raises(BlockingIOError):
                 native.hear(connection)
         os.close(connection)
+
+
+def test_a_message_that_cannot_be_written_leaves_no_trace(node):
+    """The publisher begins its frame in the ring, and finds that a field is of another type."""
+    publisher = node.publisher("/ring", Number)
+    subscriber = node.subscriber("/ring", Number, policy=reliable())
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    for number in range(4):
+        with pytest.raises(TypeError):
+            publisher.publish(Number(number, "none"))
+        assert publisher.publish(Number(number, number))
+        assert subscriber.recv(SOON_S) == Number(number, number)
+    assert publisher.counters.published == subscriber.counters.received == 4
+    assert subscriber.counters.lost == subscriber.counters.rejected == 0
 
 
 @pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
