@@ -86,6 +86,7 @@ def make_kernels() -> None:
         everything._replace(finest_level=True),
         everything._replace(finest_level=True, nearest_texel=True),
         everything._replace(bodies=True),
+        everything._replace(bodies=True, timed=True),
         everything._replace(bodies=True, baked=False),
         everything._replace(worlds=True, bodies=True),
         everything._replace(worlds=True, world_scenes=True, world_lenses=True),

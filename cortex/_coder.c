@@ -1,5 +1,5 @@
 /* A `Coder` is made once per message type and publisher. It writes a message as a frame or as a bare body,
-   and reads a frame or a body back: what `body.py` does, in a tenth of the time.
+   and reads them back: what `body.py` does, in a tenth of the time.
 
    It is strict: of whatever is not exactly as usual (another class, a number of NumPy, a wrong dtype or shape, a
    malformed body) it returns None, and the Python code does the work, or says what is wrong. So it never raises for a
@@ -20,41 +20,25 @@
 
 /* Writing */
 
-PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
-    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
-    if (frame == NULL) return NULL;
-    char *out = PyBytes_AS_STRING(frame);
+int write_frame(const Coder *coder, PyObject *message, char *out, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
     Pack pack;
-    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) {
-        Py_DECREF(frame);
-        return NULL;
-    }
+    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) return 0;
     memcpy(out, coder->head, HEAD_SIZE);
     const uint64_t rest[5] = {sequence, (uint64_t)pack.stamp_ns, (uint64_t)publish_ns, (uint64_t)size, 0};
     memcpy(out + HEAD_SIZE, rest, sizeof rest);
-    return frame;
+    return 1;
 }
 
-PyDoc_STRVAR(frame_doc,
-"frame($self, message, sequence, publish_ns, limit, /)\n--\n\n"
-"A whole frame: the head, the rest of the header, the body; None if the message is not as usual, or its body has\n"
-"more than `limit` bytes.");
-
-static PyObject *coder_frame(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 4)) return NULL;
-    const uint64_t sequence = PyLong_AsUnsignedLongLong(arguments[1]);
-    const int64_t publish_ns = PyLong_AsLongLong(arguments[2]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
-    if (PyErr_Occurred()) return NULL;
-    const Py_ssize_t size = coder->has_head ? measure_body(coder, arguments[0]) : -1;
-    if (size < 0 || size > limit) Py_RETURN_NONE;
-    PyObject *frame = make_frame(coder, arguments[0], size, sequence, publish_ns);
-    return frame == NULL ? none_or_error(NULL) : frame;
+PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
+    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
+    if (frame == NULL || write_frame(coder, message, PyBytes_AS_STRING(frame), size, sequence, publish_ns)) return frame;
+    Py_DECREF(frame);
+    return NULL;
 }
 
 PyDoc_STRVAR(encode_doc,
 "encode($self, message, limit, /)\n--\n\n"
-"The body of a message; None as for `frame`.");
+"The body of a message; None if the message is not as usual, or its body has more than `limit` bytes.");
 
 static PyObject *coder_encode(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
     if (!arguments_are(count, 2)) return NULL;
@@ -69,11 +53,6 @@ static PyObject *coder_encode(Coder *coder, PyObject *const *arguments, Py_ssize
 }
 
 /* Reading */
-
-PyDoc_STRVAR(read_doc,
-"read($self, frame, /)\n--\n\n"
-"A frame to its sequence, publish_ns and message; None if it does not begin with the head, or is not as usual.\n"
-"Arrays of the message are read-only views of the frame.");
 
 /* The message in the slot that a descriptor names; NULL without error if it is not as usual. */
 static PyObject *read_slot(const Coder *coder, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
@@ -107,35 +86,6 @@ static PyObject *read_frame(const Coder *coder, PyObject *frame, uint64_t *seque
     return read_body(coder, frame, bytes + HEADER_SIZE, size);
 }
 
-static PyObject *coder_read(Coder *coder, PyObject *frame) {
-    uint64_t sequence;
-    int64_t publish_ns;
-    PyObject *message = read_frame(coder, frame, &sequence, &publish_ns);
-    if (message == NULL) return none_or_error(NULL);
-    return Py_BuildValue("KLN", (unsigned long long)sequence, (long long)publish_ns, message);
-}
-
-/* Where frames come from, and what is noted of them. */
-typedef struct {
-    PyObject *receive, *again, *latency;
-    int64_t expected, clock_offset_ns;
-    Py_ssize_t limit;
-} Source;
-
-/* Take `receive`, `again`, and then `expected`, `limit`, `latency`, `clock_offset_ns`; 0 with an error set. */
-static int take_source(Source *source, PyObject *const *first, PyObject *const *rest) {
-    source->receive = first[0];
-    source->again = first[1];
-    source->expected = PyLong_AsLongLong(rest[0]);
-    source->limit = PyLong_AsSsize_t(rest[1]);
-    source->latency = rest[2];
-    source->clock_offset_ns = PyLong_AsLongLong(rest[3]);
-    if (PyErr_Occurred()) return 0;
-    if (PyList_Check(source->latency) && PyList_GET_SIZE(source->latency) > 0) return 1;
-    PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
-    return 0;
-}
-
 int note_latency(PyObject *latency, int64_t elapsed_ns) {
     Py_ssize_t bucket = 0;
     for (uint64_t left = elapsed_ns > 0 ? (uint64_t)elapsed_ns : 0; left; left >>= 1) ++bucket;
@@ -147,27 +97,6 @@ int note_latency(PyObject *latency, int64_t elapsed_ns) {
     return more != NULL && PyList_SetItem(latency, bucket, more) == 0;
 }
 
-/* Count how long the message of a source was on its way; 0 with an error set. */
-static int note_arrival(const Source *source, int64_t publish_ns) {
-    return note_latency(source->latency, monotonic_ns() - publish_ns - source->clock_offset_ns);
-}
-
-PyDoc_STRVAR(drain_doc,
-"drain($self, receive, again, messages, expected, limit, latency, clock_offset_ns, may_wait, /)\n--\n\n"
-"Read plain frames that follow one another, and append their messages.\n\n"
-"Args:\n"
-"    receive: Called with DONTWAIT (1); returns a frame.\n"
-"    again: What it raises when there is none.\n"
-"    messages: A deque or list; its `append` is called.\n"
-"    expected: Sequence of the next message; -1: not known.\n"
-"    limit: Most messages to read.\n"
-"    latency: Counts by powers of two of a nanosecond; every eighth message is entered.\n"
-"    clock_offset_ns: What to add to the publisher's clock to read it on ours [ns].\n"
-"    may_wait: Whether to wait a little for the first: call `receive` without DONTWAIT.\n\n"
-"Returns:\n"
-"    The sequence expected next, how many were read, and what ended it: None where there were no more or the limit\n"
-"    was reached, or a frame that was taken from the socket and is something else, or out of sequence.\n");
-
 PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
     uint64_t sequence;
     if (coder->has_head && PyBytes_CheckExact(frame) && PyBytes_GET_SIZE(frame) >= HEADER_SIZE) {
@@ -175,46 +104,6 @@ PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, 
         if (sequence != expected) return NULL;
     }
     return read_frame(coder, frame, &sequence, publish_ns);
-}
-
-/* Append a message, which is let go; 0 with an error set. */
-static int append_message(PyObject *append, PyObject *message) {
-    PyObject *appended = PyObject_CallOneArg(append, message);
-    Py_DECREF(message);
-    Py_XDECREF(appended);
-    return appended != NULL;
-}
-
-/* Read until something ends it, and return how many were read; `ended_by` is a frame or NULL, perhaps with an error. */
-static Py_ssize_t drain_source(const Coder *coder, Source *source, PyObject *append, int may_wait, PyObject **ended_by) {
-    Py_ssize_t read = 0;
-    for (; read < source->limit; ++read) {
-        *ended_by = take_frame(source->receive, source->again, may_wait && read == 0);
-        if (*ended_by == NULL) break;
-        int64_t publish_ns;
-        PyObject *message = read_expected(coder, *ended_by, (uint64_t)source->expected, &publish_ns);
-        if (message == NULL) break;
-        Py_CLEAR(*ended_by);
-        source->expected += 1;
-        if (!append_message(append, message) || (read % 8 == 0 && !note_arrival(source, publish_ns))) break;
-    }
-    return read;
-}
-
-static PyObject *coder_drain(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    Source source;
-    if (!arguments_are(count, 8) || !take_source(&source, arguments, arguments + 3)) return NULL;
-    const int may_wait = PyObject_IsTrue(arguments[7]);
-    PyObject *append = may_wait < 0 ? NULL : PyObject_GetAttrString(arguments[2], "append");
-    if (append == NULL) return NULL;
-    PyObject *frame = NULL;
-    const Py_ssize_t read = drain_source(coder, &source, append, may_wait, &frame);
-    Py_DECREF(append);
-    if (PyErr_Occurred()) {
-        Py_XDECREF(frame);
-        return NULL;
-    }
-    return Py_BuildValue("LnN", (long long)source.expected, read, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
 PyDoc_STRVAR(decode_doc,
@@ -282,7 +171,8 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
 
 static int coder_traverse(Coder *coder, visitproc visit, void *arg) {
     Py_VISIT(coder->slots);
-    return visit_block(&coder->block, visit, arg);
+    Py_VISIT(coder->block.row);
+    return 0;
 }
 
 /* What keeps the block in a cycle is its class, which breaks it. */
@@ -299,10 +189,7 @@ static void coder_dealloc(Coder *coder) {
 }
 
 static PyMethodDef coder_methods[] = {
-    {"frame", (PyCFunction)(void (*)(void))coder_frame, METH_FASTCALL, frame_doc},
     {"encode", (PyCFunction)(void (*)(void))coder_encode, METH_FASTCALL, encode_doc},
-    {"read", (PyCFunction)coder_read, METH_O, read_doc},
-    {"drain", (PyCFunction)(void (*)(void))coder_drain, METH_FASTCALL, drain_doc},
     {"decode", (PyCFunction)(void (*)(void))coder_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };

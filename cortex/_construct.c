@@ -12,16 +12,12 @@
 enum { ARGUMENTS_MAX = 64 };
 
 typedef struct {
-    PyObject *name; /* interned */
-    Py_ssize_t slot;
-    PyObject *value; /* its default, or NULL */
-} Argument;
-
-typedef struct {
-    PyObject_HEAD
-    PyObject *init; /* the `__init__` that this does the work of */
-    Py_ssize_t count;
-    Argument *arguments;
+    PyObject_VAR_HEAD
+    PyObject *init;   /* the `__init__` that this does the work of */
+    PyObject *names;  /* of the arguments, interned */
+    PyObject *values; /* what stands for one that is left out */
+    PyObject *required; /* among those: it may not be */
+    Py_ssize_t slots[];
 } Maker;
 
 static PyObject *maker_name, *init_name;
@@ -56,22 +52,24 @@ static const Maker *maker_of(PyTypeObject *cls) {
 /* Put each value where its argument belongs; 0 if they do not fit. Values are borrowed. */
 static int match(
     const Maker *maker, PyObject *const *given, Py_ssize_t positional, PyObject *keywords, PyObject **values) {
-    if (positional > maker->count) return 0;
+    const Py_ssize_t count = Py_SIZE(maker);
+    PyObject *const *names = &PyTuple_GET_ITEM(maker->names, 0);
+    if (positional > count) return 0;
     for (Py_ssize_t index = 0; index < positional; ++index) values[index] = given[index];
-    for (Py_ssize_t index = positional; index < maker->count; ++index) values[index] = NULL;
+    for (Py_ssize_t index = positional; index < count; ++index) values[index] = NULL;
     const Py_ssize_t named = keywords == NULL ? 0 : PyTuple_GET_SIZE(keywords);
     Py_ssize_t next = positional; /* most name them in order */
     for (Py_ssize_t number = 0; number < named; ++number) {
         PyObject *name = PyTuple_GET_ITEM(keywords, number);
-        if (next >= maker->count || maker->arguments[next].name != name) {
-            for (next = 0; next < maker->count && maker->arguments[next].name != name; ++next) continue;
+        if (next >= count || names[next] != name) {
+            for (next = 0; next < count && names[next] != name; ++next) continue;
         }
-        if (next == maker->count || values[next] != NULL) return 0;
+        if (next == count || values[next] != NULL) return 0;
         values[next++] = given[positional + number];
     }
-    for (Py_ssize_t index = positional; index < maker->count; ++index) {
-        if (values[index] == NULL) values[index] = maker->arguments[index].value;
-        if (values[index] == NULL) return 0;
+    for (Py_ssize_t index = positional; index < count; ++index) {
+        if (values[index] == NULL) values[index] = PyTuple_GET_ITEM(maker->values, index);
+        if (values[index] == maker->required) return 0;
     }
     return 1;
 }
@@ -107,30 +105,25 @@ static PyObject *construct(PyObject *self, PyObject *const *given, size_t flags,
     }
     PyObject *message = cls->tp_alloc(cls, 0);
     if (message == NULL) return NULL;
-    for (Py_ssize_t index = 0; index < maker->count; ++index) {
-        *(PyObject **)((char *)message + maker->arguments[index].slot) = Py_NewRef(values[index]);
+    for (Py_ssize_t index = 0; index < Py_SIZE(maker); ++index) {
+        *(PyObject **)((char *)message + maker->slots[index]) = Py_NewRef(values[index]);
     }
     return message;
 }
 
 static int maker_traverse(Maker *maker, visitproc visit, void *arg) {
     Py_VISIT(maker->init);
-    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_VISIT(maker->arguments[index].value);
-    return 0;
-}
-
-static int maker_clear(Maker *maker) {
-    Py_CLEAR(maker->init);
-    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_CLEAR(maker->arguments[index].value);
+    Py_VISIT(maker->values);
     return 0;
 }
 
 static void maker_dealloc(Maker *maker) {
     PyObject_GC_UnTrack(maker);
-    maker_clear(maker);
-    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_XDECREF(maker->arguments[index].name);
-    PyMem_Free(maker->arguments);
-    Py_TYPE(maker)->tp_free((PyObject *)maker);
+    Py_DECREF(maker->init);
+    Py_DECREF(maker->names);
+    Py_DECREF(maker->values);
+    Py_DECREF(maker->required);
+    PyObject_GC_Del(maker);
 }
 
 static PyTypeObject MakerType = {
@@ -138,63 +131,46 @@ static PyTypeObject MakerType = {
     .tp_name = "cortex._native.Maker",
     .tp_doc = "What `hasten` knows of a class.",
     .tp_basicsize = sizeof(Maker),
+    .tp_itemsize = sizeof(Py_ssize_t),
     .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_DISALLOW_INSTANTIATION,
     .tp_traverse = (traverseproc)maker_traverse,
-    .tp_clear = (inquiry)maker_clear,
     .tp_dealloc = (destructor)maker_dealloc,
 };
 
-/* Add what is known of one argument; 0 with an error set if it is not as it should be. */
-static int take_argument(Maker *maker, PyTypeObject *cls, PyObject *name, PyObject *defaults) {
-    if (!PyUnicode_CheckExact(name)) {
-        PyErr_SetString(PyExc_TypeError, "names are strings");
-        return 0;
-    }
-    const Py_ssize_t slot = slot_of(cls, name);
-    if (slot < 0) return 0;
-    PyObject *value = PyDict_GetItemWithError(defaults, name);
-    if (value == NULL && PyErr_Occurred()) return 0;
-    Argument *argument = &maker->arguments[maker->count++];
-    argument->name = Py_NewRef(name);
-    PyUnicode_InternInPlace(&argument->name);
-    argument->slot = slot;
-    argument->value = Py_XNewRef(value);
-    return 1;
-}
-
 PyDoc_STRVAR(hasten_doc,
-"hasten($module, cls, names, defaults, /)\n--\n\n"
+"hasten($module, cls, names, values, required, /)\n--\n\n"
 "Let calls of a class fill its slots directly.\n\n"
 "Args:\n"
 "    cls: A class whose `__init__` puts each argument into the slot of its name, and does nothing else.\n"
-"    names: The arguments in order, at most 64.\n"
-"    defaults: Values of those that may be left out.\n");
+"    names: The arguments in order, at most 64, interned.\n"
+"    values: Their defaults.\n"
+"    required: What stands there for an argument that has none.\n");
 
 static PyObject *hasten(PyObject *module, PyObject *arguments) {
     (void)module;
     PyTypeObject *cls;
-    PyObject *names, *defaults;
-    if (!PyArg_ParseTuple(arguments, "O!O!O!", &PyType_Type, &cls, &PyTuple_Type, &names, &PyDict_Type, &defaults)) {
+    PyObject *names, *values, *required;
+    if (!PyArg_ParseTuple(arguments, "O!O!O!O", &PyType_Type, &cls, &PyTuple_Type, &names, &PyTuple_Type, &values, &required))
         return NULL;
-    }
     const Py_ssize_t count = PyTuple_GET_SIZE(names);
     /* from Python 3.12 on, types that are no heap types may have no `tp_dict` */
     const int is_plain = (cls->tp_flags & Py_TPFLAGS_HEAPTYPE) && Py_IS_TYPE(cls, &PyType_Type);
     PyObject *init = is_plain ? PyDict_GetItemWithError(cls->tp_dict, init_name) : NULL;
-    if (count > ARGUMENTS_MAX || init == NULL) {
+    if (count > ARGUMENTS_MAX || PyTuple_GET_SIZE(values) != count || init == NULL) {
         if (!PyErr_Occurred()) PyErr_Format(PyExc_TypeError, "%s cannot be hastened", cls->tp_name);
         return NULL;
     }
-    Maker *maker = PyObject_GC_New(Maker, &MakerType);
+    Maker *maker = PyObject_GC_NewVar(Maker, &MakerType, count);
     if (maker == NULL) return NULL;
     maker->init = Py_NewRef(init);
-    maker->count = 0;
-    maker->arguments = PyMem_Calloc((size_t)count + 1, sizeof(Argument));
+    maker->names = Py_NewRef(names);
+    maker->values = Py_NewRef(values);
+    maker->required = Py_NewRef(required);
     PyObject_GC_Track(maker);
-    int failed = maker->arguments == NULL;
-    if (failed) PyErr_NoMemory();
+    int failed = 0;
     for (Py_ssize_t index = 0; !failed && index < count; ++index) {
-        failed = !take_argument(maker, cls, PyTuple_GET_ITEM(names, index), defaults);
+        maker->slots[index] = slot_of(cls, PyTuple_GET_ITEM(names, index));
+        failed = maker->slots[index] < 0;
     }
     failed = failed || PyObject_SetAttr((PyObject *)cls, maker_name, (PyObject *)maker) < 0;
     Py_DECREF(maker);

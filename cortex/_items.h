@@ -53,8 +53,16 @@ typedef struct {
     int dimension_count; /* of the scope that each element is */
 } List;
 
-/* Of a message: where its fields lie. */
+typedef struct Memory Memory;
+struct Memory {
+    Memory *before;
+    max_align_t content[];
+};
+
+/* Of a message: where its fields lie. Of the outermost one also what keeps all this. */
 typedef struct {
+    PyObject *row; /* a tuple of tuples, which has all the classes, members and dtypes */
+    Memory *memory;
     PyTypeObject *cls;
     Py_ssize_t size;
     int dimension_count;
@@ -83,7 +91,6 @@ struct Item {
 /* Take what `native.py` says of a message, see there; 0 with an error set. Whatever was taken is to be freed. */
 int take_block(Block *block, PyObject *row);
 void free_block(Block *block);
-int visit_block(const Block *block, visitproc visit, void *arg);
 
 static inline PyObject **place_of(const Item *field, PyObject *message) {
     return (PyObject **)((char *)message + field->slot);

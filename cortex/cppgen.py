@@ -14,11 +14,15 @@ from pathlib import Path
 
 import cortex.messages
 from cortex import records
-from cortex.cppbody import BodyWriter, Code, is_large, literal, place
 from cortex.layout import (
+    ITEM_ALIGNMENT,
+    LARGE_ARRAY_BYTES,
+    fixed_bytes,
     has_tail,
     measure,
     measure_fields,
+    stride_of,
+    values_of,
 )
 from cortex.message import is_message
 from cortex.schema import (
@@ -153,7 +157,6 @@ class _Generator:
     def __init__(self, namespace: str | None) -> None:
         self._namespace = namespace
         self.blocks: list[_Block] = []
-        self._body = BodyWriter(self.cpp)
 
     def _qualified(self, name: str) -> tuple[str, str, str]:
         """Namespace, identifier, and both together, of a type's name."""
@@ -202,7 +205,7 @@ class _Generator:
             "namespace cortex {",
             "template <>",
             f"struct EnumCodec<::{qualified}> {{",
-            f"  static constexpr std::string_view name = {literal(kind.name)};",
+            f"  static constexpr std::string_view name = {_literal(kind.name)};",
             "  static constexpr bool known(std::int32_t number) noexcept {",
             "    switch (number) {",
             *(f"      case {_int32(number)}:" for number in sorted(set(members.values()))),
@@ -237,20 +240,6 @@ class _Generator:
         return f"::{qualified}"
 
     def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
-        _, size, alignment = measure_fields(schema)
-        read, write, draft = Code("MalformedMessage"), Code("std::invalid_argument"), Code("")
-        used = 0
-        for member in members:
-            where = literal(f"{schema.name}.{member.field.name}")
-            at = _plus("at", member.offset)
-            self._body.read(read, member.field.type, f"out.{member.name}", at, where, 2)
-            if member.offset > used:
-                write.lines.append(f"    sink.zero({_plus('at', used)}, {member.offset - used});")
-            self._body.write(write, member.field.type, f"message.{member.name}", at, where, 2)
-            place(draft, member.field.name, member.field.type, f"out.{member.name}", member.offset)
-            used = member.offset + measure(member.field.type)[0]
-        if size > used:
-            write.lines.append(f"    sink.zero({_plus('at', used)}, {size - used});")
         stamp = next((m for m in members if m.field.name == "stamp_ns" and _is_integer(m.field.type)), None)
         unused = "" if stamp else "[[maybe_unused]] "
         stamp_code = f"static_cast<std::int64_t>(message.{stamp.name})" if stamp else "0"
@@ -258,12 +247,11 @@ class _Generator:
             "namespace cortex {",
             "template <>",
             f"struct Codec<{cpp}> {{",
-            f"  static constexpr std::string_view name = {literal(schema.name)};",
+            f"  static constexpr std::string_view name = {_literal(schema.name)};",
             f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
             "  static constexpr std::string_view schema =",
             *_string_lines(schema.to_json()),
-            f"  static constexpr std::size_t block = {size};",
-            f"  static constexpr std::size_t alignment = {alignment};",
+            f"  static constexpr std::size_t block = {measure_fields(schema)[1]};",
             f"  static constexpr bool fixed = {_truth(not has_tail(schema))};",
             f"  static constexpr bool stamped = {_truth(stamp is not None)};",
             "",
@@ -271,21 +259,63 @@ class _Generator:
             f"    return {stamp_code};",
             "  }",
             "",
-            *_function("decode", ["Reader& reader", "std::size_t at", f"{cpp}& out"], read),
-            "",
-            "  template <class Sink>",
-            *_function("encode", ["Sink& sink", "std::size_t at", f"const {cpp}& message"], write),
-            "",
-            *_function("draft", ["Placer& placer", f"{cpp}& out"], draft),
+            "  template <class Visitor, class Message>",
+            *_fields(schema.name, members),
             "};",
             "}  // namespace cortex",
         ]
 
 
-def _function(name: str, parameters: Sequence[str], code: Code) -> list[str]:
-    unused = "" if code.lines else "[[maybe_unused]] "
-    marked = ", ".join(unused + parameter for parameter in parameters)
-    return [f"  static void {name}({marked}) {{", *code.whole("    "), "  }"]
+def _fields(name: str, members: list[_Member]) -> Iterator[str]:
+    """The function that hands each field, its place and its shape to a visitor."""
+    unused = "" if members else "[[maybe_unused]] "
+    parameters = ("Visitor& visit", "std::size_t at", "Message& message")
+    yield f"  static void fields({', '.join(unused + each for each in parameters)}) {{"
+    variables: dict[tuple[str, str], str] = {}
+    """By the field whose own they are, or nothing if others share them, and their name."""
+    calls = []
+    for member in members:
+        scope = member.field.name if _holds_list(member.field.type) else ""
+        place = f"at + {member.offset}" if member.offset else "at"
+        shapes = _shapes(member.field.type, f"{name}.{member.field.name}", scope, variables)
+        calls.append(f"    visit({', '.join([place, f'message.{member.name}', *shapes])});")
+    for (_, dimension), variable in variables.items():
+        yield f"    Dimension {variable}{{{_literal(dimension)}}};"
+    yield from calls
+    yield "  }"
+
+
+def _holds_list(kind: FieldType) -> bool:
+    """Whether dimensions within a field belong to the elements of its lists."""
+    return isinstance(kind, ListType) or (isinstance(kind, OptionalType) and _holds_list(kind.item))
+
+
+def _shapes(kind: FieldType, where: str, scope: str, variables: dict[tuple[str, str], str]) -> Iterator[str]:
+    """What a visitor has to be told of a field besides its C++ type, from the outside in."""
+    if isinstance(kind, OptionalType):
+        yield f"Held<{measure(kind)[1]}>{{}}"
+        yield from _shapes(kind.item, where, scope, variables)
+    elif isinstance(kind, ListType):
+        alignment = max(ITEM_ALIGNMENT, measure(kind.item)[1])
+        yield f"Elements<{stride_of(kind.item)}, {alignment}, {values_of(kind.item)}>{{}}"
+        yield from _shapes(kind.item, where, scope, variables)
+    elif kind == "bytes":
+        yield "Bytes{}"
+    elif isinstance(kind, ArrayType) and _is_large(kind):
+        yield f"Within<{', '.join(map(str, kind.shape))}>{{}}"
+    elif isinstance(kind, ArrayType) and not kind.is_fixed:
+        extents = [
+            f"{extent}u"
+            if isinstance(extent, int)
+            else variables.setdefault((scope, extent), f"dimension_{len(variables)}")
+            for extent in kind.shape
+        ]
+        yield f"Extents<{len(extents)}>{{{_literal(where)}, {{{{{', '.join(extents)}}}}}}}"
+
+
+def _is_large(kind: ArrayType) -> bool:
+    """Whether an array of a fixed shape is so large that C++ has it as a view."""
+    return kind.is_fixed and fixed_bytes(kind) >= LARGE_ARRAY_BYTES
 
 
 def _struct(name: str, members: list[_Member]) -> Iterator[str]:
@@ -316,7 +346,7 @@ def _array(kind: ArrayType) -> str:
     if kind.dtype == ANY_DTYPE:
         return f"cortex::AnyArray<{rank}>"
     cpp = _ITEMS[kind.dtype]
-    if not kind.is_fixed or is_large(kind):
+    if not kind.is_fixed or _is_large(kind):
         return f"cortex::Array<{cpp}, {rank}>"
     for extent in reversed(kind.shape or (1,)):
         cpp = f"std::array<{cpp}, {extent}>"
@@ -345,7 +375,7 @@ def _comment(text: str) -> str:
 def _string_lines(text: str) -> Iterator[str]:
     pieces = [text[start : start + 90] for start in range(0, len(text), 90)]
     for index, piece in enumerate(pieces):
-        yield f"      {literal(piece)}{';' if index == len(pieces) - 1 else ''}"
+        yield f"      {_literal(piece)}{';' if index == len(pieces) - 1 else ''}"
 
 
 def _open(namespace: str) -> list[str]:
@@ -356,8 +386,16 @@ def _close(namespace: str) -> list[str]:
     return [f"}}  // namespace {namespace}"] if namespace else []
 
 
-def _plus(at: str, offset: int) -> str:
-    return f"{at} + {offset}" if offset else at
+def _literal(text: str) -> str:
+    """A C++ string literal; what is not plain ASCII becomes octal escapes, which end after three digits."""
+    out = []
+    for byte in text.encode():
+        char = chr(byte)
+        if not 32 <= byte < 127:
+            out.append(f"\\{byte:03o}")
+        else:
+            out.append(f"\\{char}" if char in '"\\?' else char)
+    return '"' + "".join(out) + '"'
 
 
 def _int32(value: int) -> str:

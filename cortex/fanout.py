@@ -68,7 +68,7 @@ class Fanout:
             message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, NEXT, SLOT, LARGE)
         )
         self._fast_send = fast_send
-        self._large = LargeSender()
+        self.large = LargeSender()
         self._pub_sockets = pub_sockets
         self._back_pressure = back_pressure
         self.latching = latching
@@ -170,7 +170,7 @@ class Fanout:
 
     def tick(self, now_ns: int) -> None:
         """Let go of what was sent, and tell readers how many messages there were; called now and then."""
-        self._large.prune()
+        self.large.prune()
         if self._back_pressure.is_waiting:
             return
         sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
@@ -217,11 +217,11 @@ class Fanout:
         on_time = not (self.late or self.ring.has_lost)
         for pub_socket in {r.pub_socket for r in self.readers.values() if r.member is None}:
             on_time &= self._send_body(pub_socket, self._large_head + rest, body)
-        if slot is None:
-            on_time &= self.ring.send(self._message_head + rest + body)
-        else:
+        if slot is not None:
             rest = REST.pack(sequence, stamp_ns, publish_ns, size, slot.number)
             on_time &= self.ring.commit(slot, self._slot_head + rest)
+        elif self.ring.has_readers:
+            on_time &= self.ring.send(self._message_head + rest + body)
         if self._fast_send.ring is None:  # there may be slots now
             self.route()
         self.timeouts += not on_time
@@ -231,7 +231,7 @@ class Fanout:
         """Send header and body through a socket; False if a reliable reader lost the message."""
 
         def has_room() -> bool:
-            return self._large.has_room(pub_socket, body.nbytes)
+            return self.large.has_room(pub_socket, body.nbytes)
 
         if not has_room() and not (
             pub_socket.strict and self._await_room(has_room, self._timeout_s(pub_socket))
@@ -243,7 +243,7 @@ class Fanout:
             on_time = self.send_strict(pub_socket, head, SNDMORE)
         else:
             pub_socket.send(head, DONTWAIT | SNDMORE)
-        self._large.send(pub_socket, body)
+        self.large.send(pub_socket, body)
         return on_time
 
     def _timeout_s(self, pub_socket: PubSocket) -> float:

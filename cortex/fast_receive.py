@@ -54,6 +54,16 @@ class FastReceive:
         """
         return NOTHING
 
+    def drain(self, link: Link, messages: deque[Any], limit: int, may_wait: bool, /) -> bytes | None:
+        """Read the frames of a link with a coder that follow one another, and append their messages.
+
+        The lock is held.
+
+        Returns:
+            What ended it: a frame that is something else; None if there was no more, or `limit` were read.
+        """
+        raise NotImplementedError("links have coders in C only")
+
     def soon(self) -> Any:
         """As a call with False, while an asyncio task may go on: `left` and `until_ns` say so."""
         return NOTHING

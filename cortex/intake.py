@@ -119,7 +119,7 @@ class Intake:
             messages: Where they are appended.
             may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
         """
-        links, latency = self._rotated(), self._counters.latency
+        links = self._rotated()
         if any(link.coder is None for link in links):
             if may_wait:
                 self.receive_one(block=True)
@@ -131,18 +131,10 @@ class Intake:
         for link in links:
             left = min(self._policy.depth, DRAIN_MAX) - len(messages)
             while left > 0 and not self.queue:
-                link.expected, count, frame = link.coder.drain(
-                    link.receive,
-                    zmq.Again,
-                    messages,
-                    link.expected,
-                    left,
-                    latency,
-                    link.clock_offset_ns,
-                    may_wait,
-                )
+                before = len(messages)
+                frame = self.fast_receive.drain(link, messages, left, may_wait)
                 may_wait = False
-                left -= count
+                left -= len(messages) - before
                 if frame is None:
                     break
                 left -= 1

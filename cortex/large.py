@@ -2,35 +2,57 @@
 
 from __future__ import annotations
 
-from collections import deque
-from typing import NamedTuple
+import ctypes
+import weakref
+from collections import defaultdict, deque
 
+import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from cortex.pub_socket import PubSocket
 
 PRIVATE_BYTES = 64 << 20
 """Most bytes of bodies that wait to be sent through lossy sockets, and through strict ones."""
-
-
-class _Body(NamedTuple):
-    tracker: zmq.MessageTracker
-    size: int
-    strict: bool
+FREE_MAX = 16
+"""Memory of so many sent bodies is kept for those that follow: of `PRIVATE_BYTES` or four of them at most."""
 
 
 class LargeSender:
     """Bodies of one publisher that its sockets still read. The caller holds the sockets' lock."""
 
     def __init__(self) -> None:
-        self._waiting: deque[_Body] = deque()
+        self._waiting: defaultdict[PubSocket, deque[tuple[zmq.MessageTracker, int]]] = defaultdict(deque)
+        """What each socket has still to send, in order, and its bytes."""
         self.waiting_bytes = {False: 0, True: 0}
         """Bytes that wait, of lossy and of strict sockets."""
+        self._free: list[NDArray[np.uint8]] = []
+
+    def acquire(self, size: int) -> NDArray[np.uint8]:
+        """Return memory for a body of so many bytes, as large or larger; it is not cleared.
+
+        It is used again once nobody looks at it, sockets included: the C library would give its pages back,
+        and to get new ones takes longer than the copy. Any thread may let go of it.
+        """
+        for index, memory in enumerate(self._free):
+            if size <= len(memory) <= 4 * size:
+                del self._free[index]
+                break
+        else:
+            del self._free[:1]  # sizes have changed
+            memory = np.empty(size, np.uint8)
+        lent = (ctypes.c_ubyte * len(memory)).from_buffer(memory.data)
+        weakref.finalize(lent, self._release, memory).atexit = False
+        return np.frombuffer(memoryview(lent), np.uint8)
+
+    def _release(self, memory: NDArray[np.uint8]) -> None:
+        kept = sum(map(len, self._free)) + len(memory)
+        if len(self._free) < FREE_MAX and kept <= max(PRIVATE_BYTES, 4 * len(memory)):
+            self._free.append(memory)
 
     def has_room(self, pub_socket: PubSocket, size: int) -> bool:
         """Whether so many bytes more may wait."""
-        if self._waiting:
-            self.prune()
+        self.prune()
         return self.waiting_bytes[pub_socket.strict] + size <= max(PRIVATE_BYTES, 4 * size)
 
     def send(self, pub_socket: PubSocket, body: memoryview) -> None:
@@ -42,14 +64,11 @@ class LargeSender:
         finally:
             if pub_socket.strict:
                 pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 1)
-        self._waiting.append(_Body(tracker, body.nbytes, pub_socket.strict))
+        self._waiting[pub_socket].append((tracker, body.nbytes))
         self.waiting_bytes[pub_socket.strict] += body.nbytes
 
     def prune(self) -> None:
         """Let go of what has been sent."""
-        for _ in range(len(self._waiting)):
-            body = self._waiting.popleft()
-            if body.tracker.done:
-                self.waiting_bytes[body.strict] -= body.size
-            else:
-                self._waiting.append(body)
+        for pub_socket, waiting in self._waiting.items():
+            while waiting and waiting[0][0].done:
+                self.waiting_bytes[pub_socket.strict] -= waiting.popleft()[1]

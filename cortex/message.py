@@ -182,8 +182,8 @@ def _hasten(cls: type[Any]) -> None:
         and len(fields) <= _HASTENED_FIELDS_MAX
     )
     if plain:
-        defaults = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
-        native.hasten(cls, tuple(field.name for field in fields), defaults)
+        names = tuple(sys.intern(field.name) for field in fields)
+        native.hasten(cls, names, tuple(field.default for field in fields), dataclasses.MISSING)
 
 
 def _plain_init(names: tuple[str, ...]) -> Callable[..., None]:

@@ -136,7 +136,7 @@ class Publisher(Generic[T]):
         with self._large_lock:
             with self._lock:
                 slot = self._acquire(prepared.size, now_ns, may_wait=True)
-            buffer = np.empty(prepared.size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+                buffer = self._memory(slot, prepared.size)
             prepared.write(buffer)
             with self._lock:
                 return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns)
@@ -148,6 +148,10 @@ class Publisher(Generic[T]):
         self._check_open()
         exact = self.codec.fixed_size is not None
         return self._fanout.ring.acquire(size, exact=exact, may_wait=may_wait)
+
+    def _memory(self, slot: Any, size: int) -> np.ndarray:
+        """Where a body is written: a slot, or else memory of its own. The lock is held."""
+        return self._fanout.large.acquire(size) if slot is None else np.frombuffer(slot, np.uint8)
 
     @contextmanager
     def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:
@@ -194,15 +198,17 @@ class Publisher(Generic[T]):
     ) -> Loan | None:
         size = self.codec.draft_size(dims, dtypes)
         slot = None
-        if size > self._inline_max:
+        if size <= self._inline_max:
+            buffer = np.empty(size, np.uint8)
+        else:
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
                 slot = self._acquire(size, now_ns, may_wait=may_wait)
                 if slot is None and self._fanout.ring.has_slots(size):
                     return None
+                buffer = self._memory(slot, size)
         self._check_open()
-        buffer = np.empty(size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
         draft = self.codec.draft(buffer, dims=dims, dtypes=dtypes)
         if slot is not None:
             slot.on_forgotten = self._warn_of_forgotten_loan
@@ -228,7 +234,7 @@ class Publisher(Generic[T]):
                 return self._publish_inline(buffer[:size].tobytes(), stamp_ns, now_ns)
             if slot is None or not slot.is_current:  # its ring was replaced by one of larger slots
                 slot, written = self._acquire(size, now_ns, may_wait=True), buffer
-                buffer = np.empty(size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+                buffer = self._memory(slot, size)
                 buffer[:size] = written[:size]
             return self._send_written(buffer, slot, size, stamp_ns, now_ns)
 
@@ -254,15 +260,16 @@ class Publisher(Generic[T]):
         if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
-        body = buffer[:size].data
+        body = buffer[:size]
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current
-            body = memoryview(body.tobytes() if wanted else b"")
+            body = self._memory(None, size)[:size] if wanted else body[:0]
+            np.copyto(body, buffer[: len(body)])
         sequence = self._fast_send.sequence
         self._fast_send.sequence += 1
         self._fast_send.bytes += size
         slot = slot if slot is not None and slot.is_current else None
-        return self._fanout.send_large(body, slot, sequence, stamp_ns, now_ns, size)
+        return self._fanout.send_large(body.data, slot, sequence, stamp_ns, now_ns, size)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send a small message; the lock is held."""

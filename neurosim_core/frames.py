@@ -12,9 +12,9 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.settings import Settings
 
@@ -38,13 +38,13 @@ class Mount(Settings):
     """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll). A camera
     with zeros looks forward; positive pitch looks down."""
 
-    def rotation(self) -> Rotation:
+    def rotation(self) -> scipy.spatial.transform.Rotation:
         """Return R_BS for a sensor with axes forward, left, up."""
-        return Rotation.from_euler("xyz", self.rpy_rad)
+        return scipy.spatial.transform.Rotation.from_euler("xyz", self.rpy_rad)
 
     def optical_quaternion(self) -> NDArray[np.float64]:
         """Return q_BC (xyzw, shape [4]) for a camera with optical axes right, down, forward."""
-        q_BC = self.rotation() * Rotation.from_quat(Q_FORWARD_OPTICAL)
+        q_BC = self.rotation() * scipy.spatial.transform.Rotation.from_quat(Q_FORWARD_OPTICAL)
         return np.asarray(q_BC.as_quat(), dtype=np.float64)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import math
+import os
 import signal
 from pathlib import Path
 
@@ -36,6 +38,17 @@ LONGEST = [Path(__file__).parent / name for name in (
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+WAITING = ("bridge", "cortex", "live")
+"""Folders whose tests mostly wait for other processes and for time to pass."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Let `-n auto` start half as many processes again as there are cores: some of them always wait."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return math.ceil(1.5 * cores)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Keep the order of the files; pytest-xdist would begin with those of the most tests."""
     if hasattr(config.option, "loadscopereorder"):
@@ -43,7 +56,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: LONGEST.index(item.path) if item.path in LONGEST else len(LONGEST))
+    """Begin with the longest files; then alternate between files that wait and files that compute."""
+    files = dict.fromkeys(item.path for item in items if item.path not in LONGEST)
+    kinds: tuple[list[Path], list[Path]] = ([], [])
+    for path in files:
+        kinds[path.parent.name in WAITING].append(path)
+    places = {path: place / len(kind) for kind in kinds for place, path in enumerate(kind)}
+    places |= {path: place - len(LONGEST) for place, path in enumerate(LONGEST)}
+    items.sort(key=lambda item: places[item.path])
 
 
 def pytest_collection_finish() -> None:

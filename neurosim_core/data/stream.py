@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.data.arguments import names_arguments
 from neurosim_core.data.batch import Batch, Sample, collate
 from neurosim_core.data.flights import RecordedFlight
 from neurosim_core.data.shards import ShardFlight
@@ -50,7 +49,6 @@ class Dataset:
         FileNotFoundError: There is no such file.
     """
 
-    @names_arguments
     def __init__(
         self,
         source: str | Path | Sequence[str | Path],
@@ -61,6 +59,8 @@ class Dataset:
         fields: Sequence[str] | None = None,
         sensors: Mapping[str, str] | None = None,
     ) -> None:
+        from neurosim_core.io.transfer import as_recording
+
         config = WindowConfig(
             window_s=window_s,
             stride_s=stride_s,
@@ -73,10 +73,9 @@ class Dataset:
             if path.suffix == ".tar":
                 self.flights.append(ShardFlight(path, config))
                 continue
-            recording, folder = _as_recording(path)
-            flight = RecordedFlight(recording, config, name=str(path))
-            if folder is not None:
-                weakref.finalize(flight, _remove, folder, os.getpid())
+            files = ExitStack()
+            flight = RecordedFlight(files.enter_context(as_recording(path)), config, name=str(path))
+            weakref.finalize(flight, _close, files, os.getpid())
             self.flights.append(flight)
         self._tell_missing(config)
         self._begins = np.concatenate([[0], np.cumsum([len(flight) for flight in self.flights])])
@@ -168,7 +167,6 @@ class Stream:
         ValueError: An argument is out of range, or goes with recordings only.
     """
 
-    @names_arguments
     def __init__(
         self,
         source: Any,
@@ -296,6 +294,8 @@ class Stream:
 def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Return the files of a source: of folders all recordings and event files below, in alphabetical order.
 
+    Texts in folders that tell no events, but poses say, are left out.
+
     Raises:
         FileNotFoundError: There is none.
     """
@@ -307,7 +307,7 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     if path.is_file() or (path.is_dir() and is_event_file(path)):
         return [path]
     files = (p for p in path.rglob("*") if p.name[0] != "." and p.exists())
-    hits = {p for p in files if p.suffix == ".tar" or is_event_file(p)}
+    hits = {p for p in files if p.suffix == ".tar" or (is_event_file(p) and not _is_other_text(p))}
     found = sorted(p for p in hits if p.parent not in hits)  # what is in a bag is the bag's
     if not found:
         raise FileNotFoundError(
@@ -316,21 +316,22 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     return found
 
 
-def _as_recording(path: Path) -> tuple[Path, tempfile.TemporaryDirectory[str] | None]:
-    """Return a recording; a copy in a new folder if the file is of another format."""
-    from neurosim_core.io.transfer import is_recording, transfer
+def _is_other_text(path: Path) -> bool:
+    from neurosim_core.io import FORMATS, EventFileError
+    from neurosim_core.io.csv import CsvSource
 
-    if is_recording(path):
-        return path, None
-    folder = tempfile.TemporaryDirectory(prefix="neurosim-")
-    copy = Path(folder.name) / "events.h5"
-    transfer(path, copy, from_zero=True)
-    return copy, folder
+    if path.suffix.lower() in FORMATS["csv"].suffixes:
+        try:
+            CsvSource(path)
+        except EventFileError as error:
+            _log.info("%s; it is left out", error)
+            return True
+    return False
 
 
-def _remove(folder: tempfile.TemporaryDirectory[str], pid: int) -> None:
+def _close(files: ExitStack, pid: int) -> None:
     if os.getpid() == pid:  # not in a worker that was forked
-        folder.cleanup()
+        files.close()
 
 
 def _sequential(source: Any) -> Any:

@@ -1,8 +1,8 @@
 """Events as text, one a line: `t,x,y,p`, t in whole microseconds.
 
 Other files are read too: columns separated by commas, blanks or semicolons; in the order of a header such as
-`x,y,polarity,timestamp`, else t, x, y, p; times with a decimal point are seconds; polarity may be -1 or 1; a
-first line `WIDTH HEIGHT`, or `%geometry:WIDTH,HEIGHT`, tells the sensor.
+`x,y,polarity,timestamp` or `t [us], x, y, p`, else t, x, y, p; times that are not whole are seconds; polarity
+may be -1 or 1; a first line `WIDTH HEIGHT`, or `%geometry:WIDTH,HEIGHT`, tells the sensor.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ _NAMES = {
     **dict.fromkeys(("p", "polarity", "on", "pol"), "p"),
 }
 _HEADER_LINES_MAX = 100
+_UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
 
 
 class CsvSource:
@@ -35,7 +37,8 @@ class CsvSource:
         self._path = path
         self.notes: list[str] = []
         self._columns: tuple[str, ...] = ("t", "x", "y", "p")
-        self._skip, self._delimiter, self._in_seconds = 0, ",", False
+        self._skip, self._delimiter = 0, ","
+        self._kind: type = np.int64  # read twice as fast as others
         self.size = self._read_header()
 
     def close(self) -> None:
@@ -43,10 +46,10 @@ class CsvSource:
 
     def _read_header(self) -> tuple[int, int] | None:
         size = None
-        with open(self._path, encoding="utf-8", errors="replace") as file:
+        with self._open() as file:
             for line in islice(file, _HEADER_LINES_MAX):
                 text = line.strip()
-                words = re.split(r"[,;\s]+", text.lstrip("%# "))
+                words = re.split(r"[,;\s]+", _UNIT.sub("", text).lstrip("%# "))
                 if geometry := re.search(r"geometry:?\s*(\d+)\D(\d+)", text):
                     size = int(geometry[1]), int(geometry[2])
                 elif len(words) >= 4 and {_NAMES.get(word.lower()) for word in words} >= {"t", "x", "y", "p"}:
@@ -54,56 +57,67 @@ class CsvSource:
                 elif len(words) == 2 and all(word.isdigit() for word in words) and not text.startswith("%"):
                     size = int(words[0]), int(words[1])
                 elif text and text[0] not in "%#":
-                    if len(words) < 4 or not re.fullmatch(r"[-+.\deE]+", words[0]):
-                        raise EventFileError(f"{self._path} is not a text of events: {text[:60]!r}")
                     self._delimiter = next((mark for mark in ",;" if mark in text), "")
-                    self._in_seconds = "." in words[self._columns.index("t")]
+                    self._kind = np.float64 if re.search(r"[.eE]", text) else np.int64
+                    try:
+                        events_of(0, *self._load([text])[0, 1:])
+                    except (ValueError, IndexError):
+                        raise EventFileError(f"{self._path} is not a text of events: {text[:60]!r}") from None
                     break
                 self._skip += 1
         return size
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        place = [self._columns.index(name) for name in ("t", "x", "y", "p")]
-        kind = np.float64 if self._in_seconds else np.int64
-        number = self._skip
-        with open(self._path, encoding="utf-8", errors="replace") as file:
+        number, in_seconds = self._skip, None
+        with self._open() as file:
             lines = islice(file, self._skip, None)
             while chunk := list(islice(lines, _BLOCK_LINES)):
-                rows = self._rows(chunk, number, kind, place)
+                t, *rest = self._rows(chunk, number).T
                 number += len(chunk)
-                if len(rows):
-                    yield self._events(rows, number)
+                if len(t):
+                    in_seconds = bool((t % 1.0).any()) if in_seconds is None else in_seconds
+                    try:
+                        events = events_of(np.rint(t * 1e6) if in_seconds else t, *rest)
+                    except ValueError as error:
+                        raise EventFileError(f"{self._path}, before line {number}: {error}") from None
+                    yield events
 
-    def _rows(self, chunk: list[str], number: int, kind: type, place: list[int]) -> NDArray[np.float64]:
-        last = chunk[-1]
+    def _open(self) -> TextIO:
+        return open(self._path, encoding="utf-8-sig", errors="replace")
+
+    def _rows(self, chunk: list[str], number: int) -> NDArray[np.float64]:
+        """Return t, x, y, p of lines; a last one that was cut off is left out, and noted."""
+        is_cut = not chunk[-1].endswith("\n")
         try:
-            rows = self._load(chunk, kind, place)
+            if is_cut and not self._is_whole(chunk[-1:]):
+                self.notes.append(f"{self._path} ends within a line: it was cut off")
+                chunk = chunk[:-1]
+            return self._load(chunk)
         except ValueError as error:
-            if last.endswith("\n"):
-                raise EventFileError(f"{self._path}, after line {number}: {error}") from None
-            rows, last = self._rows(chunk[:-1], number, kind, place) if chunk[1:] else np.zeros((0, 4)), "\n"
-            self.notes.append(f"{self._path} ends within a line: it was cut off")
-        if not last.endswith("\n") and len(rows):  # a number may be cut, and still be one
-            self.notes.append(f"{self._path} ends within a line: it was cut off")
-            rows = rows[:-1]
-        return rows
+            raise EventFileError(f"{self._path}, after line {number}: {error}") from None
 
-    def _load(self, chunk: list[str], kind: type, place: list[int]) -> NDArray[np.float64]:
+    def _is_whole(self, line: list[str]) -> bool:
+        """Whether a line without an end has all of an event: of numbers only a polarity cannot be cut."""
+        try:
+            rows = self._load(line)
+        except ValueError:
+            return False
+        return self._columns[-1] == "p" or not len(rows)
+
+    def _load(self, chunk: list[str]) -> NDArray[np.float64]:
+        place = [self._columns.index(name) for name in ("t", "x", "y", "p")]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a chunk without data
             rows: NDArray[np.float64] = np.loadtxt(
-                chunk, kind, comments=("#", "%"), delimiter=self._delimiter or None, usecols=place, ndmin=2
+                chunk,
+                self._kind,
+                comments=("#", "%"),
+                delimiter=self._delimiter or None,
+                usecols=place,
+                ndmin=2,
             )
-        return rows
-
-    def _events(self, rows: NDArray[np.float64], number: int) -> EventArrays:
-        t = np.rint(rows[:, 0] * 1e6) if self._in_seconds else rows[:, 0]
-        rest = rows[:, 1:].astype(np.int64)
-        rest[:, 2] = np.where(rest[:, 2] == -1, 0, rest[:, 2])
-        if not np.isfinite(t).all() or (rest < 0).any() or (rest > 0xFFFF).any() or (rest[:, 2] > 1).any():
-            raise EventFileError(f"{self._path}: an event before line {number} is impossible")
-        return events_of(t, *rest.T)
+        return rows.reshape(-1, 4)
 
 
 class CsvSink:

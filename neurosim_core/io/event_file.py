@@ -19,6 +19,9 @@ _HEADER_LINE_MAX = 4096
 _DISORDER_MAX_US = 10_000
 """Cameras send events of neighbouring rows slightly out of order; what comes later than this is damage."""
 
+_TIME_MAX_US = 1 << 53
+"""285 years; float64 holds all whole numbers up to it."""
+
 
 class EventFileError(ValueError):
     """A file is damaged or not of its format, or its format cannot hold some events."""
@@ -168,6 +171,10 @@ class BlockChecker:
                 f"{self._path}: event {self._count + first} is impossible on {self._width}x{self._height} "
                 f"pixels: column {x[first]}, row {y[first]}, polarity {polarity[first]}"
             )
+        if int(t.max()) > _TIME_MAX_US:
+            raise EventFileError(
+                f"{self._path}: times must be microseconds, got {int(t.max())}: nanoseconds?"
+            )
         late_us = np.maximum.accumulate(t) - t
         worst_us = max(int(late_us.max()), 0 if self._last_us is None else self._last_us - int(t.min()))
         crosses = self._last_us is not None and int(t.min()) < self._last_us
@@ -259,11 +266,23 @@ def _find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
 
 
 def events_of(t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike) -> EventArrays:
-    """Return columns in the types that events have."""
+    """Return columns in the types that events have; darker may be -1 as well as 0.
+
+    Raises:
+        ValueError: A number is none that its type has: it is negative, too large, or not whole.
+    """
+    signs = np.asarray(polarity)
+    if signs.dtype.kind in "if":
+        signs = np.where(signs == -1, 0, signs)
     kinds = (np.int64, np.uint16, np.uint16, np.uint8)
-    return EventArrays(
-        *(np.asarray(c).astype(kind, copy=False) for c, kind in zip((t, x, y, polarity), kinds, strict=True))
-    )
+    columns = []
+    for name, given, kind in zip(EventArrays._fields, (t, x, y, signs), kinds, strict=True):
+        values = np.asarray(given)
+        with np.errstate(invalid="ignore"):
+            columns.append(values.astype(kind, copy=False))
+        if not np.can_cast(values.dtype, kind) and (columns[-1] != values).any():
+            raise ValueError(f"an event has {name} = {values[np.argmax(columns[-1] != values)]}")
+    return EventArrays(*columns)
 
 
 def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:

@@ -1,7 +1,8 @@
 """Events in HDF5 files: recordings of Neurosim, files of DSEC, and any with the same four arrays.
 
 The group `events`, or `sensors/NAME/events` of a recording, holds t [us], x, y and p; `t_offset` beside it is
-added to t.
+added to t. Files of other names are read, too: ts, xs, ys and ps; records instead of columns; those of M3ED
+(`prophesee/left`) and Prophesee (`CD/events`). Times that are floating-point numbers are seconds.
 
 Reference: Gehrig et al. (2021), DSEC, https://dsec.ifi.uzh.ch/data-format.
 """
@@ -30,7 +31,8 @@ from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
 
-_NAMES = ("t", "x", "y", "p")
+_NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
+_PLACES = ("events", "prophesee/left", "CD/events")
 _SPAN_MAX_US = 30 * 24 * 3_600_000_000
 
 
@@ -94,30 +96,41 @@ class Hdf5Source:
             self._group = file[f"sensors/{sensor or described[0]}"]
             if not bool(file.attrs["clean"]):
                 self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
-        if "events" not in self._group or any(name not in self._group["events"] for name in _NAMES):
+        known = (self._group[place] for place in _PLACES if place in self._group)
+        fits = ((found, names) for found in known for names in _NAMES if {*names} <= _parts_of(found))
+        self._events: Any
+        self._names: tuple[str, ...]
+        self._events, self._names = next(fits, (None, ()))
+        if self._events is None:
             raise EventFileError(
                 f"{self._path} has no events/t, x, y and p; known HDF5 files: "
-                "recordings of Neurosim, DSEC, MVSEC"
+                "recordings of Neurosim, DSEC, MVSEC, M3ED, Prophesee"
             )
-        self._columns = [self._group["events"][name] for name in _NAMES]
-        self._count = min(len(column) for column in self._columns)
+        is_table = hasattr(self._events, "dtype")
+        counts = {len(self._events)} if is_table else {len(self._events[name]) for name in self._names}
+        self._count = min(counts)
         if "packet_count" in self._group:
             packets = int(self._group["packet_count"][()])
             self._count = int(self._group["event_end"][packets - 1]) if packets else 0
-        elif len({len(column) for column in self._columns}) > 1:
+        elif len(counts) > 1:
             raise EventFileError(f"{self._path}: events/t, x, y and p have different lengths")
-        offset = self._group.get("t_offset")
-        self._offset_us = 0 if offset is None else int(offset[()])
+        self._offset_us = int(np.asarray(self._group.get("t_offset", 0)).item())
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
         for begin in range(0, self._count, BLOCK_EVENTS):
             end = min(begin + BLOCK_EVENTS, self._count)
             with damage_of(self._path):
-                t, x, y, p = (read_rows(column, begin, end) for column in self._columns)
-            if len(t) != end - begin:
-                raise EventFileError(f"{self._path}: fewer events than its index says")
-            yield events_of(t + np.int64(self._offset_us), x, y, p)
+                if hasattr(self._events, "dtype"):
+                    rows = self._events[begin:end]
+                    t, x, y, p = (rows[name] for name in self._names)
+                else:
+                    t, x, y, p = (read_rows(self._events[name], begin, end) for name in self._names)
+                if len(t) != end - begin:
+                    raise EventFileError(f"{self._path}: fewer events than its index says")
+                t = np.rint(t * 1e6) if t.dtype.kind == "f" else t
+                block = events_of(t + np.int64(self._offset_us), x, y, p)
+            yield block
 
 
 class RecordingSink:
@@ -159,6 +172,11 @@ class RecordingSink:
         self._closed = True
         self._packets.end()
         self._writer.close()
+
+
+def _parts_of(found: Any) -> set[str]:
+    """Return the names of the columns of a group, or of a dataset of records."""
+    return {*(found if hasattr(found, "keys") else found.dtype.names or ())}
 
 
 def _class(recording: Recording, sensor: str) -> type[Packet]:

@@ -65,12 +65,9 @@ class MvsecSource:
         events = self._group.get("events")
         for begin in range(0, 0 if events is None else len(events), BLOCK_EVENTS):
             with damage_of(self._path):
-                rows = np.asarray(events[begin : begin + BLOCK_EVENTS], np.float64)
-            pixels = rows[:, :2]
-            if not np.isfinite(rows).all() or (pixels < 0).any() or (pixels > 0xFFFF).any():
-                raise EventFileError(f"{self._path}: an event after number {begin} is impossible")
-            x, y = pixels.T
-            yield events_of(np.rint(rows[:, 2] * 1e6), x, y, rows[:, 3] > 0)
+                x, y, t_s, polarity = np.asarray(events[begin : begin + BLOCK_EVENTS], np.float64).T
+                block = events_of(np.rint(t_s * 1e6), x, y, polarity > 0)
+            yield block
 
     def _rows(self, name: str) -> Iterator[Packet]:
         array = self._group[_ROWS[name]]

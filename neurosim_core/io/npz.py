@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,8 +16,6 @@ from neurosim_core.packets import EventArrays, join_events
 
 _OTHER_NAMES = {"t": ("ts", "timestamps"), "x": (), "y": (), "p": ("polarity",)}
 _NAMES = {"width", "height", *_OTHER_NAMES, *(other for others in _OTHER_NAMES.values() for other in others)}
-_DAMAGE = zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError, MemoryError
-"""What reading a damaged file raises."""
 
 
 class NpzSource:
@@ -38,7 +35,7 @@ class NpzSource:
                         found[member.removesuffix(".npy")] = np.lib.format.read_array(
                             file, allow_pickle=False
                         )
-        except _DAMAGE as error:
+        except Exception as error:  # what NumPy raises for damage is not listed anywhere
             raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         columns = []
         for name, others in _OTHER_NAMES.items():
@@ -50,8 +47,10 @@ class NpzSource:
         if len(shapes) > 1 or columns[0].ndim != 1 or any(c.dtype.kind not in "iub" for c in columns):
             kinds = ", ".join(f"{column.dtype} {column.shape}" for column in columns)
             raise EventFileError(f"{path}: t, x, y and p must be as long, and whole numbers: got {kinds}")
-        t, x, y, p = columns
-        self._events = events_of(t, x, y, np.where(p == -1, 0, p) if p.dtype.kind == "i" else p)
+        try:
+            self._events = events_of(*columns)
+        except ValueError as error:
+            raise EventFileError(f"{path}: {error}") from None
         known = [found[name] for name in ("width", "height") if name in found]
         sized = len(known) == 2 and all(array.size == 1 for array in known)
         self.size = (int(known[0].item()), int(known[1].item())) if sized else None

@@ -47,6 +47,9 @@ def add_parsers(commands: _Commands) -> None:
         "--seeds", type=int, default=1, metavar="N", help="train with N seeds from --seed on; with --ray"
     )
     learn.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes that train one policy; with --ray"
+    )
+    learn.add_argument(
         "--ray",
         metavar="ADDRESS",
         help="a Ray cluster (local, auto, host:port): one training for each of --seeds; depth, flow: the "
@@ -181,10 +184,10 @@ def _learn(arguments: argparse.Namespace) -> int:
 
         seeds = range(arguments.seed, arguments.seed + arguments.seeds)
         population = {f"seed-{seed}": dataclasses.replace(config, seed=seed) for seed in seeds}
-        train_population(folder, population, address=arguments.ray)
+        train_population(folder, population, address=arguments.ray, workers=arguments.workers)
         return 0
-    if arguments.seeds != 1:
-        raise ValueError("--seeds needs --ray: local, auto or host:port")
+    if arguments.seeds != 1 or arguments.workers != 1:
+        raise ValueError("--seeds and --workers need --ray: local, auto or host:port")
     if train(folder, config, resume=arguments.resume):
         print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
     return 0

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
 from neurosim_core.learn.descent import Descent, Replayed
 from neurosim_core.learn.env import Env
-from neurosim_core.learn.policies import EventPolicy
+from neurosim_core.learn.policies import make_event_policy
 from neurosim_core.learn.ppo import count_ended, shares
 from neurosim_core.learn.task import MIRROR_ACTION
 
@@ -69,18 +68,16 @@ class Dagger:
         self._generator = generator
         self._now, _ = env.reset()
         vector = env.group(self._now, "student")
-        _, channels, height, width = self._now["events"].shape
-        hints = self._now[env.task.hint].shape[1]
-        sizes: dict[str, Any] = {"hint_count": hints, "hidden": config.hidden, "widths": config.widths}
-        self.policy = EventPolicy(channels, height, width, vector.shape[1], **sizes).to(env.device)
-        if env.device.type == "cuda":
-            self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        hint = self._now[env.task.hint]
+        self.policy = make_event_policy(
+            self._now["events"], vector, hint, hidden=config.hidden, widths=config.widths
+        )
         self.descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
         self._pushed = torch.zeros((env.num_envs, 4), device=env.device)
         self._make_mirrors()
-        self._make_replay(vector.shape[1], hints)
+        self._make_replay(vector.shape[1], hint.shape[1])
 
     def begin(self, seed: int) -> None:
         """Begin anew in all worlds, at different times of their episodes, with nothing to learn from."""

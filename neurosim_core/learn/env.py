@@ -376,6 +376,8 @@ class Env:
 
     def _observations(self) -> Observations:
         seen = self.task.observe(self.view)
+        if self.view.surface is not None:
+            seen.setdefault("events", self.view.surface)
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
 
 

@@ -194,3 +194,23 @@ class EventPolicy(nn.Module):
             memories.append(memory)
         remembered = torch.stack(memories)
         return self.head(torch.cat([remembered, vectors], dim=2)), remembered[..., self.hidden :]
+
+
+def make_event_policy(
+    surface: torch.Tensor, vector: torch.Tensor, hint: torch.Tensor, *, hidden: int, widths: Sequence[int]
+) -> EventPolicy:
+    """Return a policy for what is seen in an environment, on its device.
+
+    Args:
+        surface: Event surfaces, [N, C, H, W].
+        vector: What is seen besides, [N, n].
+        hint: What is estimated, [N, h].
+        hidden: See `EventPolicy`.
+        widths: See `EventPolicy`.
+    """
+    _, channels, height, width = surface.shape
+    policy = EventPolicy(
+        channels, height, width, vector.shape[1], hint_count=hint.shape[1], hidden=hidden, widths=widths
+    )
+    policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return policy.to(surface.device)

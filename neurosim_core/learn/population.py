@@ -1,9 +1,11 @@
-"""Trainings that need nothing of each other, such as several seeds, on a cluster of Ray."""
+"""Trainings on a cluster of Ray: several seeds side by side, or one policy by several machines."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import socket
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +17,12 @@ from neurosim_core.render.launch import limit_cores
 
 
 def train_population(
-    folder: Path, configs: Mapping[str, TrainConfig], *, address: str = "auto", say: Say = print
+    folder: Path,
+    configs: Mapping[str, TrainConfig],
+    *,
+    address: str = "auto",
+    workers: int = 1,
+    say: Say = print,
 ) -> None:
     """Train with each of several settings, as many side by side as the cluster has GPUs, or cores, for.
 
@@ -24,8 +31,10 @@ def train_population(
 
     Args:
         folder: Of the runs: each in a folder there, of its name.
-        configs: By name. With a CUDA device a training takes a GPU, `cuda:0` to it; else a core.
+        configs: By name.
         address: See `data.ray_source.cluster`.
+        workers: Processes that train one policy, on any machines of the cluster, each with worlds of its own
+            (see `ranks`). With a CUDA device each takes a GPU, `cuda:0` to it; else a core.
         say: Told what comes of each.
 
     Raises:
@@ -37,12 +46,11 @@ def train_population(
         raise ValueError(f"{folder} holds the runs {', '.join(held)}: choose another folder")
     failures = []
     with cluster(address) as ray:
-        left = {}
+        left: dict[Any, str] = {}
+        groups = {}
         for name, config in configs.items():
-            gpus = int(is_for_cuda(config.device))
-            config = dataclasses.replace(config, device="cuda:0" if gpus else "cpu")
-            training = ray.remote(_train).options(num_cpus=1, num_gpus=gpus).remote(name, config)
-            left[training] = name
+            groups[name], trainings = _begin(ray, name, config, workers)
+            left |= dict.fromkeys(trainings, name)
         while left:
             (done,), _ = ray.wait([*left], num_returns=1)
             name = left.pop(done)
@@ -51,23 +59,56 @@ def train_population(
             except ray.exceptions.RayError as error:
                 failures.append(name)
                 say(f"{name} failed: {error}")
-                continue
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            for file, content in files.items():
-                (folder / name / file).write_bytes(content)
-            for tested, evaluation in found.items():
-                say(f"{name}: unseen scenes, {tested}: {evaluation}")
+                left = {training: other for training, other in left.items() if other != name}
+            else:
+                for file, content in files.items():
+                    (folder / name).mkdir(parents=True, exist_ok=True)
+                    (folder / name / file).write_bytes(content)
+                for tested, evaluation in found.items():
+                    say(f"{name}: unseen scenes, {tested}: {evaluation}")
+            if name not in left.values():
+                ray.util.remove_placement_group(groups.pop(name))  # ends its processes
     if failures:
         raise RuntimeError(f"these trainings failed: {', '.join(failures)}; what was printed says why")
 
 
-def _train(name: str, config: TrainConfig) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Train on a machine of the cluster; return the files of the run, and how its student does."""
-    if config.device == "cpu":
-        limit_cores(1)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary, name)
-        found = train(folder, config)
-        if config.wandb:
-            importlib.import_module("wandb").finish()  # the process may train the next one
-        return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}, found
+def _begin(ray: Any, name: str, config: TrainConfig, workers: int) -> tuple[Any, list[Any]]:
+    """Return what is reserved for a training, all of it or nothing, and what its workers will return."""
+    cuda = is_for_cuda(config.device)
+    config = dataclasses.replace(config, device="cuda:0" if cuda else "cpu")
+    needs = {"num_cpus": 1, "num_gpus": int(cuda)}
+    group = ray.util.placement_group([{"CPU": 1, **({"GPU": 1} if cuda else {})}] * workers)
+    placed = ray.util.scheduling_strategies.PlacementGroupSchedulingStrategy(group)
+    worker = ray.remote(_Worker).options(**needs, scheduling_strategy=placed)
+    started = [worker.remote() for _ in range(workers)]
+    meeting = started[0].free_port.remote()
+    return group, [
+        each.train.remote(name, config, rank, workers, meeting) for rank, each in enumerate(started)
+    ]
+
+
+class _Worker:
+    """A process on a machine of the cluster, which trains alone or with others."""
+
+    def free_port(self) -> tuple[str, int]:
+        """Return where others can meet this process."""
+        ray = importlib.import_module("ray")
+        with socket.socket() as found:
+            found.bind(("", 0))
+            return ray.util.get_node_ip_address(), found.getsockname()[1]
+
+    def train(
+        self, name: str, config: TrainConfig, rank: int, workers: int, meeting: tuple[str, int]
+    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """Train; return the files of the run, and how its student does: nothing, but of rank 0."""
+        if config.device == "cpu":
+            limit_cores(1)
+        host, port = meeting
+        who = {"RANK": rank, "LOCAL_RANK": 0, "WORLD_SIZE": workers, "MASTER_ADDR": host, "MASTER_PORT": port}
+        os.environ |= {key: str(value) for key, value in who.items()}
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary, name)
+            found = train(folder, config)
+            if config.wandb and rank == 0:
+                importlib.import_module("wandb").finish()
+            return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}, found

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import nn
 
 from neurosim_core.learn.descent import Descent, Replayed
 from neurosim_core.learn.env import Env
-from neurosim_core.learn.policies import Critic, EventPolicy
+from neurosim_core.learn.policies import Critic, EventPolicy, make_event_policy
 from neurosim_core.learn.ppo import (
     PpoConfig,
     add_advantages,
@@ -62,24 +61,22 @@ class RecurrentPpo:
         self._now, _ = env.reset()
         on_cuda = env.device.type == "cuda"
         vector, told = (env.group(self._now, name) for name in ("student", "critic"))
-        channels, height, width = shape = self._now["events"].shape[1:]
-        hints = self._now[env.task.hint].shape[1]
-        sizes: dict[str, Any] = {"hint_count": hints, "hidden": config.hidden, "widths": config.widths}
-        self.policy = EventPolicy(channels, height, width, vector.shape[1], **sizes)
+        surface, hint = self._now["events"], self._now[env.task.hint]
+        self.policy = make_event_policy(surface, vector, hint, hidden=config.hidden, widths=config.widths)
         last = self.policy.head[-1]
         assert isinstance(last, nn.Linear)
         nn.init.orthogonal_(last.weight, 0.05)  # at first it does next to nothing
         self._module = _EventActorCritic(self.policy, told.shape[1]).to(env.device)
-        if on_cuda:
-            self.policy.eyes.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.descent = Descent(self._module, self._loss, gradient_max=config.gradient_max, eps=1e-5)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
-        sizes = {"vector": vector.shape[1], "hint": hints, "critic": told.shape[1], "action": 4}
+        sizes = {"vector": vector.shape[1], "hint": hint.shape[1], "critic": told.shape[1], "action": 4}
         steps = (config.horizon, env.num_envs)
         self._kept = {name: torch.zeros((*steps, size), device=env.device) for name, size in sizes.items()}
         for name in ("begun", "log_p", "value", "reward", "done", "advantage", "return"):
             self._kept[name] = torch.zeros(steps, device=env.device)
-        self._kept["surface"] = torch.zeros((*steps, *shape), dtype=torch.float16, device=env.device)
+        self._kept["surface"] = torch.zeros(
+            (*steps, *surface.shape[1:]), dtype=torch.float16, device=env.device
+        )
         self._first_memory = torch.zeros_like(self._memory)
         self._seen = {
             name: torch.zeros_like(self._kept[name][0])

@@ -165,7 +165,7 @@ class Task:
         """Note that a step has been made; before rewards and observations are asked for."""
 
     def observe(self, view: View) -> Observations:
-        """Return what can be observed, by name."""
+        """Return what can be observed, by name; the event surfaces are added as `events`."""
         raise NotImplementedError
 
     def reward(self, view: View) -> torch.Tensor:

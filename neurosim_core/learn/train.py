@@ -9,7 +9,7 @@ what it would have done without the interruption, to the bit on a CPU.
 from __future__ import annotations
 
 import dataclasses
-import importlib
+import importlib.util
 import json
 import os
 import resource
@@ -126,6 +126,8 @@ class Training:
             self._trainers |= {"teacher": teacher, "student": student}
         else:
             self._trainers["student"] = RecurrentPpo(self.env, config.student, self._generator)
+        for trainer in self._trainers.values():  # kernels are compiled here, and not while training
+            trainer.env.step(torch.zeros((trainer.env.num_envs, trainer.env.action_count), device=device))
         self._done = dict.fromkeys(self._trainers, 0)
         folder.mkdir(parents=True, exist_ok=True)
         if ranks.rank() == 0:
@@ -373,6 +375,8 @@ def train(
     begin_s = time.monotonic()
     prepare_torch()
     config = dataclasses.replace(read_config(folder) if resume else config, device=ranks.join(config.device))
+    if config.wandb and importlib.util.find_spec("wandb") is None:
+        raise ImportError("--wandb needs the package wandb: pip install wandb")
     if ranks.rank() > 0:
         say = _say_nothing
     training = Training(folder, config, say=say)

@@ -24,7 +24,7 @@ Reference: Akeley (1993), RealityEngine graphics (multisampling); Aila, Laine (2
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from functools import cache
 from typing import Any
 
@@ -55,18 +55,21 @@ from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
+from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
 
 _CELLS = 4
 _SIDE = 4
 _LANES = _SIDE * _SIDE
 
 
-def _rays_through(lens: Lens, point: Any, sample_count: int, fill_factor: float) -> NDArray[np.float32]:
-    """Return rays through a point of the sensitive area of each pixel, shape [H * W, 4]."""
-    column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
+def _rays_through(
+    lens: Lens, points: Iterable[Any], sample_count: int, fill_factor: float
+) -> Iterator[NDArray[np.float32]]:
+    """Yield rays through points of the sensitive area of each pixel, shape [H, W, 4]."""
     spread = lens.ray_spread()[..., None] * np.float32(np.sqrt(fill_factor / sample_count))
-    return np.concatenate([lens.ray_table((column, row)), spread], axis=-1).reshape(-1, 4)
+    for point in points:
+        column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
+        yield np.concatenate([lens.ray_table((column, row)), spread], axis=-1)
 
 
 def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -86,7 +89,8 @@ def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArr
     if sample_count > 1:
         columns, rows = np.arange(sample_count), spread_order(sample_count)
         points += list(zip((columns + 0.5) / sample_count, (rows + 0.5) / sample_count, strict=True))
-    return np.stack([_rays_through(lens, point, sample_count, fill_factor) for point in points])
+    layers = np.stack(list(_rays_through(lens, points, sample_count, fill_factor)))
+    return layers.reshape(len(points), -1, 4)
 
 
 def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -95,12 +99,16 @@ def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     They go through the centres of 4 x 4 cells of the pixels. Four adjacent rows of a column use all columns
     of cells, and four adjacent columns of a row use all rows of cells.
     """
-    row, col = np.indices((lens.height, lens.width)).reshape(2, -1)
-    cell_column = (row + 2 * (col & 1) + ((col >> 1) & 1)) % _CELLS
-    cell_row = (col + 2 * (row & 1) + ((row >> 1) & 1)) % _CELLS
-    centres = (np.arange(_CELLS) + 0.5) / _CELLS
-    rays = np.stack([_rays_through(lens, (x, y), 1, fill_factor) for x in centres for y in centres])
-    return rays[_CELLS * cell_column + cell_row, np.arange(len(row))]
+    pixels = [(row, col) for row in range(_CELLS) for col in range(_CELLS)]  # the others repeat these
+    cells = [
+        ((row + 2 * (col & 1) + (col >> 1)) % _CELLS, (col + 2 * (row & 1) + (row >> 1)) % _CELLS)
+        for row, col in pixels
+    ]
+    rays = np.empty((lens.height, lens.width, 4), dtype=np.float32)
+    points = (np.array(cells) + 0.5) / _CELLS
+    for (row, col), through in zip(pixels, _rays_through(lens, points, 1, fill_factor), strict=True):
+        rays[row::_CELLS, col::_CELLS] = through[row::_CELLS, col::_CELLS]
+    return rays.reshape(-1, 4)
 
 
 def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -110,12 +118,9 @@ def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
         Direction in C and spread [rad]; difference of the directions at the right and the left border of the
         sensitive area, and of those at its lower and upper border; shape [3, H * W, 4].
     """
-    center = _rays_through(lens, (0.5, 0.5), 1, fill_factor)
-    right, left, lower, upper = (
-        _rays_through(lens, point, 1, fill_factor)
-        for point in ((1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
-    )
-    return np.stack([center, right - left, lower - upper])
+    points = ((0.5, 0.5), (1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
+    center, right, left, lower, upper = _rays_through(lens, points, 1, fill_factor)
+    return np.stack([center, right - left, lower - upper]).reshape(3, -1, 4)
 
 
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
@@ -153,6 +158,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
     cast_packet = packet_caster(terms.embree) if terms.embree else None
+    find_pose = pose_finder(terms)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
     def average_pixels(
@@ -179,8 +185,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
+        pose = find_pose(instant, 0, row * view.width + col, view)
+        origin = view.p_WC[pose]
+        q = view.q_WC[pose]
         pixel = place.first_ray + row * view.width + col
         center = wp.vec3(rays[0, pixel][0], rays[0, pixel][1], rays[0, pixel][2])
         across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
@@ -255,9 +262,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
                     hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
                 if wp.static(terms.bodies):
-                    hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
+                    hit, body = intersect_bodies(bodies, pose, direction_C, q, hit)
                 total += radiance_of(
-                    scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
+                    scene, bodies, pose, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
         write_radiance(scene, total / whole, instant, place.slot, row, col, out)
 
@@ -265,7 +272,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 @cache
-def _block_shader(*, textured: bool, emissive: bool) -> Any:
+def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
 
     Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
@@ -273,18 +280,15 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
 
     def shade_block(
         scene: SceneData,
+        view: ViewData,
         faces: wp.array3d[int],
         rays: wp.array2d[wp.vec4],
         first_pixel: int,
         instant: int,
         top: int,
         left: int,
-        height: int,
-        width: int,
         rows: int,
         columns: int,
-        origin: wp.vec3,
-        q_WC: wp.quat,
         radiance_out: wp.array[wp.vec3],
         unresolved_out: wp.array[int],
     ): ...
@@ -298,6 +302,7 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
         MOST=FACE_COUNT_MAX,
         TEXTURED=textured,
         EMISSIVE=emissive,
+        TIMED=timed,
         UNIT=True,
         LIGHT_WITHIN=True,
         SHARPNESS=round(100 * SHARPNESS),
@@ -310,8 +315,9 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
-    cast_packet = packet_caster(terms.embree)
-    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
+    cast_packet = packet_caster(terms.embree, origins=True)
+    find_pose = pose_finder(terms)
+    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
     shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -337,8 +343,6 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot < 0 and out.log_radiance.shape[0] == 0:
             return
         instant = place.instant
-        origin = view.p_WC[instant]
-        q = view.q_WC[instant]
         rows = wp.min(view.height - top, _SIDE)
         columns = wp.min(view.width - left, _SIDE)
         first_ray = place.first_ray + top * view.width + left
@@ -346,23 +350,21 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         unresolved_bits = wp.zeros(shape=(1,), dtype=int)
         shade_block(
             scene,
+            view,
             out.face,
             rays,
             first_ray,
             instant,
             top,
             left,
-            view.height,
-            view.width,
             rows,
             columns,
-            origin,
-            q,
             radiance,
             unresolved_bits,
         )
         unresolved = unresolved_bits[0]
         if unresolved != 0:
+            origins = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             ray = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             face = wp.zeros(shape=(_LANES,), dtype=int)
             t = wp.zeros(shape=(_LANES,), dtype=float)
@@ -380,10 +382,12 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
                             pixel = first_ray + y * view.width + x
                             sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                             toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                            ray[lane] = wp.quat_rotate(q, toward)
+                            pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
+                            origins[lane] = view.p_WC[pose]
+                            ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
                             spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
                 cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
+                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
                 )
                 shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
             for lane in range(_LANES):

@@ -36,7 +36,7 @@ from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, turn_count
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, tile_locator
+from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
@@ -105,24 +105,28 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
     ...
 
 
-@wp.func_native(read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
-def _cover_block(
-    scene: SceneData,
-    faces: wp.array3d[int],
-    instant: int,
-    top: int,
-    left: int,
-    height: int,
-    width: int,
-    alone: wp.bool,
-    outside: wp.bool,
-    origin: wp.vec3,
-    center: wp.vec3,
-    across: wp.vec3,
-    down: wp.vec3,
-) -> Coverage:
-    """Find what the points of the pixels of a block show; see the file."""
-    ...
+def _block_coverer(timed: bool) -> Any:
+    """Return the Warp function that finds what the points of the pixels of a block show; see the file."""
+    code = read_native(__file__, "cover_block", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX, TIMED=timed)
+
+    @wp.func_native(code)
+    def cover_block(
+        scene: SceneData,
+        faces: wp.array3d[int],
+        instant: int,
+        top: int,
+        left: int,
+        height: int,
+        width: int,
+        alone: wp.bool,
+        outside: wp.bool,
+        position: wp.vec3,
+        center: wp.vec3,
+        across: wp.vec3,
+        down: wp.vec3,
+    ) -> Coverage: ...
+
+    return cover_block
 
 
 @wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
@@ -267,6 +271,8 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     """Return the kernels; see `antialias.antialiasing_kernel`."""
     requested = requested_outputs(outputs)
     locate_pixel = _pixel_locator(terms, images=requested.images, instants=requested.log)
+    find_pose = pose_finder(terms)
+    cover_block = _block_coverer(terms.timed)
     radiance_of = pixel_shader(terms)
     shade_part = _part_shader(terms)
     write_radiance = radiance_writer(outputs, supersampled=False)
@@ -321,11 +327,12 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             radiance = scene.sky
             if kind != _SKY:
                 ray_C = rays[0, at.ray]
-                toward = wp.quat_rotate(view.q_WC[at.instant], _xyz(ray_C))
+                pose = find_pose(at.instant, 0, at.row * view.width + at.col, view)
+                toward = wp.quat_rotate(view.q_WC[pose], _xyz(ray_C))
                 radiance = shade_part(
                     scene,
                     out.face[at.instant, at.row, at.col],
-                    view.p_WC[at.instant],
+                    view.p_WC[pose],
                     toward,
                     SHARPNESS * ray_C[3],
                 )
@@ -363,16 +370,18 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]
             unwanted = at.outside or (alone and lane >= 16)
-            pixel = wp.where(at.outside, at.ray - (at.row - at.top) * view.width - at.col + at.left, at.ray)
+            back = wp.where(at.outside, (at.row - at.top) * view.width + at.col - at.left, 0)
+            pixel = at.ray - back
             part = int(-1)
             if not at.outside:
                 part = out.face[at.instant, at.row, at.col]
-            origin = view.p_WC[at.instant]
-            q = view.q_WC[at.instant]
+            pose = find_pose(at.instant, 0, at.row * view.width + at.col - back, view)
+            origin = view.p_WC[pose]
+            q = view.q_WC[pose]
             center = wp.quat_rotate(q, _xyz(rays[0, pixel]))
             across = wp.quat_rotate(q, _xyz(rays[1, pixel]))
             down = wp.quat_rotate(q, _xyz(rays[2, pixel]))
-            covered = _cover_block(
+            covered = cover_block(
                 scene,
                 out.face,
                 at.instant,
@@ -463,19 +472,20 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             light = wp.vec3(0.0)
             if wanted != 0:
                 point = ray_point(index % RAY_COUNT)
-                origin = view.p_WC[at.instant]
-                q = view.q_WC[at.instant]
+                pose = find_pose(at.instant, 0, at.row * view.width + at.col, view)
+                origin = view.p_WC[pose]
+                q = view.q_WC[pose]
                 toward_C = _xyz(rays[0, at.ray] + point[0] * rays[1, at.ray] + point[1] * rays[2, at.ray])
                 direction_C = wp.normalize(toward_C)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
                 if wp.static(terms.bodies):
-                    hit, body = intersect_bodies(bodies, at.instant, direction_C, q, hit)
+                    hit, body = intersect_bodies(bodies, pose, direction_C, q, hit)
                 light = radiance_of(
                     scene,
                     bodies,
-                    at.instant,
+                    pose,
                     body,
                     q,
                     direction,

@@ -10,8 +10,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
-from scipy.spatial import KDTree
 
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import (
@@ -94,7 +94,7 @@ def _make_table(data: Any, lens: RayTableConfig, device: Any) -> Any:
     x, y = np.meshgrid(a, a)
     size = np.hypot(x, y)
     scale = np.sin(size) / np.where(size > 0.0, size, 1.0)
-    _, nearest = KDTree(known).query(np.stack([x * scale, y * scale, np.cos(size)], axis=-1))
+    _, nearest = scipy.spatial.KDTree(known).query(np.stack([x * scale, y * scale, np.cos(size)], axis=-1))
     places = np.stack([col[nearest], row[nearest]], axis=-1) + 0.5
     data.table = wp.array(rays, dtype=wp.vec3d, device=device)
     data.guess = wp.array(places.astype(np.float32), dtype=wp.vec2, device=device)

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.install import install_hint
 from neurosim_core.render.body_arrays import join_bodies
@@ -120,7 +120,7 @@ def _body_mesh(
 ) -> Any:
     joined = join_bodies([body], material_count=0, instance_count=0)
     p_WO, q_WO = body_poses({body.name: body.config}, [0])
-    R_WO = Rotation.from_quat(q_WO[0, 0])
+    R_WO = scipy.spatial.transform.Rotation.from_quat(q_WO[0, 0])
     placed = replace(
         joined.mesh,
         vertices=(R_WO.apply(joined.mesh.vertices) + p_WO[0, 0]).astype(np.float32),
@@ -242,7 +242,7 @@ class PyrenderRenderer:
         active: Any = None,
     ) -> None:
         """Render those of the first `instant_count` poses that have an image slot; see `Renderer.render`."""
-        rotations = Rotation.from_quat(q_WC.numpy()[:instant_count]).as_matrix()
+        rotations = scipy.spatial.transform.Rotation.from_quat(q_WC.numpy()[:instant_count]).as_matrix()
         positions, slots = p_WC.numpy(), image_slot.numpy()
         for instant in range(instant_count):
             if slots[instant] < 0:
@@ -263,7 +263,7 @@ class PyrenderRenderer:
             self._scene.nodes.remove_node(node)
 
     def _place_bodies(self, p_WO: NDArray[np.float64], q_WO: NDArray[np.float64]) -> None:
-        rotations = Rotation.from_quat(q_WO).as_matrix()
+        rotations = scipy.spatial.transform.Rotation.from_quat(q_WO).as_matrix()
         for node, rotation, position in zip(self._scene.bodies, rotations, p_WO, strict=True):
             self._scene.nodes.set_pose(node, _matrix(rotation, position))
 

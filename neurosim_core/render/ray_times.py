@@ -83,7 +83,8 @@ class ShutterConfig(Settings):
     """How long a line gathers light [s]; 0: pictures without motion blur. Geometry (depth, normal, instance)
     is that of the middle of the exposure."""
     exposure_samples: Annotated[int, Field(ge=1, le=256)] = 16
-    """Instants of an exposure, each with a ray per pixel; at least `render.samples_per_pixel`."""
+    """Instants of an exposure, each with a ray per pixel; at least `render.samples_per_pixel`, 16 if it is
+    adaptive and there are several."""
 
     @property
     def window_ns(self) -> int:

@@ -9,10 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
@@ -300,8 +299,8 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     joined = (material[one // 3] == material[other // 3]) & (uv[one] == uv[other]).all(axis=(1, 2))
     joined &= np.einsum("ec,ec->e", normal[one // 3], normal[other // 3]) > _PLANE_COSINE
     pairs = (one[joined] // 3, other[joined] // 3)
-    graph = coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
-    return neighbor, connected_components(graph, directed=False)[1].astype(np.int32)
+    graph = scipy.sparse.coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
+    return neighbor, scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 def _areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:

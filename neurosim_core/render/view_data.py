@@ -1,4 +1,4 @@
-# mypy: disable-error-code="assignment,no-untyped-def,return-value"
+# mypy: disable-error-code="assignment,index,no-untyped-def,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """The camera of a launch: rays, poses and worlds, and the layout of tiles of 8 x 8 pixels."""
@@ -61,6 +61,23 @@ class WorldData:
     lens: wp.array[int]
     """With `RenderTerms.world_lenses`: index of the lens of each world, shape [world]; a layer of rays holds
     the lenses one after another."""
+
+
+@cache
+def pose_finder(terms: RenderTerms) -> wp.Function:
+    """Return the Warp function that finds the pose of a ray.
+
+    Its parameters: the row of the arrays of instants; the layer; the pixel of a lens; view.
+    """
+
+    @wp.func
+    def find_pose(instant: int, layer: int, pixel: int, view: ViewData) -> int:
+        pose = instant
+        if wp.static(terms.timed):
+            pose = instant * view.pose_count + view.pose[layer, pixel]
+        return pose
+
+    return find_pose
 
 
 @cache

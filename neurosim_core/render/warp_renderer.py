@@ -21,7 +21,6 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.candidate_data import TILE, CandidateListData
 from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
 from neurosim_core.render.config import CandidateListConfig
-from neurosim_core.render.coverage import SAMPLE_COUNT
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, make_render_outputs, requested_outputs
@@ -32,6 +31,8 @@ from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.view_data import WorldData, make_view
 from neurosim_core.scene.bodies import BodyPoses
 
+EXPOSURE_RAY_COUNT = 16
+"""Fewest rays of a pixel whose rays have several times, with adaptive antialiasing."""
 _THREAD_COUNT_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
 
@@ -59,10 +60,16 @@ class RenderWorlds:
 def ray_times_of(timing: RayTiming | None, lens: Lens, arrays: SceneArrays) -> RayTimes | None:
     """Return when the rays of a lens are cast, for `WarpRenderer`; None: all at the stamp.
 
-    Antialiasing cannot adapt to what moves within a picture: in its place there are SAMPLE_COUNT rays.
+    Adaptive antialiasing takes one time per pixel. Where a pixel has several, as in an exposure, there are at
+    least EXPOSURE_RAY_COUNT rays in its place.
     """
+    if timing is None:
+        return None
     wanted = arrays.config.samples_per_pixel
-    return None if timing is None else timing.times(lens, SAMPLE_COUNT if wanted == "adaptive" else wanted)
+    times = timing.times(lens, 1 if wanted == "adaptive" else wanted)
+    if wanted == "adaptive" and times is not None and times.sample_count > 1:
+        times = timing.times(lens, EXPOSURE_RAY_COUNT)
+    return times
 
 
 ONE_WORLD = RenderWorlds()
@@ -130,7 +137,7 @@ class WarpRenderer:
         device = arrays.device
         lenses = worlds.lenses or (lens,)
         adaptive = arrays.config.samples_per_pixel == "adaptive" and requested_outputs(outputs).radiance
-        adaptive = adaptive and times is None
+        adaptive = adaptive and (times is None or times.sample_count == 1)
         has_geometry = requested_outputs(outputs).geometry
         rays = np.concatenate([self._layers(each, adaptive, has_geometry) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
@@ -145,7 +152,8 @@ class WarpRenderer:
         self._pose_count = 1 if times is None else len(times.offsets_ns)
         if times is not None:
             self._view.pose_count = self._pose_count
-            self._view.pose = wp.array(times.instant, dtype=int, device=device)
+            pose = np.broadcast_to(times.instant, (len(rays), times.instant.shape[1]))
+            self._view.pose = wp.array(pose, dtype=int, device=device)
         rows = worlds.count * instant_count * self._pose_count
         self._body_data = make_body_data(arrays.bodies, rows, device)
         self._world_data = self._make_world_data()
@@ -258,7 +266,7 @@ class WarpRenderer:
     def _layers(self, lens: Lens, adaptive: bool, has_geometry: bool) -> NDArray[np.float32]:
         """Return the rays of the first pass: of one layer, or that of the centres first."""
         config = self._arrays.config
-        if self._times is not None:
+        if self._times is not None and not adaptive:
             return ray_layers(lens, self._times.sample_count, config.fill_factor)
         if config.samples_per_pixel != "adaptive":
             return ray_layers(lens, config.samples_per_pixel, config.fill_factor)

@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Vector3, quaternion_exp
 from neurosim_core.scene.body_shapes import BoxShape, ShapeConfig, Solid, SurfaceConfig, make_solid
@@ -187,7 +187,8 @@ def upload_motions(
 def _motion(config: MotionConfig) -> Motion:
     motion = Motion()
     motion.position = wp.vec3d(*config.position_m)
-    motion.orientation = wp.quatd(*Rotation.from_euler("xyz", config.rpy_rad).as_quat())
+    orientation = scipy.spatial.transform.Rotation.from_euler("xyz", config.rpy_rad)
+    motion.orientation = wp.quatd(*orientation.as_quat())
     motion.velocity = wp.vec3d(*config.velocity_m_s)
     motion.acceleration = wp.vec3d(*config.acceleration_m_s2)
     motion.spin = wp.vec3d(*config.spin_rad_s)

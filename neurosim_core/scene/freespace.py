@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy import ndimage
 
 from neurosim_core.frames import Vector3
 from neurosim_core.scene.scene import Scene
@@ -224,7 +224,7 @@ class FreeSpace:
         """
         rows = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         place = ((rows - self.origin_m) / self.voxel_m).T
-        grid = ndimage.map_coordinates(self.distance, place, order=1, mode="nearest", prefilter=False)
+        grid = scipy.ndimage.map_coordinates(self.distance, place, order=1, mode="nearest", prefilter=False)
         return np.minimum(grid.astype(np.float64), self._to_bounds(rows))
 
     def reachable(self, clearance_m: float) -> NDArray[np.bool_]:
@@ -256,7 +256,7 @@ class FreeSpace:
         voxel = self.voxel_of(point)
         where = "outside of the rooms"
         if (point >= self.bounds_m[0]).all() and (point <= self.bounds_m[1]).all():
-            labels, _ = ndimage.label(~self.occupied)
+            labels, _ = scipy.ndimage.label(~self.occupied)
             region = labels == labels[voxel]
             if self.occupied[voxel] or region[self.voxel_of(self.seed_m)]:
                 return
@@ -429,7 +429,7 @@ def _launch_fill(mesh: wp.Mesh, origin: Array, voxel: float, distance: Any) -> N
 
 def _find_seed(space: FreeSpace) -> _Seed:
     occupied = space.occupied
-    labels, count = ndimage.label(~occupied)
+    labels, count = scipy.ndimage.label(~occupied)
     if count == 0:
         raise ValueError(
             f"the scene has no free space at {space.voxel_m:g} m resolution; it measures "
@@ -469,13 +469,13 @@ def _reachable(space: FreeSpace, clearance_m: float) -> NDArray[np.bool_]:
     # D of the identity above for the longest step, a diagonal of length sqrt(3) voxel
     needed = math.sqrt(clearance_m**2 + 0.75 * space.voxel_m**2) * (1.0 + 1e-6)
     free = (room >= needed) & np.isfinite(space.height)
-    labels, count = ndimage.label(free)
+    labels, count = scipy.ndimage.label(free)
     if count == 0:
         return np.zeros_like(free)
     if free[seed]:
         return np.asarray(labels == labels[seed])
     # the seed is too near something: stay in the region that it belongs to at the least clearance
-    loose, _ = ndimage.label(~space.occupied & (room > 0.0))
+    loose, _ = scipy.ndimage.label(~space.occupied & (room > 0.0))
     if not loose[seed]:
         return np.zeros_like(free)
     sizes = np.bincount(labels[(loose == loose[seed]) & free], minlength=count + 1)

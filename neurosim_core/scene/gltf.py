@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
 from neurosim_core.scene.materials import srgb_to_linear
@@ -212,7 +212,7 @@ class _Reader:
         matrix = np.eye(4)
         rotation = np.asarray(node.get("rotation", [0, 0, 0, 1]), dtype=np.float64)
         if np.linalg.norm(rotation) > 0.0:
-            matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix()
+            matrix[:3, :3] = scipy.spatial.transform.Rotation.from_quat(rotation).as_matrix()
         matrix[:3, :3] *= np.asarray(node.get("scale", [1, 1, 1]), dtype=np.float64)
         matrix[:3, 3] = node.get("translation", [0, 0, 0])
         return matrix

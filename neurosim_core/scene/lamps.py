@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from neurosim_core.scene.scene import Light, LinearRgb
 
@@ -90,8 +90,9 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     full = np.zeros(shape, dtype=bool)
     full[tuple(index.T)] = True
     full[[0, -1]] = full[:, [0, -1]] = True  # nothing hangs outside
-    room = ndimage.distance_transform_edt(~full) * cell
-    width = ndimage.distance_transform_edt(~full, sampling=(1.0, 1.0, 4.0))  # counts walls, hardly the floor
+    room = scipy.ndimage.distance_transform_edt(~full) * cell
+    # counts walls, hardly the floor
+    width = scipy.ndimage.distance_transform_edt(~full, sampling=(1.0, 1.0, 4.0))
     floor = _gap(full) * cell
     standing = np.isfinite(floor) & (floor >= 1.2)
     how = "hung under the ceilings"
@@ -101,7 +102,7 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
         how = "hung inside at the height where a ceiling would be, for there is none"
         top = (shape[2] - 1 - np.arange(shape[2])) * cell
         places = standing & np.isinf(above) & (top >= 0.3) & (top <= 0.9) & (room >= 0.25)
-    air, _ = ndimage.label(room >= 1.5 * cell)
+    air, _ = scipy.ndimage.label(room >= 1.5 * cell)
     if not air[places].any():
         return _around(low, high), "placed above and around the scene, which has no room for them inside"
     free = air == np.bincount(air[places & (air > 0)]).argmax()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 CREASE_RAD = 0.7
 """Edges whose faces differ by more than this stay sharp [rad]; 40 degrees."""
@@ -61,8 +60,9 @@ def smooth_normals(
     same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
     joined_a = np.concatenate([first, head[first]])
     joined_b = np.concatenate([np.where(same, second, head[second]), np.where(same, head[second], second)])
-    links = coo_matrix((np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)), shape=(faces.size,) * 2)
-    count, label = connected_components(links, directed=False)
+    linked = np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)
+    links = scipy.sparse.coo_matrix(linked, shape=(faces.size,) * 2)
+    count, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     weighted = (angle[:, :, None] * face_normal[:, None, :]).reshape(-1, 3)
     total = np.empty((int(count), 3))
     for axis in range(3):

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import yaml
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Q_FORWARD_OPTICAL, Mount
 from neurosim_core.render.camera import PinholeConfig
@@ -61,7 +61,8 @@ def read_camchain(file: str | Path, *, imu: Mount | None = None) -> dict[str, di
             T_BC = T_BI @ np.linalg.inv(_matrix(camera["T_cam_imu"], f"{file}: {name}.T_cam_imu"))
         elif "T_cn_cnm1" in camera:
             T_BC = T_BC @ np.linalg.inv(_matrix(camera["T_cn_cnm1"], f"{file}: {name}.T_cn_cnm1"))
-        R_BS = Rotation.from_matrix(T_BC[:3, :3]) * Rotation.from_quat(Q_FORWARD_OPTICAL).inv()
+        rotations = scipy.spatial.transform.Rotation
+        R_BS = rotations.from_matrix(T_BC[:3, :3]) * rotations.from_quat(Q_FORWARD_OPTICAL).inv()
         cameras[name] = {
             "lens": _read_lens(camera, f"{file}: {name}"),
             "mount": {"position_m": T_BC[:3, 3].tolist(), "rpy_rad": R_BS.as_euler("xyz").tolist()},
@@ -144,7 +145,7 @@ def _write_lens(lens: Any, name: str) -> dict[str, Any]:
 
 def _pose(quaternion: Any, position: Any) -> NDArray[np.float64]:
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, :3] = scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = position
     return pose
 

@@ -10,7 +10,7 @@ from neurosim_core.sensors.base import ImageSensorConfig
 
 @register("sensor", "rgb")
 class RgbSensorConfig(ImageSensorConfig):
-    """A colour camera with an ideal global shutter; pictures are 8-bit sRGB, uint8 [H, W, 3]."""
+    """A colour camera without noise; pictures are 8-bit sRGB, uint8 [H, W, 3]."""
 
     kind: Literal["rgb"] = "rgb"
 

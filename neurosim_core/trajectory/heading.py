@@ -11,8 +11,6 @@ from __future__ import annotations
 import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.ndimage import gaussian_filter1d
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.trajectory.path import Path
@@ -65,7 +63,7 @@ def follow_travel(path: Path, *, lookahead_s: float, rate_max_rad_s: float) -> P
     heading = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
     target = np.interp(stamps_s, stamps_s[moving], heading)
     limited = _nearest_with_slope(target, rate_max_rad_s * _SAMPLE_NS / NS_PER_S)
-    smooth = gaussian_filter1d(limited, _SMOOTHING_S * NS_PER_S / _SAMPLE_NS, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(limited, _SMOOTHING_S * NS_PER_S / _SAMPLE_NS, mode="nearest")
 
     spline = scipy.interpolate.BSpline(clamped, np.interp(asked_s, stamps_s, smooth), _DEGREE)
     powers = np.asarray(scipy.interpolate.PPoly.from_spline(spline.tck).c)[::-1]  # of seconds since the knot
@@ -85,12 +83,12 @@ def _nearest_with_slope(values: Array, step_max: float) -> Array:
     band = np.full((2, count), -_PENALTY)  # I + penalty D^T D, D the differences of neighbours
     band[0] = 1.0 + 2.0 * _PENALTY
     band[0, [0, -1]] -= _PENALTY
-    factor = linalg.cholesky_banded(band, lower=True)
+    factor = scipy.linalg.cholesky_banded(band, lower=True)
     nearest = values
     steps, dual = np.clip(np.diff(values), -step_max, step_max), np.zeros(count - 1)
     for _ in range(_ITERATIONS):
         pull = np.diff(_PENALTY * (dual - steps), prepend=0.0, append=0.0)
-        nearest = np.asarray(linalg.cho_solve_banded((factor, True), values + pull, check_finite=False))
+        nearest = np.asarray(scipy.linalg.cho_solve_banded((factor, True), values + pull, check_finite=False))
         slope = np.diff(nearest) + dual
         steps = np.clip(slope, -step_max, step_max)
         dual = slope - steps

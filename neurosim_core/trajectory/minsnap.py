@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.trajectory.path import Path
@@ -125,7 +124,8 @@ def solve_minimum_snap(points: Array, durations_s: Array, rest: NDArray[np.bool_
         band[0, fixed] = 1.0
         right = right.reshape(3 * inner, axes)
         right[fixed] = 0.0
-        unknown = linalg.solveh_banded(band, right, lower=True, check_finite=False).reshape(inner, 3, axes)
+        unknown = scipy.linalg.solveh_banded(band, right, lower=True, check_finite=False)
+        unknown = unknown.reshape(inner, 3, axes)
 
     derivatives = np.zeros((count + 1, 4, axes))  # in units of scale_s
     derivatives[:, 0] = points

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import ndimage
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Vector3
@@ -228,7 +228,7 @@ def _entry(terrain: _Terrain, point: Array, *, leg: int, name: str) -> Voxel:
         if len(clear):
             return _voxel(around[clear[0]])
     room = float(space.clearance(point[None])[0])
-    _, nearest = ndimage.distance_transform_edt(~terrain.open, return_indices=True)
+    _, nearest = scipy.ndimage.distance_transform_edt(~terrain.open, return_indices=True)
     near = space.centers(np.array([n[space.voxel_of(point)] for n in nearest]))
     if room < 0.0:
         low, high = space.bounds_m

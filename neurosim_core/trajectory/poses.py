@@ -19,7 +19,6 @@ import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Q_FORWARD_OPTICAL, Vector3
@@ -105,7 +104,8 @@ def pose_path(config: PosesConfig) -> Path:
         ValueError: A file cannot be read, or a row is wrong; the message names file, row and value.
     """
     if config.keyframes is not None:
-        quaternions = Rotation.from_euler("xyz", [frame.rpy_rad for frame in config.keyframes]).as_quat()
+        rpy_rad = [frame.rpy_rad for frame in config.keyframes]
+        quaternions = scipy.spatial.transform.Rotation.from_euler("xyz", rpy_rad).as_quat()
         frames = zip(config.keyframes, quaternions, strict=True)
         where = "path.keyframes"
         table = np.array([[frame.time_s, *frame.position_m, *turn] for frame, turn in frames])
@@ -114,9 +114,9 @@ def pose_path(config: PosesConfig) -> Path:
         assert config.file is not None
         where = str(config.file)
         poses = read_poses(config.file, config.format, topic=config.topic)
-    orientation = Rotation.from_quat(poses.orientation)
+    orientation = scipy.spatial.transform.Rotation.from_quat(poses.orientation)
     if config.frame == "optical":
-        orientation = orientation * Rotation.from_quat(Q_FORWARD_OPTICAL).inv()
+        orientation = orientation * scipy.spatial.transform.Rotation.from_quat(Q_FORWARD_OPTICAL).inv()
     stamps_ns = poses.stamps_ns - round(config.start_s * NS_PER_S)
     if stamps_ns[-1] <= 0:
         raise ValueError(
@@ -261,7 +261,9 @@ def _check_poses(
     return Poses(stamps_ns[rows], p[rows], (q / length[:, None])[rows])
 
 
-def spline_path(stamps_ns: NDArray[np.int64], position: NDArray[np.float64], orientation: Rotation) -> Path:
+def spline_path(
+    stamps_ns: NDArray[np.int64], position: NDArray[np.float64], orientation: scipy.spatial.transform.Rotation
+) -> Path:
     """Return the path through poses, whose orientation is prescribed as well.
 
     Args:
@@ -273,7 +275,7 @@ def spline_path(stamps_ns: NDArray[np.int64], position: NDArray[np.float64], ori
     spans_s = np.diff(times_s)
     rising = spans_s[:, None, None] ** np.arange(4)
     place = _rising(scipy.interpolate.CubicSpline(times_s, position).c) * rising
-    rotation = _rising(RotationSpline(times_s, orientation).interpolator.c) * rising
+    rotation = _rising(scipy.spatial.transform.RotationSpline(times_s, orientation).interpolator.c) * rising
     forward = orientation.apply([1.0, 0.0, 0.0])
     yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
     heading = np.zeros((len(spans_s), 1, 4))

@@ -179,6 +179,81 @@ def test_texts_of_others(tmp_path):
     assert open_events(path).width == 346
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefft,x,y,p\r\n1,3,5,0\r\n2000003,4,6,1",  # of a spreadsheet, without an end of the last line
+        "t [us], x [px], y [px], p\n1,3,5,-1\n2000003,4,6,1\n",
+        "1.0,3.0,5.0,0\n2000003.0,4.0,6.0,1\n",
+        ",t,x,y,p\n0,1,3,5,0\n1,2000003,4,6,1\n",
+        "1;3;5;0;9\n\n2000003;4;6;1;9\n",
+    ],
+)
+def test_texts_of_other_programs(text, tmp_path):
+    (tmp_path / "events.csv").write_text(text, encoding="utf-8", newline="")
+    found = read(tmp_path / "events.csv")
+    assert [column.tolist() for column in found] == [[1, 2_000_003], [3, 4], [5, 6], [0, 1]]
+
+
+def test_a_text_that_was_cut_off(tmp_path):
+    """A number may be cut, and still be one: what ends with it is left out, and said."""
+    path, order = tmp_path / "events.csv", "x,y,p,t\n3,5,0,10\n"
+    for text in (f"{order}4,6,1,2000", "1,3,5,0\n2,4,6", "1,3,5,0\n2,4,6,-", "1,3,5,0\n2"):
+        path.write_text(text)
+        reader = open_events(path)
+        assert sum(len(block.t) for block in reader.blocks()) == 1
+        assert "cut off" in reader.notes[0]
+
+
+@pytest.mark.parametrize("line", ["1,-1,5,0", "1,3,65536,0", "1,3.5,5,0", "1,3,5,nan", "1e300,3,5,0"])
+def test_numbers_that_are_no_event(line, tmp_path):
+    path = tmp_path / "events.csv"
+    path.write_text(f"0.0,3,5,0\n{line}\n")
+    with pytest.raises(EventFileError, match="before line 2: an event has"):
+        read(path)
+    path.write_text(f"{line}\n")
+    with pytest.raises(EventFileError, match=r"is not a text of events|an event has t"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "layout",
+    ["events/t,x,y,p", "events/ts,xs,ys,ps", "prophesee/left/t,x,y,p", "records events", "records CD/events"],
+)
+def test_hdf5_of_other_programs(layout, tmp_path):
+    """Columns or records, under the names that there are; seconds, if times are floating-point numbers."""
+    events, path = draw(500, span_us=3_000_000), tmp_path / "events.h5"
+    signs = events.polarity.astype(np.int8) * 2 - 1
+    with h5py.File(path, "w") as file:
+        if layout.startswith("records"):
+            rows = np.empty(500, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+            rows["t"], rows["x"], rows["y"], rows["p"] = events
+            file[layout.split()[1]] = rows
+        else:
+            group, _, names = layout.rpartition("/")
+            t = events.t * 1e-6 if "ts" in names else events.t
+            for name, column in zip(names.split(","), (t, events.x, events.y, signs), strict=True):
+                file[f"{group}/{name}"] = column
+    assert same(read(path), events)
+
+
+def test_hdf5_that_tells_nothing(tmp_path):
+    path = tmp_path / "events.h5"
+    for name, value, words in (
+        ("events", np.zeros((9, 4)), "has no events/t"),
+        ("other", 1, "has no events/t"),
+    ):
+        with h5py.File(path, "w") as file:
+            file[name] = value
+        with pytest.raises(EventFileError, match=words):
+            open_events(path)
+    with h5py.File(path, "w") as file:
+        for name, value in (("t", 16 * 10**17), ("x", 3), ("y", 4), ("p", 1)):
+            file[f"events/{name}"] = np.array([value])
+    with pytest.raises(EventFileError, match="nanoseconds"):
+        read(path)
+
+
 def test_dsec(tmp_path):
     """uint32 times after t_offset, as DSEC has them."""
     events = draw(5000, span_us=3_000_000)

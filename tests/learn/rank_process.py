@@ -31,7 +31,9 @@ def train(folder: Path, model: ns.Model) -> dict[str, Any]:
     training = Training(folder, config, say=lambda line: None, models=[model])
     training.run()
     digests = [
-        hashlib.sha256(torch.nn.utils.parameters_to_vector(policy.parameters()).detach().numpy()).hexdigest()
+        hashlib.sha256(
+            torch.cat([each.detach().flatten() for each in policy.parameters()]).numpy()
+        ).hexdigest()
         for policy in (training.teacher, training.student)
         if policy is not None
     ]

@@ -1,10 +1,16 @@
-"""Several seeds on a cluster of Ray: each is what it is in this process, to the byte."""
+"""Trainings on a cluster of Ray: each is what it is without, to the byte."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import logging
+import os
+import subprocess
+import sys
 
 import pytest
+from processes import ROOT
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 pytest.importorskip("ray", reason="needs the extra distributed")
@@ -16,22 +22,32 @@ from neurosim_core.learn.population import train_population  # noqa: E402
 from neurosim_core.learn.ppo import PpoConfig  # noqa: E402
 from neurosim_core.learn.train import TrainConfig, train  # noqa: E402
 
+CONFIG = TrainConfig(
+    task="dodge",
+    device="cpu",
+    seed=3,
+    teacher=PpoConfig(worlds=4, iterations=1, horizon=4, minibatches=1),
+    student=DaggerConfig(worlds=4, iterations=1, horizon=4, updates=1, batch=4, widths=(4, 4, 4)),
+    pixels=8,
+    evaluation_worlds=2,
+)
+TRAIN_AS_CONFIGURED = """
+import sys
+from pathlib import Path
+from neurosim_core.learn.train import read_config, train
+folder = Path(sys.argv[1])
+train(folder, read_config(folder))
+"""
 
-def test_seeds_on_a_cluster_are_those_of_this_process(tmp_path, monkeypatch):
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch):
     logging.getLogger("ray").setLevel(logging.ERROR)
     monkeypatch.setenv("RAY_worker_niceness", "0")
-    configs = {
-        f"seed-{seed}": TrainConfig(
-            task="dodge",
-            device="cpu",
-            seed=seed,
-            teacher=PpoConfig(worlds=4, iterations=1, horizon=4, minibatches=1),
-            student=DaggerConfig(worlds=4, iterations=1, horizon=4, updates=1, batch=4, widths=(4, 4, 4)),
-            pixels=8,
-            evaluation_worlds=2,
-        )
-        for seed in (3, 4)
-    }
+
+
+def test_seeds_on_a_cluster_are_those_of_this_process(tmp_path):
+    configs = {f"seed-{seed}": dataclasses.replace(CONFIG, seed=seed) for seed in (3, 4)}
     said: list[str] = []
     train_population(tmp_path, configs, address="local", say=said.append)
     assert sorted(line.split(":")[0] for line in said) == ["seed-3", "seed-3", "seed-4", "seed-4"]
@@ -42,3 +58,29 @@ def test_seeds_on_a_cluster_are_those_of_this_process(tmp_path, monkeypatch):
     assert alike
     assert not other
     assert list((tmp_path / "seed-3").glob("events.out.tfevents.*"))
+
+
+def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path):
+    said: list[str] = []
+    train_population(tmp_path, {"both": CONFIG}, address="local", workers=2, say=said.append)
+    assert len(said) == 2
+    script, folder = tmp_path / "train.py", tmp_path / "torchrun"
+    script.write_text(TRAIN_AS_CONFIGURED)
+    folder.mkdir()
+    (folder / "run.json").write_text(json.dumps(dataclasses.asdict(CONFIG)))
+    subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+            *(str(script), str(folder)),
+        ],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=True,
+        capture_output=True,
+        timeout=900,
+    )
+    train(tmp_path / "alone", CONFIG, say=said.append)
+    both, other, alone = (
+        (tmp_path / run / "policy.onnx").read_bytes() for run in ("both", "torchrun", "alone")
+    )
+    assert both == other
+    assert both != alone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 import subprocess
@@ -34,6 +35,7 @@ from neurosim_core.learn.train import (  # noqa: E402
     evaluate_run,
     load_student,
     make_card,
+    train,
 )
 
 torch.set_num_threads(1)
@@ -278,6 +280,14 @@ def test_weights_and_biases_gets_what_tensorboard_does_if_asked_for(tmp_path, ha
     assert given["sync_tensorboard"] is True
     assert given["name"] == "with"
     assert given["config"]["teacher"]["worlds"] == 4
+
+
+def test_weights_and_biases_must_be_there_before_anything_is_set_up(tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "wandb" else find(name))
+    with pytest.raises(ImportError, match="--wandb needs the package wandb: pip install wandb"):
+        train(tmp_path / "run", small(wandb=True))
+    assert not (tmp_path / "run").exists()
 
 
 def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from render_scenes import LOOK_DOWN, scene_of, textured_plane
+from render_scenes import LOOK_DOWN, box, plane, scene_of, textured_plane
 from render_scenes import checkerboard as checker
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +15,16 @@ from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.ray_times import RayTimes, ShutterConfig
 from neurosim_core.render.renderer import make_renderer, upload_scene
+from neurosim_core.render.warp_renderer import ray_times_of
+from neurosim_core.scene.bodies import (
+    BodyConfig,
+    MotionConfig,
+    make_bodies,
+    make_body_poses,
+    pose_bodies,
+    upload_motions,
+)
+from neurosim_core.scene.body_shapes import BoxShape, PlainSurface
 from neurosim_core.scene.scene import Ambient, Material
 
 LENS = PinholeConfig(width=48, height=24, fx=60.0, fy=60.0, cx=24.0, cy=12.0)
@@ -34,20 +44,50 @@ def half_white() -> object:
     return scene_of(*parts, materials=materials, part_material=(0, 1), ambient=WHITE)
 
 
-def render(scene, times, positions, orientations, *, traversal="auto", samples=1):
+def boxes_above_a_floor() -> object:
+    rng = np.random.default_rng(3)
+    boxes = [
+        box(tuple(rng.uniform(0.05, 0.3, 3)), (*rng.uniform(-0.6, 0.6, 2), rng.uniform(0.1, 0.5)))
+        for _ in range(12)
+    ]
+    shades = rng.uniform(0.05, 1.0, 13)
+    return scene_of(
+        plane(8.0),
+        *boxes,
+        materials=tuple(Material(name=str(k), base_color=(x, x, x)) for k, x in enumerate(shades)),
+        part_material=tuple(range(13)),
+        ambient=WHITE,
+    )
+
+
+def render(
+    scene,
+    times,
+    positions,
+    orientations,
+    *,
+    traversal="auto",
+    samples=1,
+    device="cpu",
+    outputs=OUTPUTS,
+    bodies=(),
+    body_poses=None,
+    mode="unshadowed",
+):
     """Render all outputs of one instant whose rays have these poses, shape [J, ...]."""
     config = RenderConfig(
-        lighting=LightingConfig(mode="unshadowed"),
+        lighting=LightingConfig(mode=mode),
         exposure=1.0,
         samples_per_pixel=samples,
         cpu_traversal=traversal,
     )
-    arrays = upload_scene(scene, config, device="cpu")
-    renderer = make_renderer(arrays, LENS, outputs=OUTPUTS, instant_count=1, times=times)
-    p = wp.array(np.asarray(positions, np.float32), dtype=wp.vec3, device="cpu")
-    q = wp.array(np.asarray(orientations, np.float32), dtype=wp.quat, device="cpu")
-    renderer.render(p, q, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
-    return {name: getattr(renderer, name).numpy()[0].copy() for name in OUTPUTS}
+    arrays = upload_scene(scene, config, device=device, bodies=bodies)
+    renderer = make_renderer(arrays, LENS, outputs=outputs, instant_count=1, times=times)
+    p = wp.array(np.asarray(positions, np.float32), dtype=wp.vec3, device=device)
+    q = wp.array(np.asarray(orientations, np.float32), dtype=wp.quat, device=device)
+    slots = wp.zeros(1, dtype=int, device=device)
+    renderer.render(p, q, slots, instant_count=1, bodies=body_poses)
+    return {name: getattr(renderer, name).numpy()[0].copy() for name in outputs}
 
 
 @pytest.mark.parametrize("traversal", ["embree", "warp"])
@@ -63,11 +103,32 @@ def test_one_time_for_all_rays_gives_the_same_bytes(traversal, samples):
         assert own[name].tobytes() == one[name].tobytes(), name
 
 
-@pytest.mark.parametrize("traversal", ["embree", "warp"])
-def test_rolling_rows_shear_a_vertical_edge(traversal):
+@pytest.mark.parametrize("mode", ["baked", "unshadowed"])
+def test_one_time_for_all_rays_is_antialiased_to_the_same_bytes(device, mode):
+    pose = ([[0.05, 0.03, 1.6]], [Rotation.from_euler("xyz", [3.0, 0.2, 0.3]).as_quat()])
+    how = {"samples": "adaptive", "mode": mode, "device": device}
+    times = RayTimes(np.zeros(1, np.int64), np.zeros((1, 48 * 24), np.int32), 1)
+    own, one = (render(boxes_above_a_floor(), each, *pose, **how) for each in (times, None))
+    for name in OUTPUTS:
+        assert own[name].tobytes() == one[name].tobytes(), name
+
+
+def test_exposures_take_rays_in_place_of_adaptive_antialiasing():
+    arrays = upload_scene(
+        half_white(), RenderConfig(lighting=LightingConfig(mode="unshadowed")), device="cpu"
+    )
+    assert ray_times_of(ShutterConfig(readout_s=0.01), LENS, arrays).sample_count == 1
+    for count, rays in ((1, 1), (4, 16), (40, 40)):
+        shutter = ShutterConfig(readout_s=0.01, exposure_s=0.002, exposure_samples=count)
+        assert ray_times_of(shutter, LENS, arrays).sample_count == rays
+    assert ray_times_of(ShutterConfig(), LENS, arrays) is None
+
+
+@pytest.mark.parametrize(("traversal", "samples"), [("embree", 64), ("warp", 64), ("auto", "adaptive")])
+def test_rolling_rows_shear_a_vertical_edge(device, traversal, samples):
     """Turning at w about the picture's y axis, row r sees the edge at cx + f tan(w t_r): within 0.05 px."""
     rate_rad_s = 3.0
-    times = ShutterConfig(readout_s=0.03).times(LENS, 64)
+    times = ShutterConfig(readout_s=0.03).times(LENS, 1 if samples == "adaptive" else samples)
     assert len(times.offsets_ns) == 24
     assert times.offsets_ns[-1] == 0
     t_s = times.offsets_ns * 1e-9
@@ -78,8 +139,9 @@ def test_rolling_rows_shear_a_vertical_edge(traversal):
         times,
         positions,
         turn.as_quat(),
-        traversal=traversal,
-        samples=64,
+        traversal=traversal if device == "cpu" else "auto",
+        samples=samples,
+        device=device,
     )
     white = np.exp(picture["log_radiance"]) - 1e-3
     edge = 48.0 - white.sum(axis=1)  # the share of a row that is white is to the right of the edge
@@ -88,6 +150,52 @@ def test_rolling_rows_shear_a_vertical_edge(traversal):
     # of the 64 samples each column of a pixel has one: 1/128 px
     assert np.abs(edge - expected).max() < 0.05
     assert np.ptp(edge) > 4.0
+
+
+@pytest.mark.parametrize(
+    ("direction", "moving", "light"), [("down", False, "baked"), ("right", True, "unshadowed")]
+)
+def test_rolling_pixels_are_means_over_their_area(device, direction, moving, light):
+    """In a fast turn past boxes and a body: as close to 64 rays at the same times as a still camera is."""
+    scene = boxes_above_a_floor()
+    bodies = {
+        "crate": BodyConfig(
+            shape=BoxShape(size_m=(0.3, 0.3, 0.3)),
+            surface=PlainSurface(color=(1.0, 0.1, 0.1)),
+            motion=MotionConfig(position_m=(-0.5, 0.0, 0.6), velocity_m_s=(6.0, 0.0, 0.0)),
+        )
+    }
+    shutter = ShutterConfig(readout_s=0.03, direction=direction)
+
+    def radiance(samples, timing):
+        times = None if timing is None else timing.times(LENS, 1 if samples == "adaptive" else samples)
+        t_ns = np.zeros(1, np.int64) if times is None else times.offsets_ns
+        t_s = t_ns * 1e-9
+        turn = Rotation.from_rotvec(np.outer(2.0 * t_s, [0.3, 1.0, 0.5])) * Rotation.from_quat(LOOK_DOWN)
+        where = None
+        if moving:
+            where = make_body_poses(len(t_s), 1, device)
+            stamps = wp.array(100_000_000 + t_ns[:, None], dtype=wp.int64, device=device)
+            order = wp.array(np.arange(len(t_s)), dtype=int, device=device)
+            pose_bodies(upload_motions(bodies, device), stamps, order, count=len(t_s), poses=where)
+        return render(
+            scene,
+            times,
+            np.add([0.05, 0.03, 1.6], np.outer(t_s, [5.0, -3.0, 2.0])),
+            turn.as_quat(),
+            samples=samples,
+            device=device,
+            outputs=("radiance",),
+            bodies=make_bodies(bodies) if moving else (),
+            body_poses=where,
+            mode=light,
+        )["radiance"].astype(float)
+
+    def error(samples, timing):
+        return np.sqrt(np.mean((radiance(samples, timing) - radiance(64, timing)) ** 2))
+
+    assert error("adaptive", shutter) < 0.2 * error(1, shutter)
+    assert error("adaptive", shutter) < 1.5 * error("adaptive", None)
 
 
 def test_an_exposure_blurs_a_step_to_a_trapezium():

@@ -12,6 +12,7 @@ import torch
 from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
+from neurosim_core.learn.tasks.hall import hall_settings
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 
@@ -83,12 +84,12 @@ class Avoid(Task):
         torch.where(mask, distance, self._distance, out=self._distance)
 
     def observe(self, view: View) -> Observations:
-        """Return state (57), proprioception (17), room (18) and events (surfaces)."""
+        """Return state (57), proprioception (17) and room (18)."""
         goal = view.goal_B / view.goal_B.norm(dim=1, keepdim=True).clamp(min=1e-3)
         known = [0.3 * view.velocity_B, goal, 0.25 * self._speed[:, None], view.action]
         room = (view.probes.clamp(max=_FAR_M) / _FAR_M).unflatten(1, (len(_RANGES_M), -1))
         even, odd = (0.5 * (room + sign * room.flip(2))[:, 1:3] for sign in (1.0, -1.0))
-        seen = {
+        return {
             "state": torch.cat(
                 [view.gravity_B, 0.3 * view.body_rate, *known, view.last_action, room.flatten(1)], dim=1
             ),
@@ -97,9 +98,6 @@ class Avoid(Task):
             ),
             "room": torch.cat([even[:, :, :5].flatten(1), odd[:, :, :4].flatten(1)], dim=1),
         }
-        if view.surface is not None:
-            seen["events"] = view.surface
-        return seen
 
     def reward(self, view: View) -> torch.Tensor:
         """Pay for the speed towards the goal, up to what is asked; nearness to pillars costs something."""
@@ -126,18 +124,12 @@ class Avoid(Task):
 def _hall(seed: int) -> dict[str, Any]:
     """Return settings of a hall with pillars, from floor to ceiling, as far as they find room."""
     rng, places = np.random.default_rng(seed), np.empty((0, 2))
-    boxes: list[dict[str, Any]] = []
+    boxes: list[tuple[float, ...]] = []
     while len(boxes) < _PILLARS:
         place = rng.uniform((-16.0, -6.2), (19.0, 6.2))
         if len(places) and np.hypot(*(places - place).T).min() < _APART_M:
             continue
         places = np.concatenate([places, place[None]])
         width, depth = rng.uniform(0.4, 0.85, 2)
-        boxes.append(
-            {
-                "position_m": (*place.tolist(), 0.5 * _HALL_M[2]),
-                "size_m": (float(width), float(depth), _HALL_M[2]),
-                "yaw_rad": float(rng.uniform(0.0, math.pi)),
-            }
-        )
-    return {"kind": "hall", "size_m": _HALL_M, "boxes": boxes, "seed": seed, "inside_m": (-20.0, 0.0, 1.5)}
+        boxes.append((*place, 0.5 * _HALL_M[2], width, depth, _HALL_M[2], rng.uniform(0.0, math.pi)))
+    return hall_settings(_HALL_M, boxes, seed=seed, inside_m=(-20.0, 0.0, 1.5))

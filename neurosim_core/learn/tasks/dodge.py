@@ -11,6 +11,7 @@ import torch
 from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View, turn
+from neurosim_core.learn.tasks.hall import hall_settings
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
@@ -64,7 +65,7 @@ class Dodge(Task):
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
         """Return settings of an empty hall to train in, or of another."""
-        return [{"kind": "hall", "size_m": _HALL_M, "seed": 100 * unseen, "inside_m": (0.0, 0.0, 2.0)}]
+        return [hall_settings(_HALL_M, (), seed=100 * unseen, inside_m=(0.0, 0.0, 2.0))]
 
     def routes(self, scene: SceneConfig) -> Routes | None:
         """Return places in the middle of the hall: who begins there is to stay there."""
@@ -106,19 +107,16 @@ class Dodge(Task):
         self._before.copy_(now)
 
     def observe(self, view: View) -> Observations:
-        """Return state (26), proprioception (16), threat (3) and events (surfaces)."""
+        """Return state (26), proprioception (16) and threat (3)."""
         position, velocity = self._threat(view)
         known = [view.velocity_B, view.goal_B, view.action]
         told = [*known, view.gravity_B, 0.3 * view.body_rate, view.last_action]
         measured = [*known, view.gravity_measured, 0.3 * view.gyro]
-        seen = {
+        return {
             "state": torch.cat([*told, 0.3 * position, 0.1 * velocity], dim=1),
             "proprioception": torch.cat(measured, dim=1),
             "threat": 0.3 * position,
         }
-        if view.surface is not None:
-            seen["events"] = view.surface
-        return seen
 
     def reward(self, view: View) -> torch.Tensor:
         """Pay for being in its place; to be hit costs as much as a crash."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import TimeSurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View, turn
+from neurosim_core.learn.tasks.hall import hall_settings
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 
@@ -99,20 +100,17 @@ class Gates(Task):
         self._look(view)
 
     def observe(self, view: View) -> Observations:
-        """Return state (30), proprioception (13), next_gate (3) and events (surfaces)."""
+        """Return state (30), proprioception (13) and next_gate (3)."""
         ways = (self._offset, self._normal, *self._gate(view, 1))
         gate, normal, after, later = (turn(view.orientation, way, back=True) for way in ways)
         speed = view.velocity_B / _SPEED_M_S
         vectors = [speed, view.gravity_B, 0.3 * view.body_rate, view.action, view.last_action]
         thrust = 2.0 * view.draws[:, -1:] - 1.0  # that factor of the episode which a student has to find out
-        seen = {
+        return {
             "state": torch.cat([*vectors, thrust, 0.2 * gate, normal, 0.1 * after, later], dim=1),
             "proprioception": torch.cat([speed, view.gravity_measured, 0.3 * view.gyro, view.action], dim=1),
             "next_gate": 0.2 * gate,
         }
-        if view.surface is not None:
-            seen["events"] = view.surface
-        return seen
 
     def reward(self, view: View) -> torch.Tensor:
         """Pay for the speed towards the next gate, up to 8 m/s, and for gates that are passed."""
@@ -179,5 +177,5 @@ def _hall(seed: int) -> dict[str, Any]:
             ((0.0, 0.0, middle), (0.15, _OPENING_M, _BAR_M)),
             ((0.0, 0.0, -middle), (0.15, _OPENING_M, _BAR_M)),
         ):
-            boxes.append({"position_m": (gate + offset).tolist(), "size_m": size, "yaw_rad": float(yaw)})
-    return {"kind": "hall", "size_m": _HALL_M, "boxes": boxes, "seed": seed, "inside_m": (0.0, 0.0, 2.0)}
+            boxes.append((*(gate + offset), *size, yaw))
+    return hall_settings(_HALL_M, boxes, seed=seed, inside_m=(0.0, 0.0, 2.0))

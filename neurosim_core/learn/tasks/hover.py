@@ -67,8 +67,8 @@ class Hover(Task):
         self._best_s = torch.maximum(self._best_s, self._held_s)
 
     def observe(self, view: View) -> Observations:
-        """Return state (17), proprioception (10) and events (surfaces)."""
-        seen = {
+        """Return state (17), proprioception (10) and velocity (3)."""
+        return {
             "state": torch.cat(
                 [
                     view.velocity_B,
@@ -82,9 +82,6 @@ class Hover(Task):
             "proprioception": torch.cat([view.gravity_measured, 0.3 * view.gyro, view.action], dim=1),
             "velocity": view.velocity_B,
         }
-        if view.surface is not None:
-            seen["events"] = view.surface
-        return seen
 
     def reward(self, view: View) -> torch.Tensor:
         """Pay for slowness; tilt, rates and changes of the action cost something.

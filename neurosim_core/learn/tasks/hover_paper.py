@@ -37,12 +37,9 @@ class HoverPaper(Hover):
     }
 
     def observe(self, view: View) -> Observations:
-        """Return state (13: position, velocity, orientation, body rate) and events (surfaces)."""
+        """Return state (13: position, velocity, orientation, body rate)."""
         parts = [view.position, view.velocity, view.orientation, view.body_rate]
-        seen = {"state": torch.cat(parts, dim=1)}
-        if view.surface is not None:
-            seen["events"] = view.surface
-        return seen
+        return {"state": torch.cat(parts, dim=1)}
 
     def reward(self, view: View) -> torch.Tensor:
         """Return -2 |v| - 0.05 |w| - 0.01 |change of the action| + 0.5, and -500 at a crash."""

@@ -11,6 +11,7 @@ import torch
 
 from neurosim_core.learn.episodes import Randomisation, StartConfig
 from neurosim_core.learn.task import View
+from neurosim_core.learn.tasks.hall import hall_settings
 from neurosim_core.learn.tasks.hover import Hover
 from neurosim_core.registry import register
 
@@ -49,16 +50,10 @@ class ThrowRecover(Hover):
 def _hall(seed: int) -> dict[str, Any]:
     """Return settings of a high hall with boxes along its walls."""
     rng = np.random.default_rng(seed)
-    boxes: list[dict[str, Any]] = []
+    boxes = []
     for _ in range(_BOXES):
         angle = rng.uniform(-math.pi, math.pi)
         width, depth, height = rng.uniform((0.5, 0.5, 0.5), (1.5, 1.5, 4.0))
-        place = rng.uniform(5.5, 7.5) * np.array([math.cos(angle), math.sin(angle)])
-        boxes.append(
-            {
-                "position_m": (*place.tolist(), 0.5 * float(height)),
-                "size_m": (float(width), float(depth), float(height)),
-                "yaw_rad": float(rng.uniform(0.0, math.pi)),
-            }
-        )
-    return {"kind": "hall", "size_m": _HALL_M, "boxes": boxes, "seed": seed, "inside_m": (0.0, 0.0, 4.5)}
+        x, y = rng.uniform(5.5, 7.5) * np.array([math.cos(angle), math.sin(angle)])
+        boxes.append((x, y, 0.5 * height, width, depth, height, rng.uniform(0.0, math.pi)))
+    return hall_settings(_HALL_M, boxes, seed=seed, inside_m=(0.0, 0.0, 4.5))

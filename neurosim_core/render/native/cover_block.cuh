@@ -2,7 +2,8 @@
 // `cover_lanes.cuh` do on a CPU. A thread is a pixel in an instant; with one instant, `alone`, half of them are idle. Leaves
 // pairs of a thread and a surface that it shows in shared memory. Returns their number, -1: the instants show so many faces that
 // they have to be taken one by one; the first of the thread and how many; how many of its points show none, -1: it has to be
-// rendered by rays; whether the sky is behind; where the pairs are.
+// rendered by rays; whether the sky is behind; where the pairs are. `position` is where the camera sees the pixel from: with
+// TIMED each pixel has its own, else they share one.
 wp::vec_t<6, int> result;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
@@ -12,6 +13,12 @@ Block& block = blocks[threadIdx.x / 32 % 2];
 constexpr unsigned ALL = 0xffffffffu;
 const int lane = threadIdx.x % 32, pixel = lane % 16, half = alone ? 0 : lane / 16;
 const bool idle = alone && lane >= 16;
+wp::vec3 origin = position, shift; // where faces are prepared for, and from there to the position
+if constexpr (TIMED)
+    for (int axis = 0; axis < 3; ++axis) {
+        origin[axis] = __shfl_sync(0xffffffffu, position[axis], 16 * half);
+        shift[axis] = position[axis] - origin[axis];
+    }
 const unsigned below = (1u << lane) - 1u, ours = 0xffffu << (16 * half); // threads before; those of the instant
 const int room = alone ? MOST : MOST / 2, width_of_row = alone ? 16 : 32, base_of_faces = half * room;
 int *const seen = block.seen + base_of_faces, *const part_of = block.part + base_of_faces;
@@ -24,6 +31,7 @@ auto lowest = [](Entries entries) { return __ffsll(entries) - 1; };
 auto along = [](const Quad& function, const wp::vec3& toward) {
     return fmaf(function.x, toward[0], fmaf(function.y, toward[1], function.z * toward[2]));
 };
+auto distance = [&](const Quad& plane) { return TIMED ? 1.0f - along(plane, shift) : 1.0f; }; // by that from the origin
 // Bits of the points where a function, of which the value at the centre and the slopes are given, is negative.
 auto negative_at = [](float value, float slope_x, float slope_y) {
     float at[SAMPLES], step[SAMPLES]; // of the samples 1, 2, 4, ... from sample 0
@@ -98,13 +106,18 @@ for (int begin = 0; more;) {
         if (more) {
             const int at = 16 * half + turn;
             bool reached = !idle && (solids >> at) & 1u;
-            float value[3][3], cut_at[3];
+            float value[3][3], cut_at[3], along_shift[3];
 #pragma unroll
             for (int side = 0; side < 3; ++side) {
                 const Quad function = block.function[side][at];
                 value[side][0] = along(function, center);
                 value[side][1] = along(function, across);
                 value[side][2] = along(function, down);
+                if constexpr (TIMED) along_shift[side] = along(function, shift);
+            }
+            if constexpr (TIMED) shift_values([&](int side, int term) -> float& { return value[side][term]; }, along_shift);
+#pragma unroll
+            for (int side = 0; side < 3; ++side) {
                 const float extent = 0.5f * (wp::abs(value[side][1]) + wp::abs(value[side][2]));
                 reached &= value[side][0] + extent >= 0.0f;
                 cut_at[side] = value[side][0] - extent;
@@ -198,7 +211,9 @@ for (Entries rest = reaching; rest; rest &= rest - 1) { // which of several show
         const Quad against = plane_of[other];
         unsigned won = 0;
         if (__float_as_int(against.w) != __float_as_int(own.w)) {
-            const Quad behind = {fmaf(NEARER, against.x, -own.x), fmaf(NEARER, against.y, -own.y), fmaf(NEARER, against.z, -own.z), 0.0f};
+            const float other_share = NEARER * distance(own), share = distance(against);
+            const Quad behind = {fmaf(other_share, against.x, -share * own.x), fmaf(other_share, against.y, -share * own.y),
+                                 fmaf(other_share, against.z, -share * own.z), 0.0f};
             const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
             const float extent = 0.5f * (wp::abs(slope_x) + wp::abs(slope_y));
             won = middle < -extent ? contested : 0u;

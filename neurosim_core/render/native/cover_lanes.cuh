@@ -1,6 +1,6 @@
 // Finds what SAMPLES points of LANES pixels show of the faces in `seen`, and of their neighbours beyond edges that cross
 // the pixels. A pixel's directions are `ray`[0] + x `ray`[1] + y `ray`[2], each [3][LANES], with x and y in `points`.
-// Faces of one surface are taken together. For each of `layer_count` surfaces `number` [LANES] is how many points show it,
+// With TIMED each is seen from a position of its own, `shift` [3][LANES] away from `origin`. Faces of one surface are taken together. For each of `layer_count` surfaces `number` [LANES] is how many points show it,
 // and `middle` [2][LANES] their mean. Where the first rays hit one surface only, all points show it.
 constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon
 #include "edge_functions.cuh"
@@ -30,6 +30,7 @@ if (even) {
 #endif
     int layer_of[MOST], touching = 0;
     float plane[MOST][3]; // of touching faces: the nearness [1/m] along a direction is its product with this
+    alignas(64) float distance[TIMED ? MOST : 1][LANES]; // of their planes, by that from the origin
     alignas(64) unsigned shown[MOST][LANES]; // bits of the points that show it
     for (int entry = 0; entry < seen_count; ++entry) {
         const int face = seen[entry];
@@ -42,6 +43,14 @@ if (even) {
                 for (int lane = 0; lane < LANES; ++lane)
                     value[side][term][lane] = function[side][0] * ray[term][0][lane] + function[side][1] * ray[term][1][lane]
                                               + function[side][2] * ray[term][2][lane];
+        if constexpr (TIMED)
+            for (int lane = 0; lane < LANES; ++lane) {
+                float along_shift[3];
+                for (int side = 0; side < 3; ++side)
+                    along_shift[side] = function[side][0] * shift[0][lane] + function[side][1] * shift[1][lane]
+                                        + function[side][2] * shift[2][lane];
+                shift_values([&](int side, int term) -> float& { return value[side][term][lane]; }, along_shift);
+            }
         unsigned touched = 0, crossed[3] = {}; // bits of the lanes
         alignas(64) unsigned* inside = shown[touching];
         for (int lane = 0; lane < LANES; ++lane) {
@@ -91,6 +100,10 @@ if (even) {
         }
         for (int axis = 0; axis < 3; ++axis)
             plane[touching][axis] = function[0][axis] + function[1][axis] + function[2][axis];
+        if constexpr (TIMED)
+            for (int lane = 0; lane < LANES; ++lane)
+                distance[touching][lane] = 1.0f - (plane[touching][0] * shift[0][lane] + plane[touching][1] * shift[1][lane]
+                                                   + plane[touching][2] * shift[2][lane]);
         for (int other = 0; other < touching; ++other) { // which of two shows where both are
             if (layer_of[other] == layer) continue;
             alignas(64) unsigned contested[LANES], undecided[LANES];
@@ -98,11 +111,14 @@ if (even) {
             unsigned any = 0;
             for (int lane = 0; lane < LANES; ++lane) any |= contested[lane] = shown[other][lane] & inside[lane];
             if (!any) continue;
+            auto difference = [&](int axis, int lane) {
+                const float own = TIMED ? distance[other][lane] * plane[touching][axis] : plane[touching][axis];
+                return own - (TIMED ? NEARER * distance[touching][lane] : NEARER) * plane[other][axis];
+            };
             for (int term = 0; term < 3; ++term)
                 for (int lane = 0; lane < LANES; ++lane)
-                    nearer[term][lane] = (plane[touching][0] - NEARER * plane[other][0]) * ray[term][0][lane]
-                                         + (plane[touching][1] - NEARER * plane[other][1]) * ray[term][1][lane]
-                                         + (plane[touching][2] - NEARER * plane[other][2]) * ray[term][2][lane];
+                    nearer[term][lane] = difference(0, lane) * ray[term][0][lane] + difference(1, lane) * ray[term][1][lane]
+                                         + difference(2, lane) * ray[term][2][lane];
             any = 0;
             for (int lane = 0; lane < LANES; ++lane) {
                 const float half = 0.5f * (wp::abs(nearer[1][lane]) + wp::abs(nearer[2][lane]));
@@ -138,9 +154,9 @@ if (even) {
 }
 #include "nearest_part.cuh"
 // Returns the part of a layer to shade in a direction: the one that the pixel's own ray hit, if it is of this surface;
-// else one that another ray hit; else, of a face that none hit, the one in this direction.
-auto part_of = [&](int layer, int own, const wp::vec3& direction) {
+// else one that another ray hit; else, of a face that none hit, the one in this direction from the pixel's position.
+auto part_of = [&](int layer, int own, const wp::vec3& from, const wp::vec3& direction) {
     if (own >= 0 && scene.face_surface.data[own] == layer_surface[layer]) return own;
     if (layer_part[layer] >= 0) return layer_part[layer];
-    return nearest_part(-1 - layer_part[layer], direction);
+    return nearest_part(-1 - layer_part[layer], from, direction);
 };

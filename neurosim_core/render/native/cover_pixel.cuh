@@ -3,6 +3,8 @@ const int top = row / 4 * 4, left = col / 4 * 4;
 #include "list_seen_faces.cuh"
 if (!listed) return -1;
 constexpr int LANES = 1;
+constexpr bool TIMED = false; // `origin` is where the pixel is seen from
+const float shift[3][LANES] = {};
 #include "sample_points.cuh"
 const float ray[3][3][LANES] = {{{center[0]}, {center[1]}, {center[2]}},
                                 {{across[0]}, {across[1]}, {across[2]}},
@@ -13,7 +15,7 @@ int whole = 0, found = 0;
 for (int layer = 0; layer < layer_count; ++layer) {
     if (number[layer][0] == 0.0f) continue;
     const wp::vec3 toward = center + middle[0][layer][0] * across + middle[1][layer][0] * down;
-    const int part = part_of(layer, *wp::address(faces, instant, row, col), toward);
+    const int part = part_of(layer, *wp::address(faces, instant, row, col), origin, toward);
 #include "meet_plane.cuh"
     face_out.data[found] = part;
     number_out.data[found] = number[layer][0];

@@ -21,6 +21,15 @@ auto functions_of = [&](const wp::vec3& a, const wp::vec3& b, const wp::vec3& c,
         for (int axis = 0; axis < 3; ++axis) function[side][axis] = product(normals[side][axis], scale);
     return volume;
 };
+// Turns values of the three functions, value(side, term), into those seen from a position that is `shift` away: to each a part of
+// their sum is added, for the edges lie in the plane that the sum is the nearness of. `along_shift`: their values along `shift`.
+auto shift_values = [](auto value, const auto& along_shift) {
+    const float share = 1.0f / (1.0f - (along_shift[0] + along_shift[1] + along_shift[2]));
+    for (int term = 0; term < 3; ++term) {
+        const float sum = value(0, term) + value(1, term) + value(2, term);
+        for (int side = 0; side < 3; ++side) value(side, term) += share * along_shift[side] * sum;
+    }
+};
 // Whether the face beyond an edge does not lie on the same side of it as the face itself, as seen from `origin`.
 auto is_beyond = [&](int face, const auto& function) {
     float least = 0.0f, largest = 0.0f;

@@ -22,7 +22,7 @@ const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 #include "nearest_part.cuh"
 const int own = __shfl_sync(0xffffffffu, own_part, owner), hit = block.part[face];
 int part = own;
-if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[face].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, toward);
+if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[face].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, origin, toward);
 met[2] = __int_as_float(part);
 for (int axis = 0; axis < 3; ++axis) {
     met[3 + axis] = toward[axis];

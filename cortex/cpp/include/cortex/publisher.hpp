@@ -13,6 +13,7 @@
 #include <utility>
 
 #include "cortex/codec.hpp"
+#include "cortex/placer.hpp"
 #include "cortex/publisher_core.hpp"
 
 namespace cortex {
@@ -64,7 +65,7 @@ class Loan {
   Loan(std::shared_ptr<detail::PublisherCore> core, const Dimensions& dimensions, const Dtypes& dtypes)
       : core_(std::move(core)) {
     Placer measure({}, block_of<T>(), dimensions, dtypes);
-    Codec<T>::draft(measure, message_);
+    Codec<T>::fields(measure, 0, message_);
     tail_ = measure.size();
     const std::size_t size = tail_ + reserve;
     slot_ = size <= core_->inline_max() ? detail::private_slot(size) : core_->acquire(size, true);
@@ -73,7 +74,7 @@ class Loan {
       throw std::runtime_error("every slot is out on loan; publish or drop one first");
     }
     Placer place(slot_.buffer, block_of<T>(), dimensions, dtypes);
-    Codec<T>::draft(place, message_);
+    Codec<T>::fields(place, 0, message_);
   }
 
   std::shared_ptr<detail::PublisherCore> core_;

@@ -1,0 +1,24 @@
+"""Halls with boxes, in which tasks fly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+def hall_settings(
+    size_m: Sequence[float], boxes: Sequence[Sequence[float]], *, seed: int, inside_m: Sequence[float]
+) -> dict[str, Any]:
+    """Return settings of a hall as a scene.
+
+    Args:
+        size_m: Length, width and height [m].
+        boxes: Middle [m], size [m] and yaw [rad] of each, in W, [n, 7].
+        seed: Of its textures.
+        inside_m: A free point [m].
+    """
+    rows = np.asarray(boxes, dtype=np.float64).tolist()
+    settings = [{"position_m": row[:3], "size_m": row[3:6], "yaw_rad": row[6]} for row in rows]
+    return {"kind": "hall", "size_m": size_m, "boxes": settings, "seed": seed, "inside_m": inside_m}
