@@ -14,14 +14,19 @@ typedef struct {
     PyObject_HEAD
     vectorcallfunc vectorcall;
     Coder *coder;
-    PyObject *acquire, *release, *slowly, *retry, *again;
-    PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+    union {
+        struct {
+            PyObject *acquire, *release, *slowly, *retry, *again;
+            PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+            PyObject *ring;  /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
+            PyObject *prepare, *large_acquire, *large_release, *finish;
+        };
+        PyObject *held[11];
+    };
     Py_ssize_t limit;
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
-    PyObject *ring; /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
-    PyObject *prepare, *large_acquire, *large_release, *finish;
 } FastSend;
 
 PyDoc_STRVAR(fast_doc,
@@ -162,16 +167,6 @@ static int fast_lock_large(FastSend *fast) {
     return acquired == Py_True;
 }
 
-/* Give the lock of large messages back; keeps the error that is set, if one is. */
-static void fast_unlock_large(FastSend *fast) {
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->large_release);
-    if (released == NULL) PyErr_Clear(); /* it was ours */
-    Py_XDECREF(released);
-    PyErr_Restore(type, value, traceback);
-}
-
 /* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
 
    While much is copied others may have the lock: then that of large messages keeps other large ones away. */
@@ -181,7 +176,7 @@ static PyObject *fast_send_slot(FastSend *fast, PyObject *message, Py_ssize_t si
     PyObject *ring = Py_NewRef(fast->ring), *sent = NULL;
     if (!unlocked || fast_lock_large(fast)) {
         sent = fast_use_slot(fast, ring, message, size, unlocked, now_ns);
-        if (unlocked) fast_unlock_large(fast);
+        if (unlocked) give_back(fast->large_release);
     }
     Py_DECREF(ring);
     return sent;
@@ -215,22 +210,8 @@ static PyObject *fast_call(PyObject *self, PyObject *const *arguments, size_t fl
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
     PyObject *result = fast_send(fast, arguments[0]);
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->release);
-    if (released == NULL) {
-        Py_XDECREF(result);
-        Py_XDECREF(type);
-        Py_XDECREF(value);
-        Py_XDECREF(traceback);
-        return NULL;
-    }
-    Py_DECREF(released);
-    if (type != NULL) {
-        PyErr_Restore(type, value, traceback);
-        return NULL;
-    }
-    return result != NULL ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
+    give_back(fast->release);
+    return result != NULL || PyErr_Occurred() ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
 }
 
 PyDoc_STRVAR(fast_send_slot_doc,
@@ -280,33 +261,12 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
 
 static int fast_traverse(FastSend *fast, visitproc visit, void *arg) {
     Py_VISIT(fast->coder);
-    Py_VISIT(fast->acquire);
-    Py_VISIT(fast->release);
-    Py_VISIT(fast->slowly);
-    Py_VISIT(fast->retry);
-    Py_VISIT(fast->again);
-    Py_VISIT(fast->sends);
-    Py_VISIT(fast->ring);
-    Py_VISIT(fast->prepare);
-    Py_VISIT(fast->large_acquire);
-    Py_VISIT(fast->large_release);
-    Py_VISIT(fast->finish);
-    return 0;
+    return visit_held(fast->held, sizeof fast->held / sizeof *fast->held, visit, arg);
 }
 
 static int fast_clear(FastSend *fast) {
     Py_CLEAR(fast->coder);
-    Py_CLEAR(fast->acquire);
-    Py_CLEAR(fast->release);
-    Py_CLEAR(fast->slowly);
-    Py_CLEAR(fast->retry);
-    Py_CLEAR(fast->again);
-    Py_CLEAR(fast->sends);
-    Py_CLEAR(fast->ring);
-    Py_CLEAR(fast->prepare);
-    Py_CLEAR(fast->large_acquire);
-    Py_CLEAR(fast->large_release);
-    Py_CLEAR(fast->finish);
+    clear_held(fast->held, sizeof fast->held / sizeof *fast->held);
     return 0;
 }
 
