@@ -39,3 +39,13 @@ def hall(tmp_path_factory):
             }
         )
     )
+
+
+@pytest.fixture(scope="module")
+def env(request):
+    """The task that the module names, in the first of its scenes to test in: without a camera, on a CPU."""
+    from neurosim_core.learn.env import find_task
+
+    options = dict(request.module.ENV)
+    task = find_task(options.pop("task"))
+    return ns.learn.make_env(task, device="cpu", scenes=task.scenes(unseen=True)[:1], **options)
