@@ -14,14 +14,19 @@ typedef struct {
     PyObject_HEAD
     vectorcallfunc vectorcall;
     Coder *coder;
-    PyObject *acquire, *release, *slowly, *retry, *again;
-    PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+    union {
+        struct {
+            PyObject *acquire, *release, *slowly, *retry, *again;
+            PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+            PyObject *ring;  /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
+            PyObject *prepare, *large_acquire, *large_release, *finish;
+        };
+        PyObject *held[11];
+    };
     Py_ssize_t limit;
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
-    PyObject *ring; /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
-    PyObject *prepare, *large_acquire, *large_release, *finish;
 } FastSend;
 
 PyDoc_STRVAR(fast_doc,
@@ -68,6 +73,16 @@ static PyObject *fast_send_frame(FastSend *fast, PyObject *frame) {
     }
     Py_DECREF(sends);
     return on_time < 0 ? NULL : PyBool_FromLong(on_time);
+}
+
+/* Write a small message where the only reader is the ring; 0 if it has to be sent as bytes, or is not as usual. */
+static int fast_write_frame(FastSend *fast, PyObject *message, Py_ssize_t size, int64_t now_ns) {
+    if (PyTuple_GET_SIZE(fast->sends) != 1) return 0;
+    PyObject *send = PyTuple_GET_ITEM(fast->sends, 0);
+    char *place = broadcast_begin(send, HEADER_SIZE + size);
+    if (place == NULL || !write_frame(fast->coder, message, place, size, fast->sequence, now_ns)) return 0;
+    broadcast_finish(send, HEADER_SIZE + size);
+    return 1;
 }
 
 /* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
@@ -152,16 +167,6 @@ static int fast_lock_large(FastSend *fast) {
     return acquired == Py_True;
 }
 
-/* Give the lock of large messages back; keeps the error that is set, if one is. */
-static void fast_unlock_large(FastSend *fast) {
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->large_release);
-    if (released == NULL) PyErr_Clear(); /* it was ours */
-    Py_XDECREF(released);
-    PyErr_Restore(type, value, traceback);
-}
-
 /* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
 
    While much is copied others may have the lock: then that of large messages keeps other large ones away. */
@@ -171,7 +176,7 @@ static PyObject *fast_send_slot(FastSend *fast, PyObject *message, Py_ssize_t si
     PyObject *ring = Py_NewRef(fast->ring), *sent = NULL;
     if (!unlocked || fast_lock_large(fast)) {
         sent = fast_use_slot(fast, ring, message, size, unlocked, now_ns);
-        if (unlocked) fast_unlock_large(fast);
+        if (unlocked) give_back(fast->large_release);
     }
     Py_DECREF(ring);
     return sent;
@@ -185,12 +190,13 @@ static PyObject *fast_send(FastSend *fast, PyObject *message) {
     const Py_ssize_t size = measure_body(fast->coder, message);
     if (size < 0) return NULL;
     if (size > fast->limit) return fast_send_slot(fast, message, size, now_ns);
-    PyObject *frame = make_frame(fast->coder, message, size, fast->sequence, now_ns);
-    if (frame == NULL) return NULL;
+    PyObject *frame = NULL, *sent;
+    const int is_written = fast_write_frame(fast, message, size, now_ns);
+    if (!is_written && (frame = make_frame(fast->coder, message, size, fast->sequence, now_ns)) == NULL) return NULL;
     fast->sequence += 1;
     fast->bytes += size;
-    PyObject *sent = fast_send_frame(fast, frame);
-    Py_DECREF(frame);
+    sent = is_written ? Py_NewRef(Py_True) : fast_send_frame(fast, frame);
+    Py_XDECREF(frame);
     return sent;
 }
 
@@ -204,22 +210,8 @@ static PyObject *fast_call(PyObject *self, PyObject *const *arguments, size_t fl
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
     PyObject *result = fast_send(fast, arguments[0]);
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->release);
-    if (released == NULL) {
-        Py_XDECREF(result);
-        Py_XDECREF(type);
-        Py_XDECREF(value);
-        Py_XDECREF(traceback);
-        return NULL;
-    }
-    Py_DECREF(released);
-    if (type != NULL) {
-        PyErr_Restore(type, value, traceback);
-        return NULL;
-    }
-    return result != NULL ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
+    give_back(fast->release);
+    return result != NULL || PyErr_Occurred() ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
 }
 
 PyDoc_STRVAR(fast_send_slot_doc,
@@ -269,33 +261,12 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
 
 static int fast_traverse(FastSend *fast, visitproc visit, void *arg) {
     Py_VISIT(fast->coder);
-    Py_VISIT(fast->acquire);
-    Py_VISIT(fast->release);
-    Py_VISIT(fast->slowly);
-    Py_VISIT(fast->retry);
-    Py_VISIT(fast->again);
-    Py_VISIT(fast->sends);
-    Py_VISIT(fast->ring);
-    Py_VISIT(fast->prepare);
-    Py_VISIT(fast->large_acquire);
-    Py_VISIT(fast->large_release);
-    Py_VISIT(fast->finish);
-    return 0;
+    return visit_held(fast->held, sizeof fast->held / sizeof *fast->held, visit, arg);
 }
 
 static int fast_clear(FastSend *fast) {
     Py_CLEAR(fast->coder);
-    Py_CLEAR(fast->acquire);
-    Py_CLEAR(fast->release);
-    Py_CLEAR(fast->slowly);
-    Py_CLEAR(fast->retry);
-    Py_CLEAR(fast->again);
-    Py_CLEAR(fast->sends);
-    Py_CLEAR(fast->ring);
-    Py_CLEAR(fast->prepare);
-    Py_CLEAR(fast->large_acquire);
-    Py_CLEAR(fast->large_release);
-    Py_CLEAR(fast->finish);
+    clear_held(fast->held, sizeof fast->held / sizeof *fast->held);
     return 0;
 }
 

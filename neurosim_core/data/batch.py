@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -201,22 +201,6 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
-
-    def torch(self, device: Any = None) -> Batch:
-        """Return the batch with tensors of PyTorch in place of its arrays, except for raw events.
-
-        Args:
-            device: Where to, without waiting; None: they share memory with the arrays.
-        """
-        import torch
-
-        def convert(value: Any) -> Any:
-            if not isinstance(value, np.ndarray):
-                return value
-            tensor = torch.from_numpy(value)
-            return tensor if device is None else tensor.to(device, non_blocking=True)
-
-        return replace(self, **{field.name: convert(getattr(self, field.name)) for field in fields(self)})
 
 
 def collate(samples: Sequence[Sample]) -> Batch:

@@ -192,7 +192,7 @@ def _radial(power: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
     radius = np.hypot(np.fft.fftfreq(power.shape[0])[:, None], np.fft.rfftfreq(width)[None])
     count = max(4, min(power.shape[0], width) // 2)
     ring = np.minimum((radius * 2.0 * count).astype(int), count)
-    sums, sizes = np.bincount(ring.ravel(), power.ravel()), np.bincount(ring.ravel())
+    sums, sizes = (np.bincount(ring.ravel(), weights, count) for weights in (power.ravel(), None))
     mean = (sums / np.maximum(sizes, 1))[:count]
     return (np.arange(count) + 0.5) / (2.0 * count), mean / max(float(mean.sum()), 1e-30)
 

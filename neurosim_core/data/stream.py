@@ -294,6 +294,8 @@ class Stream:
 def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Return the files of a source: of folders all recordings and event files below, in alphabetical order.
 
+    Texts in folders that tell no events, but poses say, are left out.
+
     Raises:
         FileNotFoundError: There is none.
     """
@@ -305,13 +307,26 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     if path.is_file() or (path.is_dir() and is_event_file(path)):
         return [path]
     files = (p for p in path.rglob("*") if p.name[0] != "." and p.exists())
-    hits = {p for p in files if p.suffix == ".tar" or is_event_file(p)}
+    hits = {p for p in files if p.suffix == ".tar" or (is_event_file(p) and not _is_other_text(p))}
     found = sorted(p for p in hits if p.parent not in hits)  # what is in a bag is the bag's
     if not found:
         raise FileNotFoundError(
             f"{path} holds no recording" if path.is_dir() else f"no file or folder {path}"
         )
     return found
+
+
+def _is_other_text(path: Path) -> bool:
+    from neurosim_core.io import FORMATS, EventFileError
+    from neurosim_core.io.csv import CsvSource
+
+    if path.suffix.lower() in FORMATS["csv"].suffixes:
+        try:
+            CsvSource(path)
+        except EventFileError as error:
+            _log.info("%s; it is left out", error)
+            return True
+    return False
 
 
 def _close(files: ExitStack, pid: int) -> None:

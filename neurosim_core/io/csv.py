@@ -57,10 +57,12 @@ class CsvSource:
                 elif len(words) == 2 and all(word.isdigit() for word in words) and not text.startswith("%"):
                     size = int(words[0]), int(words[1])
                 elif text and text[0] not in "%#":
-                    if len(words) < 4 or not re.fullmatch(r"[-+.\deE]+", words[0]):
-                        raise EventFileError(f"{self._path} is not a text of events: {text[:60]!r}")
                     self._delimiter = next((mark for mark in ",;" if mark in text), "")
                     self._kind = np.float64 if re.search(r"[.eE]", text) else np.int64
+                    try:
+                        events_of(0, *self._load([text])[0, 1:])
+                    except (ValueError, IndexError):
+                        raise EventFileError(f"{self._path} is not a text of events: {text[:60]!r}") from None
                     break
                 self._skip += 1
         return size

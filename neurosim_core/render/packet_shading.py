@@ -66,7 +66,8 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
 
     The bits are those of `packet_caster`, `packet_shader` and the writer of each pixel; the hits are passed
     on in arrays by quantity, which are neither cleared nor transposed. Of several layers of rays the first is
-    left out, and the radiance is the mean of the others.
+    left out, and the radiance is the mean of the others; four layers of 2 x 2 pixels are a packet if their
+    number is a multiple of four, so the last bits may differ from those of packets of one layer.
 
     Its parameters: the scene; rays of pixels, as `ViewData` has them, contiguous; the first of the
     packet, and the columns of the picture; position and orientation of the camera; the distance beyond which

@@ -74,3 +74,16 @@ def test_the_page(tmp_path, capsys):
     picture = np.asarray(Image.open(tmp_path / "page.png").convert("L"))
     assert picture.shape == (900, 1400)
     assert (picture < 200).mean() > 0.02  # it is not empty
+
+
+def test_files_with_hardly_any_events(tmp_path):
+    """The smallest sensor that has their pixels has no frequencies to speak of."""
+    pytest.importorskip("matplotlib")
+    for name, text in (("none.csv", "t,x,y,p\n"), ("one.csv", "t,x,y,p\n5,0,0,1\n")):
+        (tmp_path / name).write_text(text)
+    # What else is in folders of others.
+    (tmp_path / "imu.txt").write_text("0.001 0.12 -9.8 0.3 0.01 0.0 0.2\n")
+    (tmp_path / "readme.txt").write_text("Events of a walk through the house.\n")
+    (tmp_path / "times.txt").write_text("1\n2\n")
+    assert cli.main(["compare", str(tmp_path), "--out", str(tmp_path / "page.png")]) == 0
+    assert measure_events(tmp_path / "one.csv").event_count == 1

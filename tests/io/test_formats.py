@@ -205,13 +205,15 @@ def test_a_text_that_was_cut_off(tmp_path):
         assert "cut off" in reader.notes[0]
 
 
-@pytest.mark.parametrize(
-    "text", ["1,-1,5,0\n", "1,3,65536,0\n", "1,3.5,5,0\n", "1.0,3,5,nan\n", "1e300,3,5,0\n"]
-)
-def test_numbers_that_are_no_event(text, tmp_path):
-    (tmp_path / "events.csv").write_text(text)
-    with pytest.raises(EventFileError, match=r"an event has|must be microseconds"):
-        read(tmp_path / "events.csv")
+@pytest.mark.parametrize("line", ["1,-1,5,0", "1,3,65536,0", "1,3.5,5,0", "1,3,5,nan", "1e300,3,5,0"])
+def test_numbers_that_are_no_event(line, tmp_path):
+    path = tmp_path / "events.csv"
+    path.write_text(f"0.0,3,5,0\n{line}\n")
+    with pytest.raises(EventFileError, match="before line 2: an event has"):
+        read(path)
+    path.write_text(f"{line}\n")
+    with pytest.raises(EventFileError, match=r"is not a text of events|an event has t"):
+        read(path)
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,7 @@ typedef struct {
     CortexPage *page;
     uint64_t tail; /* as last seen */
     uint64_t late_until;
+    uint32_t timeout_ms; /* longest time that it may hold up one message */
 } CortexMember;
 
 /* What the publisher knows of a slot. */
@@ -153,7 +154,7 @@ typedef struct {
 /* Processes: memory, sockets, bells. Each returns -1 with errno set if it fails, and where there is no memfd. */
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first); /* owns the hello */
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first); /* owns the hello */
 static inline void cortex_writer_remove(CortexWriter *writer, int member); /* its leases hold while its connection does */
 static inline void cortex_writer_forget(CortexWriter *writer, int member);
 static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, uint64_t slots, uint64_t slot_bytes);
@@ -230,21 +231,33 @@ static inline void cortex_member_give_up(const CortexWriter *writer, CortexMembe
     member->late_until = member->tail + (writer->head - member->tail + 1) / 2;
 }
 
-/* Write an entry for which there is room; where it ends. */
-static inline uint64_t cortex_ring_append(
-    CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, uint32_t what, const void *frame, size_t size) {
+/* Where the frame of the next entry is to be written, for which there is room. If it is not after all, nothing has happened:
+   `reserved` stays, as the bytes below it may have changed. */
+static inline uint8_t *cortex_ring_begin(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, size_t size) {
+    const uint64_t next = at + cortex_entry_bytes(size);
+    if (next > __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED)) __atomic_store_n(&ring->reserved, next, __ATOMIC_RELAXED);
+    __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
+    return data + (at & (capacity - 1)) + CORTEX_ENTRY_BYTES;
+}
+
+/* Make it readable; where it ends. */
+static inline uint64_t cortex_ring_finish(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, uint32_t what, size_t size) {
     const uint64_t next = at + cortex_entry_bytes(size), part = capacity / CORTEX_MARKS;
     const uint32_t entry[2] = {(uint32_t)size, what};
-    __atomic_store_n(&ring->reserved, next, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
-    uint8_t *place = data + (at & (capacity - 1));
-    memcpy(place, entry, sizeof entry);
-    if (size) memcpy(place + CORTEX_ENTRY_BYTES, frame, size);
+    memcpy(data + (at & (capacity - 1)), entry, sizeof entry);
     const uint64_t before = __atomic_load_n(&ring->last, __ATOMIC_RELAXED);
     if (before / part != at / part) __atomic_store_n(&ring->marks[at / part % CORTEX_MARKS], at, __ATOMIC_RELAXED);
     __atomic_store_n(&ring->last, at, __ATOMIC_RELAXED);
     __atomic_store_n(&ring->head, next, __ATOMIC_RELEASE);
     return next;
+}
+
+/* Write an entry for which there is room; where it ends. */
+static inline uint64_t cortex_ring_append(
+    CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, uint32_t what, const void *frame, size_t size) {
+    uint8_t *place = cortex_ring_begin(ring, data, capacity, at, size);
+    if (size) memcpy(place, frame, size);
+    return cortex_ring_finish(ring, data, capacity, at, what, size);
 }
 
 static inline void cortex_writer_append(CortexWriter *writer, const void *frame, size_t size) {
@@ -291,20 +304,35 @@ static inline void cortex_writer_tidy(CortexWriter *writer) {
     }
 }
 
-/* Send a frame to all readers. If all are late it is not written: what waits for them stays. With `mind`, somebody who is
-   late counts as having no room. */
-static inline int cortex_writer_put(CortexWriter *writer, const void *frame, size_t size, int mind) {
+/* Where a frame for all readers is to be written, in `place`, before `cortex_writer_finish`: NULL if nobody gets it. If all are
+   late it is not written: what waits for them stays. With `mind`, somebody who is late counts as having no room. */
+static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int mind, uint8_t **place) {
     const uint64_t bytes = cortex_entry_bytes(size) + CORTEX_SPARE_BYTES;
     int late = 0;
     const int some = cortex_writer_look(writer, &late);
+    *place = NULL;
     if (late && mind) return CORTEX_FULL;
     if (!some) return late ? CORTEX_LATE : CORTEX_WRITTEN;
     if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     for (int index = 0; index < writer->count; ++index)
         if (cortex_member_is_full(writer, &writer->members[index], bytes) && !cortex_writer_widen(writer)) return CORTEX_FULL;
-    cortex_writer_append(writer, frame, size);
-    cortex_writer_wake(writer);
+    *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size);
     return late ? CORTEX_LATE : CORTEX_WRITTEN;
+}
+
+static inline void cortex_writer_finish(CortexWriter *writer, size_t size) {
+    writer->head = cortex_ring_finish(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_FRAME, size);
+    cortex_writer_wake(writer);
+}
+
+/* Send a frame to all readers. */
+static inline int cortex_writer_put(CortexWriter *writer, const void *frame, size_t size, int mind) {
+    uint8_t *place;
+    const int found = cortex_writer_begin(writer, size, mind, &place);
+    if (place == NULL) return found;
+    memcpy(place, frame, size);
+    cortex_writer_finish(writer, size);
+    return found;
 }
 
 /* Send the last frame, for which there is room always; of at most 64 bytes. */
