@@ -114,7 +114,7 @@ def test_the_student_sees_neither_velocity_nor_position(make):
     env.reset(seed=1)
     env.view.velocity_B[:] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     env.view.gravity_measured[:], env.view.gyro[:] = 0.5, 0.25
-    seen = env.task.observe(env.view)
+    seen = env.task.observe(env.view) | {"events": env.view.surface}
     student = env.group(seen, "student")
     assert torch.equal(student[0], student[1])
     assert not torch.equal(*env.group(seen, "teacher"))
