@@ -49,3 +49,26 @@ def env(request):
     options = dict(request.module.ENV)
     task = find_task(options.pop("task"))
     return ns.learn.make_env(task, device="cpu", scenes=task.scenes(unseen=True)[:1], **options)
+
+
+@pytest.fixture
+def host_tensors():
+    """Return the function that counts how many tensors of numbers of the host another function makes.
+
+    On a CUDA device each is a copy that waits until all work there is done.
+    """
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Count(TorchDispatchMode):
+        made = 0
+
+        def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+            self.made += "lift_fresh" in str(operation)
+            return operation(*args, **(kwargs or {}))
+
+    def count(function) -> int:
+        with Count() as counted:
+            function()
+        return counted.made
+
+    return count
