@@ -162,7 +162,6 @@ class Env:
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
         self._thrown = torch.zeros((worlds, len(task.bodies), 6), dtype=torch.float64, device=self.device)
         self._status: torch.Tensor | None = None
-        self._dropped: torch.Tensor | None = None
         self._last_surface: torch.Tensor | None = None
         self._started = False
 
@@ -248,9 +247,7 @@ class Env:
         final = self._observations()
         info = {"final_obs": final, "metrics": task.metrics(view), "seed": self._seeds.clone()}
         if self._surface is not None:
-            if self._dropped is None:  # the same array in each step
-                self._dropped = wp.to_torch(observation.events[CAMERA].dropped)
-            info["dropped"] = self._dropped
+            info["dropped"] = wp.to_torch(observation.events[CAMERA].dropped)
         if self.device.type == "cpu" and not self._mask.any():
             return final, reward, terminated, truncated, info
         if "events" in final:

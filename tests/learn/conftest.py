@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from runtime_directory import runtime
 
 import neurosim_core as ns
@@ -52,12 +53,14 @@ def env(request):
 
 
 @pytest.fixture
-def host_tensors():
+def host_tensors(monkeypatch):
     """Return the function that counts how many tensors of numbers of the host another function makes.
 
-    On a CUDA device each is a copy that waits until all work there is done.
+    On a CUDA device each is a copy that waits until all work there is done. Views of Warp's arrays are none.
     """
-    from torch.utils._python_dispatch import TorchDispatchMode
+    from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+    to_torch = wp.to_torch
 
     class Count(TorchDispatchMode):
         made = 0
@@ -66,7 +69,12 @@ def host_tensors():
             self.made += "lift_fresh" in str(operation)
             return operation(*args, **(kwargs or {}))
 
+    def view(array):
+        with _disable_current_modes():
+            return to_torch(array)
+
     def count(function) -> int:
+        monkeypatch.setattr(wp, "to_torch", view)
         with Count() as counted:
             function()
         return counted.made

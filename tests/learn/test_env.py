@@ -114,7 +114,6 @@ def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors)
     env = make(randomise=drawn)
     env.reset(seed=1)
     actions = torch.zeros((3, 4))
-    env.step(actions)  # the first makes views of arrays that are the same from then on
 
     def step_and_end() -> None:
         env.episode_length.fill_(env.episode_steps - 1)
