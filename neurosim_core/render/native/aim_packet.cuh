@@ -1,5 +1,5 @@
 // Rays in W of SIDE x SIDE pixels from `first_pixel` on: `ray` [3][N] and `spread` [N]; zero where the picture ends. Of lane k
-// `pixel_of`(k) is the place in the square, and `layer_of`(k) the layer.
+// `pixel_of`(k) is the place in the square, and `layer_of`(k) the layer; `turn`(k, x, y, z) takes a direction to W.
 alignas(64) float ray[3][N], spread[N];
 const bool all = columns == SIDE && rows == SIDE;
 for (int lane = 0; lane < N; ++lane) {
@@ -10,6 +10,6 @@ for (int lane = 0; lane < N; ++lane) {
     spread[lane] = inside ? pixel[3] : 0.0f;
 }
 for (int lane = 0; lane < N; ++lane) {
-    const wp::vec3 turned = wp::quat_rotate(q_WC, wp::vec3(ray[0][lane], ray[1][lane], ray[2][lane]));
+    const wp::vec3 turned = turn(lane, ray[0][lane], ray[1][lane], ray[2][lane]);
     for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = turned[axis];
 }

@@ -1,4 +1,5 @@
 auto origin_of = [&](int axis, int) { return origin[axis]; };
+auto turn = [&](int, float x, float y, float z) { return wp::quat_rotate(q_WC, wp::vec3(x, y, z)); };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
 alignas(64) float total[3][N] = {};
 const int layers = rays.shape[0];
