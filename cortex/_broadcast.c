@@ -59,29 +59,21 @@ static int cast_is_open(const Broadcast *cast) {
 static PyObject *cast_add(Broadcast *cast, PyObject *arguments) {
     CortexHello hello = {0};
     int strict;
+    unsigned int timeout_ms;
     unsigned long long first;
-    if (!PyArg_ParseTuple(arguments, "iiipK:add", &hello.socket, &hello.page, &hello.bell, &strict, &first)
+    if (!PyArg_ParseTuple(arguments, "iiipIK:add", &hello.socket, &hello.page, &hello.bell, &strict, &timeout_ms, &first)
         || !cast_is_open(cast))
         return NULL;
-    const int member = cortex_writer_add(&cast->writer, &hello, strict, first);
+    const int member = cortex_writer_add(&cast->writer, &hello, strict, timeout_ms, first);
     return member < 0 ? PyErr_SetFromErrno(PyExc_OSError) : PyLong_FromLong(member);
 }
 
-/* A member by its number; NULL with an error set if there is no such. */
-static CortexMember *cast_member(Broadcast *cast, PyObject *number) {
-    const long member = PyLong_AsLong(number);
-    if (member == -1 && PyErr_Occurred()) return NULL;
-    if (!cast_is_open(cast)) return NULL;
-    if (member >= 0 && member < cast->writer.count && cast->writer.members[member].used && !cast->writer.members[member].left)
-        return &cast->writer.members[member];
-    PyErr_Format(PyExc_IndexError, "no member %ld", member);
-    return NULL;
-}
-
 static PyObject *cast_remove(Broadcast *cast, PyObject *number) {
-    CortexMember *member = cast_member(cast, number);
-    if (member == NULL) return NULL;
-    cortex_writer_remove(&cast->writer, (int)(member - cast->writer.members));
+    const long member = PyLong_AsLong(number);
+    if ((member == -1 && PyErr_Occurred()) || !cast_is_open(cast)) return NULL;
+    if (member < 0 || member >= cast->writer.count || !cast->writer.members[member].used || cast->writer.members[member].left)
+        return PyErr_Format(PyExc_IndexError, "no member %ld", member);
+    cortex_writer_remove(&cast->writer, (int)member);
     Py_RETURN_NONE;
 }
 
@@ -97,12 +89,28 @@ static PyObject *cast_send(Broadcast *cast, PyObject *const *arguments, Py_ssize
     return NULL;
 }
 
-int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size) {
-    if (!PyCFunction_CheckExact(send)) return -1;
+/* The ring whose `send` this is; NULL if it is something else, or closed. */
+static CortexWriter *writer_of(PyObject *send) {
+    if (!PyCFunction_CheckExact(send)) return NULL;
     PyObject *self = PyCFunction_GET_SELF(send);
-    if (self == NULL || !Py_IS_TYPE(self, &BroadcastType) || !((Broadcast *)self)->open) return -1;
-    return cortex_writer_put(&((Broadcast *)self)->writer, frame, (size_t)size, 1);
+    return self != NULL && Py_IS_TYPE(self, &BroadcastType) && ((Broadcast *)self)->open ? &((Broadcast *)self)->writer : NULL;
 }
+
+int broadcast_is_open(PyObject *send) { return writer_of(send) != NULL; }
+
+int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size) {
+    CortexWriter *writer = writer_of(send);
+    return writer == NULL ? -1 : cortex_writer_put(writer, frame, (size_t)size, 1);
+}
+
+char *broadcast_begin(PyObject *send, Py_ssize_t size) {
+    CortexWriter *writer = writer_of(send);
+    uint8_t *place = NULL;
+    if (writer != NULL) cortex_writer_begin(writer, (size_t)size, 1, &place);
+    return (char *)place;
+}
+
+void broadcast_finish(PyObject *send, Py_ssize_t size) { cortex_writer_finish(writer_of(send), (size_t)size); }
 
 static PyObject *cast_end(Broadcast *cast, PyObject *frame) {
     if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE) {
@@ -121,18 +129,18 @@ static PyObject *cast_dissolve(Broadcast *cast, PyObject *unused) {
     return cast_close(cast, NULL);
 }
 
-static PyObject *cast_in_the_way(Broadcast *cast, PyObject *size) {
-    const Py_ssize_t bytes = PyLong_AsSsize_t(size);
-    if ((bytes == -1 && PyErr_Occurred()) || !cast_is_open(cast)) return NULL;
-    PyObject *found = PyList_New(0);
-    for (int index = 0; found != NULL && index < cast->writer.count; ++index) {
-        CortexMember *member = &cast->writer.members[index];
-        if (!cortex_member_is_full(&cast->writer, member, cortex_entry_bytes((uint64_t)bytes) + CORTEX_SPARE_BYTES)) continue;
-        PyObject *number = PyLong_FromLong(index);
-        if (number == NULL || PyList_Append(found, number) < 0) Py_CLEAR(found);
-        Py_XDECREF(number);
-    }
-    return found;
+static PyObject *cast_patience(Broadcast *cast, PyObject *size) {
+    const uint64_t bytes = PyLong_AsUnsignedLongLong(size);
+    if (PyErr_Occurred() || !cast_is_open(cast)) return NULL;
+    return PyLong_FromLongLong(cortex_writer_patience(&cast->writer, bytes));
+}
+
+static PyObject *cast_give_up(Broadcast *cast, PyObject *arguments) {
+    unsigned long long size;
+    long long waited_ms;
+    if (!PyArg_ParseTuple(arguments, "KL:give_up", &size, &waited_ms) || !cast_is_open(cast)) return NULL;
+    cortex_writer_give_up(&cast->writer, size, waited_ms);
+    Py_RETURN_NONE;
 }
 
 /* Slots */
@@ -320,19 +328,6 @@ static PyObject *cast_provide(Broadcast *cast, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
-static PyObject *cast_behind(Broadcast *cast, PyObject *unused) {
-    (void)unused;
-    if (!cast_is_open(cast)) return NULL;
-    PyObject *found = PyList_New(0);
-    for (int index = 0; found != NULL && index < cast->writer.count; ++index) {
-        if (!cortex_member_is_behind(&cast->writer, &cast->writer.members[index])) continue;
-        PyObject *number = PyLong_FromLong(index);
-        if (number == NULL || PyList_Append(found, number) < 0) Py_CLEAR(found);
-        Py_XDECREF(number);
-    }
-    return found;
-}
-
 static PyObject *cast_leased(Broadcast *cast, PyObject *unused) {
     (void)unused;
     if (!cast_is_open(cast)) return NULL;
@@ -360,13 +355,6 @@ static PyGetSetDef cast_properties[] = {
     {NULL, NULL, NULL, NULL, NULL},
 };
 
-static PyObject *cast_give_up(Broadcast *cast, PyObject *number) {
-    CortexMember *member = cast_member(cast, number);
-    if (member == NULL) return NULL;
-    cortex_member_give_up(&cast->writer, member);
-    Py_RETURN_NONE;
-}
-
 static PyMethodDef cast_methods[] = {
     {"add", (PyCFunction)cast_add, METH_VARARGS, "Take in a reader by the descriptors of its hello, which become ours; its number."},
     {"remove", (PyCFunction)cast_remove, METH_O, "Forget a reader."},
@@ -374,12 +362,12 @@ static PyMethodDef cast_methods[] = {
      "Send a frame to all; `again` if a reliable reader has no room, False if one is late and loses it."},
     {"end", (PyCFunction)cast_end, METH_O, "Send the last frame, for which there is room."},
     {"dissolve", (PyCFunction)cast_dissolve, METH_NOARGS, "Send all readers another way, and close it; what is in it stays theirs."},
-    {"in_the_way", (PyCFunction)cast_in_the_way, METH_O, "The reliable readers that have no room for so many bytes."},
-    {"give_up", (PyCFunction)cast_give_up, METH_O, "Wait for a reader no more, until it has read half."},
+    {"patience", (PyCFunction)cast_patience, METH_O,
+     "The shortest time that a reliable reader without room for so many bytes (0: one that has not come to all slots) may take [ms]; -1: all have."},
+    {"give_up", (PyCFunction)cast_give_up, METH_VARARGS, "Wait for those no more whose time is up to so many ms, until they have read half."},
     {"provide", (PyCFunction)cast_provide, METH_VARARGS, "Have slots for bodies of a size: whether all have it, whether a reader keeps many; OSError: no memory."},
     {"acquire", (PyCFunction)cast_acquire, METH_O, "A slot for so many bytes; None: none is free, or they are too small."},
     {"commit", (PyCFunction)(void (*)(void))cast_commit, METH_FASTCALL, "Send the frame of a slot that has been written, as `send`."},
-    {"behind", (PyCFunction)cast_behind, METH_NOARGS, "The reliable readers that have not come to all slots."},
     {"leased", (PyCFunction)cast_leased, METH_NOARGS, "How many slots somebody looks at, or will."},
     {"close", (PyCFunction)cast_close, METH_NOARGS, "Let go of it; readers keep what is in it."},
     {NULL, NULL, 0, NULL},

@@ -1,5 +1,5 @@
 /* A `Coder` is made once per message type and publisher. It writes a message as a frame or as a bare body,
-   and reads a frame or a body back: what `body.py` does, in a tenth of the time.
+   and reads them back: what `body.py` does, in a tenth of the time.
 
    It is strict: of whatever is not exactly as usual (another class, a number of NumPy, a wrong dtype or shape, a
    malformed body) it returns None, and the Python code does the work, or says what is wrong. So it never raises for a
@@ -20,41 +20,25 @@
 
 /* Writing */
 
-PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
-    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
-    if (frame == NULL) return NULL;
-    char *out = PyBytes_AS_STRING(frame);
+int write_frame(const Coder *coder, PyObject *message, char *out, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
     Pack pack;
-    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) {
-        Py_DECREF(frame);
-        return NULL;
-    }
+    if (!write_body(coder, message, &pack, out + HEADER_SIZE, size, 0)) return 0;
     memcpy(out, coder->head, HEAD_SIZE);
     const uint64_t rest[5] = {sequence, (uint64_t)pack.stamp_ns, (uint64_t)publish_ns, (uint64_t)size, 0};
     memcpy(out + HEAD_SIZE, rest, sizeof rest);
-    return frame;
+    return 1;
 }
 
-PyDoc_STRVAR(frame_doc,
-"frame($self, message, sequence, publish_ns, limit, /)\n--\n\n"
-"A whole frame: the head, the rest of the header, the body; None if the message is not as usual, or its body has\n"
-"more than `limit` bytes.");
-
-static PyObject *coder_frame(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 4)) return NULL;
-    const uint64_t sequence = PyLong_AsUnsignedLongLong(arguments[1]);
-    const int64_t publish_ns = PyLong_AsLongLong(arguments[2]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
-    if (PyErr_Occurred()) return NULL;
-    const Py_ssize_t size = coder->has_head ? measure_body(coder, arguments[0]) : -1;
-    if (size < 0 || size > limit) Py_RETURN_NONE;
-    PyObject *frame = make_frame(coder, arguments[0], size, sequence, publish_ns);
-    return frame == NULL ? none_or_error(NULL) : frame;
+PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns) {
+    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + size);
+    if (frame == NULL || write_frame(coder, message, PyBytes_AS_STRING(frame), size, sequence, publish_ns)) return frame;
+    Py_DECREF(frame);
+    return NULL;
 }
 
 PyDoc_STRVAR(encode_doc,
 "encode($self, message, limit, /)\n--\n\n"
-"The body of a message; None as for `frame`.");
+"The body of a message; None if the message is not as usual, or its body has more than `limit` bytes.");
 
 static PyObject *coder_encode(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
     if (!arguments_are(count, 2)) return NULL;
@@ -69,11 +53,6 @@ static PyObject *coder_encode(Coder *coder, PyObject *const *arguments, Py_ssize
 }
 
 /* Reading */
-
-PyDoc_STRVAR(read_doc,
-"read($self, frame, /)\n--\n\n"
-"A frame to its sequence, publish_ns and message; None if it does not begin with the head, or is not as usual.\n"
-"Arrays of the message are read-only views of the frame.");
 
 /* The message in the slot that a descriptor names; NULL without error if it is not as usual. */
 static PyObject *read_slot(const Coder *coder, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
@@ -105,14 +84,6 @@ static PyObject *read_frame(const Coder *coder, PyObject *frame, uint64_t *seque
     *sequence = rest[0];
     *publish_ns = (int64_t)rest[2];
     return read_body(coder, frame, bytes + HEADER_SIZE, size);
-}
-
-static PyObject *coder_read(Coder *coder, PyObject *frame) {
-    uint64_t sequence;
-    int64_t publish_ns;
-    PyObject *message = read_frame(coder, frame, &sequence, &publish_ns);
-    if (message == NULL) return none_or_error(NULL);
-    return Py_BuildValue("KLN", (unsigned long long)sequence, (long long)publish_ns, message);
 }
 
 int note_latency(PyObject *latency, int64_t elapsed_ns) {
@@ -218,9 +189,7 @@ static void coder_dealloc(Coder *coder) {
 }
 
 static PyMethodDef coder_methods[] = {
-    {"frame", (PyCFunction)(void (*)(void))coder_frame, METH_FASTCALL, frame_doc},
     {"encode", (PyCFunction)(void (*)(void))coder_encode, METH_FASTCALL, encode_doc},
-    {"read", (PyCFunction)coder_read, METH_O, read_doc},
     {"decode", (PyCFunction)(void (*)(void))coder_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };

@@ -52,7 +52,10 @@ int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_
 void copy_deferred(const Pack *pack);
 void hold_deferred(const Pack *pack, int hold);
 
-/* A whole frame; NULL without error if the message is not as usual. */
+/* Write a whole frame, whose body has the size that was measured; 0 without error if the message is not as usual. */
+int write_frame(const Coder *coder, PyObject *message, char *out, Py_ssize_t size, uint64_t sequence, int64_t publish_ns);
+
+/* The same as bytes; NULL without error if the message is not as usual. */
 PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns);
 
 /* The message of a body within `owner`, which its arrays keep; NULL without error if it is malformed. */

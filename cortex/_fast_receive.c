@@ -105,12 +105,8 @@ static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
     PyObject *acquired = PyObject_CallNoArgs(fast->acquire);
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
-    PyObject *message = fast_take_locked(fast, may_wait, now_ns), *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->release);
-    if (released == NULL) PyErr_Clear(); /* it was ours */
-    Py_XDECREF(released);
-    PyErr_Restore(type, value, traceback);
+    PyObject *message = fast_take_locked(fast, may_wait, now_ns);
+    give_back(fast->release);
     return message != NULL || PyErr_Occurred() ? message : Py_NewRef(fast->nothing);
 }
 

@@ -14,23 +14,29 @@ typedef struct {
     PyObject_HEAD
     vectorcallfunc vectorcall;
     Coder *coder;
-    PyObject *acquire, *release, *slowly, *retry, *again;
-    PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+    union {
+        struct {
+            PyObject *acquire, *release, *locked, *slowly, *retry, *again;
+            PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
+            PyObject *ring;  /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
+            PyObject *prepare, *large_acquire, *large_release, *finish;
+        };
+        PyObject *held[12];
+    };
     Py_ssize_t limit;
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
-    PyObject *ring; /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
-    PyObject *prepare, *large_acquire, *large_release, *finish;
 } FastSend;
 
 PyDoc_STRVAR(fast_doc,
-"FastSend(coder, acquire, release, slowly, retry, again, limit)\n--\n\n"
+"FastSend(coder, acquire, release, locked, slowly, retry, again, limit)\n--\n\n"
 "Called with a message, it sends it; see `fast_send.py`.\n\n"
 "Args:\n"
 "    coder: Makes the frames; has a head.\n"
 "    acquire: Takes the lock.\n"
 "    release: Gives it back.\n"
+"    locked: Whether somebody has it.\n"
 "    slowly: Called without the lock with a message that has to take the slow path.\n"
 "    retry: Called with the lock held, a frame, and that of `sends` which had no room for it.\n"
 "    again: What that raised.\n"
@@ -68,6 +74,35 @@ static PyObject *fast_send_frame(FastSend *fast, PyObject *frame) {
     }
     Py_DECREF(sends);
     return on_time < 0 ? NULL : PyBool_FromLong(on_time);
+}
+
+/* Whether all that is to be done is to write into the ring. */
+static int fast_has_ring_only(const FastSend *fast) {
+    return fast->sends != NULL && PyTuple_CheckExact(fast->sends) && PyTuple_GET_SIZE(fast->sends) == 1
+        && broadcast_is_open(PyTuple_GET_ITEM(fast->sends, 0));
+}
+
+/* Write a small message there; 0 if it has to be sent as bytes, or is not as usual. */
+static int fast_write_frame(FastSend *fast, PyObject *message, Py_ssize_t size, int64_t now_ns) {
+    PyObject *send = PyTuple_GET_ITEM(fast->sends, 0);
+    char *place = broadcast_begin(send, HEADER_SIZE + size);
+    if (place == NULL || !write_frame(fast->coder, message, place, size, fast->sequence, now_ns)) return 0;
+    broadcast_finish(send, HEADER_SIZE + size);
+    fast->sequence += 1;
+    fast->bytes += size;
+    return 1;
+}
+
+/* Send a small message through the ring without the lock, if nobody has it: others need the GIL to take it, which is kept
+   here, as no Python code runs; 0 if there is more to do. */
+static int fast_send_unlocked(FastSend *fast, PyObject *message) {
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= fast->refresh_ns || !fast_has_ring_only(fast)) return 0;
+    PyObject *locked = PyObject_CallNoArgs(fast->locked);
+    if (locked == NULL) PyErr_Clear();
+    Py_XDECREF(locked);
+    const Py_ssize_t size = locked == Py_False ? measure_body(fast->coder, message) : -1;
+    return size >= 0 && size <= fast->limit && fast_write_frame(fast, message, size, now_ns);
 }
 
 /* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
@@ -152,16 +187,6 @@ static int fast_lock_large(FastSend *fast) {
     return acquired == Py_True;
 }
 
-/* Give the lock of large messages back; keeps the error that is set, if one is. */
-static void fast_unlock_large(FastSend *fast) {
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->large_release);
-    if (released == NULL) PyErr_Clear(); /* it was ours */
-    Py_XDECREF(released);
-    PyErr_Restore(type, value, traceback);
-}
-
 /* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
 
    While much is copied others may have the lock: then that of large messages keeps other large ones away. */
@@ -171,7 +196,7 @@ static PyObject *fast_send_slot(FastSend *fast, PyObject *message, Py_ssize_t si
     PyObject *ring = Py_NewRef(fast->ring), *sent = NULL;
     if (!unlocked || fast_lock_large(fast)) {
         sent = fast_use_slot(fast, ring, message, size, unlocked, now_ns);
-        if (unlocked) fast_unlock_large(fast);
+        if (unlocked) give_back(fast->large_release);
     }
     Py_DECREF(ring);
     return sent;
@@ -185,6 +210,7 @@ static PyObject *fast_send(FastSend *fast, PyObject *message) {
     const Py_ssize_t size = measure_body(fast->coder, message);
     if (size < 0) return NULL;
     if (size > fast->limit) return fast_send_slot(fast, message, size, now_ns);
+    if (fast_has_ring_only(fast) && fast_write_frame(fast, message, size, now_ns)) Py_RETURN_TRUE;
     PyObject *frame = make_frame(fast->coder, message, size, fast->sequence, now_ns);
     if (frame == NULL) return NULL;
     fast->sequence += 1;
@@ -200,26 +226,13 @@ static PyObject *fast_call(PyObject *self, PyObject *const *arguments, size_t fl
         PyErr_SetString(PyExc_TypeError, "publish() takes one message, by position");
         return NULL;
     }
+    if (fast_send_unlocked(fast, arguments[0])) Py_RETURN_TRUE;
     PyObject *acquired = PyObject_CallNoArgs(fast->acquire);
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
     PyObject *result = fast_send(fast, arguments[0]);
-    PyObject *type, *value, *traceback;
-    PyErr_Fetch(&type, &value, &traceback);
-    PyObject *released = PyObject_CallNoArgs(fast->release);
-    if (released == NULL) {
-        Py_XDECREF(result);
-        Py_XDECREF(type);
-        Py_XDECREF(value);
-        Py_XDECREF(traceback);
-        return NULL;
-    }
-    Py_DECREF(released);
-    if (type != NULL) {
-        PyErr_Restore(type, value, traceback);
-        return NULL;
-    }
-    return result != NULL ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
+    give_back(fast->release);
+    return result != NULL || PyErr_Occurred() ? result : PyObject_CallOneArg(fast->slowly, arguments[0]);
 }
 
 PyDoc_STRVAR(fast_send_slot_doc,
@@ -248,11 +261,11 @@ static PyMethodDef fast_methods[] = {
 };
 
 static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", NULL};
-    PyObject *coder, *acquire, *release, *slowly, *retry, *again;
+    static char *names[] = {"coder", "acquire", "release", "locked", "slowly", "retry", "again", "limit", NULL};
+    PyObject *coder, *acquire, *release, *locked, *slowly, *retry, *again;
     Py_ssize_t limit;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOn:FastSend", names, &CoderType, &coder, &acquire, &release,
-                                     &slowly, &retry, &again, &limit))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOOn:FastSend", names, &CoderType, &coder, &acquire, &release,
+                                     &locked, &slowly, &retry, &again, &limit))
         return NULL;
     FastSend *fast = (FastSend *)type->tp_alloc(type, 0);
     if (fast == NULL) return NULL;
@@ -260,6 +273,7 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
     fast->coder = (Coder *)Py_NewRef(coder);
     fast->acquire = Py_NewRef(acquire);
     fast->release = Py_NewRef(release);
+    fast->locked = Py_NewRef(locked);
     fast->slowly = Py_NewRef(slowly);
     fast->retry = Py_NewRef(retry);
     fast->again = Py_NewRef(again);
@@ -269,33 +283,12 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
 
 static int fast_traverse(FastSend *fast, visitproc visit, void *arg) {
     Py_VISIT(fast->coder);
-    Py_VISIT(fast->acquire);
-    Py_VISIT(fast->release);
-    Py_VISIT(fast->slowly);
-    Py_VISIT(fast->retry);
-    Py_VISIT(fast->again);
-    Py_VISIT(fast->sends);
-    Py_VISIT(fast->ring);
-    Py_VISIT(fast->prepare);
-    Py_VISIT(fast->large_acquire);
-    Py_VISIT(fast->large_release);
-    Py_VISIT(fast->finish);
-    return 0;
+    return visit_held(fast->held, sizeof fast->held / sizeof *fast->held, visit, arg);
 }
 
 static int fast_clear(FastSend *fast) {
     Py_CLEAR(fast->coder);
-    Py_CLEAR(fast->acquire);
-    Py_CLEAR(fast->release);
-    Py_CLEAR(fast->slowly);
-    Py_CLEAR(fast->retry);
-    Py_CLEAR(fast->again);
-    Py_CLEAR(fast->sends);
-    Py_CLEAR(fast->ring);
-    Py_CLEAR(fast->prepare);
-    Py_CLEAR(fast->large_acquire);
-    Py_CLEAR(fast->large_release);
-    Py_CLEAR(fast->finish);
+    clear_held(fast->held, sizeof fast->held / sizeof *fast->held);
     return 0;
 }
 

@@ -58,6 +58,16 @@ static inline PyObject *none_or_error(PyObject *made) {
     Py_RETURN_NONE;
 }
 
+/* Give back a lock that is ours; keeps the error that is set, if one is. */
+static inline void give_back(PyObject *release) {
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    PyObject *released = PyObject_CallNoArgs(release);
+    if (released == NULL) PyErr_Clear();
+    Py_XDECREF(released);
+    PyErr_Restore(type, value, traceback);
+}
+
 /* What the types of this module do for the objects that they hold. */
 static inline int visit_held(PyObject *const *held, size_t count, visitproc visit, void *arg) {
     for (size_t index = 0; index < count; ++index) Py_VISIT(held[index]);

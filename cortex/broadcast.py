@@ -180,7 +180,8 @@ class Broadcast:
             hello.close()
             return
         with contextlib.suppress(OSError):  # it has left
-            reader.member = self._ring.add(*hello, reader.request.strict, sequence)
+            request = reader.request
+            reader.member = self._ring.add(*hello, request.strict, request.timeout_ms, sequence)
             self._readers[reader.member] = reader
             self.sends = {self._ring.send: self.send}
             if self._expected_bytes:
@@ -245,7 +246,7 @@ class Broadcast:
             return slot is not None
 
         if not acquire() and may_wait:
-            self._wait(acquire, self._ring.behind)
+            self._wait(acquire, 0)
         return slot
 
     def _provide(self, size: int, *, exact: bool) -> bool:
@@ -290,24 +291,21 @@ class Broadcast:
             return True
 
         if not attempt():
-            self._wait(attempt, lambda: self._ring.in_the_way(size))
+            self._wait(attempt, size)
         return on_time
 
-    def _wait(self, attempt: Callable[[], bool], in_the_way: Callable[[], list[int]]) -> None:
+    def _wait(self, attempt: Callable[[], bool], size: int) -> None:
         """Attempt something until it works, or nobody is in its way; give up readers whose time is over."""
         begin_s = time.monotonic()
         while not attempt():
-            slow = [self._readers[member] for member in in_the_way()]
-            if not slow:
+            patience_ms = self._ring.patience(size)
+            if patience_ms < 0:
                 attempt()
                 return
-            timeout_s = min(reader.timeout_s for reader in slow)
-            if self._await_room(attempt, timeout_s - (time.monotonic() - begin_s)):
+            if self._await_room(attempt, patience_ms / 1000.0 - (time.monotonic() - begin_s)):
                 return
-            waited_s, is_over = time.monotonic() - begin_s, self._back_pressure.is_over()
-            for member in in_the_way():
-                if is_over or self._readers[member].timeout_s <= waited_s:
-                    self._ring.give_up(member)
+            waited_ms = int((time.monotonic() - begin_s) * 1000.0)
+            self._ring.give_up(size, 2**32 if self._back_pressure.is_over() else waited_ms)
 
     def offer(self, frame: bytes) -> None:
         """Send a frame if all have room."""

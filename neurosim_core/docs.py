@@ -20,9 +20,15 @@ def add_parser(commands: Any) -> None:
     """Add the command to those of `neurosim`."""
     docs = commands.add_parser("docs", help="build the documents as a site, and open it in a browser")
     docs.add_argument("--build", action="store_true", help="build it anew, print where it is, and stop")
-    docs.add_argument("--port", type=int, default=8000, help="port of the page (default: 8000)")
+    docs.add_argument("--port", type=_port, default=8000, help="port of the page (default: 8000)")
     docs.add_argument("--no-browser", action="store_true", help="print the address only")
     docs.set_defaults(command=_docs, computes=False)
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 65535:  # of port 0 nobody would learn which it became
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 65535, got {text}")
+    return int(text)
 
 
 def _docs(arguments: argparse.Namespace) -> int:

@@ -24,7 +24,7 @@ Reference: Akeley (1993), RealityEngine graphics (multisampling); Aila, Laine (2
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from functools import cache
 from typing import Any
 
@@ -62,11 +62,14 @@ _SIDE = 4
 _LANES = _SIDE * _SIDE
 
 
-def _rays_through(lens: Lens, point: Any, sample_count: int, fill_factor: float) -> NDArray[np.float32]:
-    """Return rays through a point of the sensitive area of each pixel, shape [H * W, 4]."""
-    column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
+def _rays_through(
+    lens: Lens, points: Iterable[Any], sample_count: int, fill_factor: float
+) -> Iterator[NDArray[np.float32]]:
+    """Yield rays through points of the sensitive area of each pixel, shape [H, W, 4]."""
     spread = lens.ray_spread()[..., None] * np.float32(np.sqrt(fill_factor / sample_count))
-    return np.concatenate([lens.ray_table((column, row)), spread], axis=-1).reshape(-1, 4)
+    for point in points:
+        column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
+        yield np.concatenate([lens.ray_table((column, row)), spread], axis=-1)
 
 
 def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -86,7 +89,8 @@ def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArr
     if sample_count > 1:
         columns, rows = np.arange(sample_count), spread_order(sample_count)
         points += list(zip((columns + 0.5) / sample_count, (rows + 0.5) / sample_count, strict=True))
-    return np.stack([_rays_through(lens, point, sample_count, fill_factor) for point in points])
+    layers = np.stack(list(_rays_through(lens, points, sample_count, fill_factor)))
+    return layers.reshape(len(points), -1, 4)
 
 
 def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -95,12 +99,16 @@ def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     They go through the centres of 4 x 4 cells of the pixels. Four adjacent rows of a column use all columns
     of cells, and four adjacent columns of a row use all rows of cells.
     """
-    row, col = np.indices((lens.height, lens.width)).reshape(2, -1)
-    cell_column = (row + 2 * (col & 1) + ((col >> 1) & 1)) % _CELLS
-    cell_row = (col + 2 * (row & 1) + ((row >> 1) & 1)) % _CELLS
-    centres = (np.arange(_CELLS) + 0.5) / _CELLS
-    rays = np.stack([_rays_through(lens, (x, y), 1, fill_factor) for x in centres for y in centres])
-    return rays[_CELLS * cell_column + cell_row, np.arange(len(row))]
+    pixels = [(row, col) for row in range(_CELLS) for col in range(_CELLS)]  # the others repeat these
+    cells = [
+        ((row + 2 * (col & 1) + (col >> 1)) % _CELLS, (col + 2 * (row & 1) + (row >> 1)) % _CELLS)
+        for row, col in pixels
+    ]
+    rays = np.empty((lens.height, lens.width, 4), dtype=np.float32)
+    points = (np.array(cells) + 0.5) / _CELLS
+    for (row, col), through in zip(pixels, _rays_through(lens, points, 1, fill_factor), strict=True):
+        rays[row::_CELLS, col::_CELLS] = through[row::_CELLS, col::_CELLS]
+    return rays.reshape(-1, 4)
 
 
 def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
@@ -110,12 +118,9 @@ def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
         Direction in C and spread [rad]; difference of the directions at the right and the left border of the
         sensitive area, and of those at its lower and upper border; shape [3, H * W, 4].
     """
-    center = _rays_through(lens, (0.5, 0.5), 1, fill_factor)
-    right, left, lower, upper = (
-        _rays_through(lens, point, 1, fill_factor)
-        for point in ((1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
-    )
-    return np.stack([center, right - left, lower - upper])
+    points = ((0.5, 0.5), (1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
+    center, right, left, lower, upper = _rays_through(lens, points, 1, fill_factor)
+    return np.stack([center, right - left, lower - upper]).reshape(3, -1, 4)
 
 
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))

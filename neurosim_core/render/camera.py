@@ -110,12 +110,12 @@ class PinholeConfig(Settings):
         fx, fy, cx, cy = self.intrinsics()
         x = (np.arange(self.width) + offset_px[0] - cx) / fx
         y = (np.arange(self.height) + offset_px[1] - cy) / fy
-        rays = np.empty((self.height, self.width, 3))
-        rays[..., 0] = x[None, :]
-        rays[..., 1] = y[:, None]
-        rays[..., 2] = 1.0
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        return rays.astype(np.float32)
+        length = np.sqrt(x**2 + (y[:, None] ** 2 + 1.0))
+        rays = np.empty((self.height, self.width, 3), dtype=np.float32)
+        rays[..., 0] = x / length
+        rays[..., 1] = y[:, None] / length
+        rays[..., 2] = 1.0 / length
+        return rays
 
     def ray_spread(self) -> NDArray[np.float32]:
         """Return the angle between the rays of neighbouring pixels: the root of a pixel's solid angle.

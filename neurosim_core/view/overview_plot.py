@@ -304,13 +304,13 @@ def _draw_plan(page: _Page, scene: Scene, track: Track, snapshot: Snapshot) -> N
         return np.stack([-points[..., 1], points[..., 0]], axis=-1) if turned else points
 
     light = 1.0 - 0.7 * (1.0 - plan.colors)  # paler than the path
-    axes.add_collection(
-        PolyCollection(place(plan.triangles), facecolors=light, edgecolors=light, linewidths=0.4, zorder=1)
+    below = PolyCollection(
+        place(plan.triangles), facecolors=light, edgecolors=light, linewidths=0.4, zorder=1
     )
+    axes.add_collection(below, autolim=False)
     for outlines, ink, line_width in ((plan.low_outlines, _FAINT, 0.5), (plan.outlines, _INK, 1.1)):
-        axes.add_collection(
-            LineCollection(place(outlines), colors=ink, linewidths=line_width, capstyle="round", zorder=2)
-        )
+        lines = LineCollection(place(outlines), colors=ink, linewidths=line_width, capstyle="round", zorder=2)
+        axes.add_collection(lines, autolim=False)
     corners = place(plan.bounds)
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes.set_xlim(low[0] - 0.02 * size.max(), high[0] + 0.02 * size.max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import shutil
@@ -25,10 +26,11 @@ from cpp_client import (
 from cpp_messages import OtherScan, Picture, Rich, Scan
 from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
-from wire_vectors import load_vectors
+from wire_vectors import load_vectors, message_from_plain
 
 from cortex import wire
-from cortex.codec import codec_of
+from cortex.codec import MalformedMessage, codec_of
+from cortex.layout import VALUES_MAX, measure_fields
 from cortex.node import Node
 from cortex.policy import reliable
 from cortex.registry import ensure_registry
@@ -42,6 +44,27 @@ __all__ = ["programs", "start"]
 pytestmark = needs_compiler
 
 
+def too_many_values() -> bytes:
+    """A whole body of the vectors' `Lists`, but for one value more in a list than a body may hold (B10)."""
+    vector = load_vectors()["lists"]
+    schema = Schema.from_json(vector["schema"])
+    some = message_from_plain(schema, vector["cases"][0]["value"])
+    empty = {
+        name: []
+        for name in ("numbers", "small", "texts", "points", "inners", "arrays", "fixed", "maybe", "nested")
+    }
+    message = dataclasses.replace(some, **empty, flags=[True] * VALUES_MAX)
+    codec = codec_of(type(message))
+    body = codec.encode(message, 1 << 24)
+    assert body is not None
+    assert codec.decode(body) == message
+    at = measure_fields(schema)[0][[field.name for field in schema.fields].index("flags")] + 4
+    more = body[:at] + (VALUES_MAX + 1).to_bytes(4, "little") + body[at + 4 :] + b"\1"
+    with pytest.raises(MalformedMessage):
+        codec.decode(more)
+    return more
+
+
 def test_vectors_and_damaged_bodies(programs: Path) -> None:
     """Good bodies return as the same bytes, bad ones are rejected, damaged ones do no harm (ASan, UBSan)."""
     lines = []
@@ -49,6 +72,7 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
         name = short(Schema.from_json(vector["schema"]))
         lines += [f"{name} good {case['body']}" for case in vector["cases"]]
         lines += [f"{name} bad {case['body']}" for case in vector["malformed"]]
+    lines.append(f"Lists bad {too_many_values().hex()}")
     done = subprocess.run(
         [programs / "codec_test", str(MUTATIONS)],
         input="\n".join(lines) + "\n",

@@ -351,7 +351,7 @@ class RingImpostor(Impostor):
         fd = native.accept(self.listener)
         source, number, page, bell = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
-        self.ring.add(fd, page, bell, False, 0)
+        self.ring.add(fd, page, bell, False, 0, 0)
         self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
 
     def close(self) -> None:

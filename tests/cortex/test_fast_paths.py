@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import zmq
 from peer import Number, Scan, make
+from processes import SOON_S
 
 from cortex.codec import codec_of, coder_of
 from cortex.compiled import native
@@ -17,7 +18,7 @@ from cortex.fast_receive import NOTHING, make_fast_receive
 from cortex.fast_send import make_fast_send
 from cortex.receive_lock import ReceiveLock
 from cortex.stats import SubscriberCounters
-from cortex.wire import MESSAGE, message_head
+from cortex.wire import MESSAGE, REST, message_head
 
 pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
@@ -27,8 +28,12 @@ def coder_with_head(kind: type) -> Any:
     return coder_of(codec, message_head(MESSAGE, 7, codec.fingerprint, stamped=True))
 
 
-def frame_of(number: int) -> bytes:
-    return coder_with_head(Number).frame(Number(number, number), number, 0, 100)
+def frame_of(number: int, kind: type = Number) -> bytes:
+    codec = codec_of(kind)
+    body = codec.encode(Number(number, number) if kind is Number else make(kind, number, 40), 1 << 20)
+    assert body is not None
+    head = message_head(MESSAGE, 7, codec.fingerprint, stamped=True)
+    return head + REST.pack(number, 0, 0, len(body), 0) + body
 
 
 class Script:
@@ -130,9 +135,28 @@ def test_drain_passes_errors_on_and_keeps_count():
 
 
 def test_frames_that_are_none_of_this_publisher():
-    coder, codec, value = coder_with_head(Scan), codec_of(Scan), make(Scan, 5, 40)
-    frame = coder.frame(value, 3, 4, 1 << 20)
-    assert coder.read(frame)[:2] == (3, 4)
-    for other in (b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)):
-        assert coder.read(other) is None
-    assert coder_of(codec, b"").read(frame) is None  # it has no head
+    lock, messages, frame = ReceiveLock(), deque(), frame_of(3, Scan)
+    path = make_fast_receive(lock, deque(), SubscriberCounters(), lambda link, frame: None)
+    others = [b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)]
+    script = Script(lock.lock, *others, frame, frame)
+    link = SimpleNamespace(receive=script, coder=coder_with_head(Scan), expected=3, clock_offset_ns=0)
+    with lock.lock:
+        for other in others:
+            assert path.drain(link, messages, 4, False) == other
+        assert path.drain(link, messages, 1, False) is None
+        assert list(messages) == [make(Scan, 3, 40)]
+        link.coder, link.expected = coder_of(codec_of(Scan), b""), 3  # it has no head
+        assert path.drain(link, messages, 4, False) == frame
+
+
+def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
+    """It is not taken where it is free, but nobody passes one who has it."""
+    publisher, subscriber = numbers
+    assert publisher.publish(Number(0, 0))
+    with publisher._lock:
+        thread = threading.Thread(target=publisher.publish, args=(Number(1, 1),))
+        thread.start()
+        thread.join(0.05)
+        assert publisher._fast_send.sequence == 1
+    thread.join()
+    assert [subscriber.recv(SOON_S).value for _ in range(2)] == [0, 1]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import neurosim_core as ns
 from neurosim_core import sim
@@ -232,3 +233,22 @@ def test_a_body_is_shown_moved_and_hidden_while_time_goes_on(room, device, adapt
     fired = [len(events_of(packets)) for packets in flown]
     assert fired[0] == 0
     assert min(fired[1:]) > 200  # about 200 pixels see it come or go
+
+
+def test_what_cannot_be_thrown_is_said(room):
+    """A wrong shape or dtype, no bodies, and a sensor that knows how bodies of the configuration move."""
+
+    def throw(bodies: dict[str, Any], dtype: Any, count: int, **changes: Any) -> None:
+        worlds = ns.Simulation(settings(room, "cpu", bodies, **changes), worlds=2)
+        start: Any = wp.zeros((2, count), dtype=dtype, device="cpu")
+        worlds.throw_bodies(start, start)
+
+    ball = {"ball": {"shape": {"kind": "sphere"}}}
+    flow = {"flow": {"kind": "optical_flow", "lens": LENS}}
+    for dtype, count in ((wp.vec3d, 2), (wp.vec3, 1)):
+        with pytest.raises(ValueError, match=r"position must be vec3d of shape \(2, 1\)"):
+            throw(ball, dtype, count)
+    with pytest.raises(ValueError, match="no bodies to throw"):
+        throw({}, wp.vec3d, 0)
+    with pytest.raises(ValueError, match="colour, depth and events only"):
+        throw(ball, wp.vec3d, 1, sensors=flow)

@@ -1,14 +1,20 @@
 auto origin_of = [&](int axis, int) { return origin[axis]; };
+auto turn = [&](int, float x, float y, float z) { return wp::quat_rotate(q_WC, wp::vec3(x, y, z)); };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
 alignas(64) float total[3][N] = {};
 const int layers = rays.shape[0];
-for (int layer = layers > 1; layer < layers; ++layer) {
+// Of four layers a packet has 2 x 2 pixels, whose rays are closer together than those of 4 x 4 pixels of one layer.
+const int samples = layers > 1 ? layers - 1 : 1, together = samples % 4 == 0 ? 4 : 1;
+for (int sample = 0; sample < samples; ++sample) {
+    const int quarter = sample % 4, corner = quarter / 2 * 2 * SIDE + quarter % 2 * 2;
+    auto pixel_of = [&](int lane) { return together == 4 ? corner + lane % 4 / 2 * SIDE + lane % 2 : lane; };
+    auto layer_of = [&](int lane) { return layers > 1 ? 1 + (together == 4 ? sample - quarter + lane / 4 : sample) : 0; };
 #include "aim_packet.cuh"
 #include "embree_packet.cuh"
-constexpr float slope[2][N] = {};
+    constexpr float slope[2][N] = {};
 #include "shade_lanes.cuh"
-    for (int channel = 0; channel < 3; ++channel)
-        for (int lane = 0; lane < N; ++lane) total[channel][lane] += radiance[channel][lane];
+    for (int lane = 0; lane < N; ++lane)
+        for (int channel = 0; channel < 3; ++channel) total[channel][pixel_of(lane)] += radiance[channel][lane];
 }
 alignas(64) float luma[N];
 const float share = layers > 1 ? 1.0f / (float)(layers - 1) : 1.0f;

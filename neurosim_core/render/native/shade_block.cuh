@@ -2,85 +2,113 @@
 // pixel that has to be rendered by rays. Each face is shaded once per pixel, at the middle of the points that show it. With TIMED
 // each pixel has a pose of its own.
 const int width = view.width, height = view.height;
-#include "list_seen_faces.cuh"
-unresolved_out.data[0] = 0xffff;
-if (!listed) return;
-constexpr int LANES = 16, N = 16, POSES = TIMED ? LANES : 1;
-auto pose_of = [&](int row, int column) {
-    return TIMED ? instant * view.pose_count + *wp::address(view.pose, 0, row * width + column) : instant;
-};
-const wp::vec3 origin = view.p_WC.data[pose_of(top, left)];
-#include "sample_points.cuh"
-alignas(64) float ray[3][3][LANES], pixel_spread[LANES];
+constexpr int LANES = 16, N = 16;
+const wp::Mesh mesh = wp::mesh_get(scene.mesh);
+const int* const own_faces = wp::address(faces, instant, top, left);
 alignas(64) int own[LANES];
-alignas(64) float shift[3][POSES];
-wp::vec3 position[POSES];
-wp::quat q_WC[POSES];
-for (int lane = 0; lane < POSES; ++lane) {
-    const bool inside = lane % 4 < columns && lane / 4 < rows;
-    const int pose = pose_of(inside ? top + lane / 4 : top, inside ? left + lane % 4 : left);
-    position[lane] = view.p_WC.data[pose];
-    q_WC[lane] = view.q_WC.data[pose];
-    for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[lane][axis] - origin[axis];
-}
-for (int lane = 0; lane < LANES; ++lane) {
-    const bool inside = lane % 4 < columns && lane / 4 < rows;
-    own[lane] = *wp::address(faces, instant, inside ? top + lane / 4 : top, inside ? left + lane % 4 : left);
-    const int pixel = first_pixel + (inside ? (lane / 4) * width + lane % 4 : 0);
-    for (int term = 0; term < 3; ++term) {
-        const wp::vec4& from = *wp::address(rays, term, pixel);
-        if (term == 0) pixel_spread[lane] = from[3];
-        for (int axis = 0; axis < 3; ++axis) ray[term][axis][lane] = from[axis];
+for (int lane = 0; lane < LANES; ++lane)
+    own[lane] = own_faces[lane % 4 < columns && lane / 4 < rows ? (lane / 4) * width + lane % 4 : 0];
+// Whether the first rays hit one surface in the block and in the ring around it: the same place as in `list_seen_faces.cuh`.
+const int upper = wp::max(wp::min(top - 1, height - 6), 0), leftmost = wp::max(wp::min(left - 1, width - 6), 0);
+int other_surface = 0;
+const int surface_here = scene.face_surface.data[wp::max(own[0], 0)];
+for (int y = 0; y < 6; ++y)
+    for (int x = 0; x < 6; ++x) {
+        const int part = *wp::address(faces, instant, wp::min(upper + y, height - 1), wp::min(leftmost + x, width - 1));
+        other_surface |= (part < 0) | (scene.face_surface.data[wp::max(part, 0)] ^ surface_here);
     }
-}
-for (int term = 0; term < 3; ++term)
+#include "pixel_poses.cuh"
+const wp::vec3 origin(position[0][0], position[1][0], position[2][0]);
+alignas(64) float shift[3][POSES]; // of the positions from `origin`
+for (int lane = 0; lane < POSES; ++lane)
+    for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[axis][lane] - origin[axis];
+#include "transpose_quads.cuh"
+alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
+auto turn_rays = [&](int term) {
+    Quads quads[4];
+    const wp::vec4* const pixels = wp::address(rays, term, first_pixel);
+    if (columns == 4 && rows == 4)
+        for (int y = 0; y < 4; ++y) __builtin_memcpy(&quads[y], pixels + y * width, sizeof(Quads));
+    else
+        for (int lane = 0; lane < LANES; ++lane) {
+            const wp::vec4& pixel = pixels[lane % 4 < columns && lane / 4 < rows ? (lane / 4) * width + lane % 4 : 0];
+            for (int axis = 0; axis < 4; ++axis) quads[lane / 4][lane % 4 * 4 + axis] = pixel[axis];
+        }
+    transpose(quads, {ray[term][0], ray[term][1], ray[term][2], ray[term][3]});
     for (int lane = 0; lane < LANES; ++lane) {
-        const wp::vec3 turned =
-            wp::quat_rotate(q_WC[TIMED ? lane : 0], wp::vec3(ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]));
+        const wp::vec3 turned = turn(lane, ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]);
         for (int axis = 0; axis < 3; ++axis) ray[term][axis][lane] = turned[axis];
     }
-#include "cover_lanes.cuh"
-if (!listed) return;
-alignas(64) float whole[LANES] = {};
-for (int layer = 0; layer < layer_count; ++layer)
-    for (int lane = 0; lane < LANES; ++lane) whole[lane] += number[layer][lane];
-int unresolved = 0;
-for (int lane = 0; lane < LANES; ++lane) unresolved |= (!sky && whole[lane] < 0.5f * SAMPLES) << lane;
-alignas(64) float total[3][LANES] = {}, weight[LANES];
-for (int lane = 0; lane < LANES; ++lane) {
-    weight[lane] = 1.0f / (sky ? (float)SAMPLES : wp::max(whole[lane], 1.0f));
-    if (sky)
-        for (int channel = 0; channel < 3; ++channel)
-            total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
-}
+};
+turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
     return 0.01f * SHARPNESS * wp::sqrt(points_shown / SAMPLES);
 };
-constexpr float COSINE_MIN = 0.05f;
-auto root = [](float square) {
-#ifdef __CUDA_ARCH__
-    return sqrtf(square);
-#else
-    return __builtin_elementwise_sqrt(square); // a vector instruction without a branch
-#endif
-};
-alignas(64) float direction[3][N], from[3][N], spread[N], share[N];
-alignas(64) int faces_of[N], owner[N];
-int filled = 0;
-auto shade = [&]() {
-    alignas(64) float ts[N], us[N], vs[N], toward[3][N], normal[3][N], slope[2][N], tip[3][3][N];
-    for (int lane = filled; lane < N; ++lane) {
-        faces_of[lane] = faces_of[0];
-        spread[lane] = spread[0];
-        for (int axis = 0; axis < 3; ++axis) direction[axis][lane] = direction[axis][0];
-        if constexpr (TIMED)
-            for (int axis = 0; axis < 3; ++axis) from[axis][lane] = from[axis][0];
+constexpr int PAIRS_MAX = LANES * SAMPLES; // of a pixel and a surface that it shows
+alignas(64) float direction[3][PAIRS_MAX], spread_of[PAIRS_MAX], share[PAIRS_MAX], total[3][LANES] = {};
+alignas(64) int faces_of[PAIRS_MAX], owner[PAIRS_MAX];
+int pair_count = 0, unresolved = 0;
+if (!other_surface) {
+    for (int lane = 0; lane < LANES; ++lane) {
+        faces_of[lane] = own[lane];
+        owner[lane] = lane;
+        spread_of[lane] = footprint_width(SAMPLES) * ray[0][3][lane];
+        share[lane] = 1.0f;
+        for (int axis = 0; axis < 3; ++axis) direction[axis][lane] = ray[0][axis][lane];
     }
+    pair_count = LANES;
+} else {
+    unresolved_out.data[0] = 0xffff;
+#include "list_seen_faces.cuh"
+    if (!listed) return;
+    turn_rays(1);
+    turn_rays(2);
+#include "sample_points.cuh"
+#include "cover_lanes.cuh"
+    if (!listed) return;
+    alignas(64) float whole[LANES] = {}, weight[LANES];
+    for (int layer = 0; layer < layer_count; ++layer)
+        for (int lane = 0; lane < LANES; ++lane) whole[lane] += number[layer][lane];
+    for (int lane = 0; lane < LANES; ++lane) {
+        unresolved |= (!sky && whole[lane] < 0.5f * SAMPLES) << lane;
+        weight[lane] = 1.0f / (sky ? (float)SAMPLES : wp::max(whole[lane], 1.0f));
+        if (sky)
+            for (int channel = 0; channel < 3; ++channel)
+                total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
+    }
+    for (int layer = 0; layer < layer_count; ++layer)
+        for (int lane = 0; lane < LANES; ++lane) {
+            if (number[layer][lane] == 0.0f) continue;
+            wp::vec3 toward;
+            for (int axis = 0; axis < 3; ++axis)
+                toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
+                               + middle[1][layer][lane] * ray[2][axis][lane];
+            const int pose = TIMED ? lane : 0;
+            const wp::vec3 from(position[0][pose], position[1][pose], position[2][pose]);
+            faces_of[pair_count] = part_of(layer, own[lane], from, toward);
+            owner[pair_count] = lane;
+            spread_of[pair_count] = footprint_width(number[layer][lane]) * ray[0][3][lane];
+            share[pair_count] = number[layer][lane] * weight[lane];
+            for (int axis = 0; axis < 3; ++axis) direction[axis][pair_count] = toward[axis];
+            ++pair_count;
+        }
+    for (int pair = pair_count; pair % N != 0; ++pair) {
+        faces_of[pair] = faces_of[pair_count - 1];
+        owner[pair] = owner[pair_count - 1];
+        spread_of[pair] = spread_of[pair_count - 1];
+        for (int axis = 0; axis < 3; ++axis) direction[axis][pair] = direction[axis][pair_count - 1];
+    }
+}
+constexpr float NEARNESS_MIN = 1e-6f, COSINE_MIN = 0.05f; // as in `meet_plane.cuh`
+auto root = [](float square) { return __builtin_elementwise_sqrt(square); }; // a vector instruction without a branch
+for (int begin = 0; begin < pair_count; begin += N) {
+    const int* const parts = faces_of + begin;
+    alignas(64) float ts[N], us[N], vs[N], toward[3][N], normal[3][N], slope[2][N], tip[3][3][N];
     int other_faces = 0;
-    for (int lane = 0; lane < N; ++lane) other_faces |= faces_of[lane] ^ faces_of[0];
+    for (int lane = 0; lane < N; ++lane) other_faces |= parts[lane] ^ parts[0];
     for (int lane = 0; lane < (other_faces ? N : 1); ++lane)
         for (int corner = 0; corner < 3; ++corner) {
-            const wp::vec3& point = mesh.points[mesh.indices[3 * (size_t)faces_of[lane] + corner]];
+            const wp::vec3& point = mesh.points[mesh.indices[3 * (size_t)parts[lane] + corner]];
             for (int axis = 0; axis < 3; ++axis) tip[corner][axis][lane] = TIMED ? point[axis] : point[axis] - origin[axis];
         }
     if (!other_faces)
@@ -90,7 +118,7 @@ auto shade = [&]() {
     if constexpr (TIMED)
         for (int corner = 0; corner < 3; ++corner)
             for (int axis = 0; axis < 3; ++axis)
-                for (int lane = 0; lane < N; ++lane) tip[corner][axis][lane] -= from[axis][lane];
+                for (int lane = 0; lane < N; ++lane) tip[corner][axis][lane] -= position[axis][owner[begin + lane]];
     for (int lane = 0; lane < N; ++lane) { // as in `meet_plane.cuh`
         float function[3][3], weight_of[3], unit[3], facing = 0.0f;
         for (int side = 0; side < 3; ++side)
@@ -102,14 +130,14 @@ auto shade = [&]() {
             }
         const float volume = tip[0][0][lane] * function[0][0] + tip[0][1][lane] * function[0][1] + tip[0][2][lane] * function[0][2];
         const float scale = wp::abs(volume) > 1e-30f ? 1.0f / volume : 0.0f;
-        const float x = direction[0][lane], y = direction[1][lane], z = direction[2][lane];
+        const float x = direction[0][begin + lane], y = direction[1][begin + lane], z = direction[2][begin + lane];
         for (int side = 0; side < 3; ++side)
             weight_of[side] = scale * (function[side][0] * x + function[side][1] * y + function[side][2] * z);
         const float length = root(x * x + y * y + z * z);
         const float near = 1.0f / wp::max(weight_of[0] + weight_of[1] + weight_of[2], NEARNESS_MIN);
         float square = 0.0f;
         for (int axis = 0; axis < 3; ++axis) {
-            toward[axis][lane] = direction[axis][lane] / length;
+            toward[axis][lane] = direction[axis][begin + lane] / length;
             unit[axis] = function[0][axis] + function[1][axis] + function[2][axis];
             square += unit[axis] * unit[axis];
         }
@@ -130,33 +158,15 @@ auto shade = [&]() {
         }
     }
     {
-        auto& ray = toward;
-        auto& faces = faces_of;
+        const auto& ray = toward;
+        const int* const faces = parts;
+        const float* const spread = spread_of + begin;
 #include "shade_lanes.cuh"
-        for (int lane = 0; lane < filled; ++lane)
+        for (int lane = 0; lane < wp::min(pair_count - begin, N); ++lane)
             for (int channel = 0; channel < 3; ++channel)
-                total[channel][owner[lane]] += share[lane] * radiance[channel][lane];
+                total[channel][owner[begin + lane]] += share[begin + lane] * radiance[channel][lane];
     }
-    filled = 0;
-};
-for (int layer = 0; layer < layer_count; ++layer)
-    for (int lane = 0; lane < LANES; ++lane) {
-        if (number[layer][lane] == 0.0f) continue;
-        wp::vec3 toward;
-        for (int axis = 0; axis < 3; ++axis)
-            toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
-                           + middle[1][layer][lane] * ray[2][axis][lane];
-        const wp::vec3& place = position[TIMED ? lane : 0];
-        faces_of[filled] = part_of(layer, own[lane], place, toward);
-        if constexpr (TIMED)
-            for (int axis = 0; axis < 3; ++axis) from[axis][filled] = place[axis];
-        owner[filled] = lane;
-        spread[filled] = footprint_width(number[layer][lane]) * pixel_spread[lane];
-        share[filled] = number[layer][lane] * weight[lane];
-        for (int axis = 0; axis < 3; ++axis) direction[axis][filled] = toward[axis];
-        if (++filled == N) shade();
-    }
-if (filled) shade();
+}
 for (int lane = 0; lane < LANES; ++lane)
     for (int channel = 0; channel < 3; ++channel) radiance_out.data[lane][channel] = total[channel][lane];
 unresolved_out.data[0] = unresolved;

@@ -15,7 +15,6 @@
 
 #include "cortex/array.hpp"
 #include "cortex/broadcast.h"
-#include "cortex/slot.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
@@ -67,75 +66,6 @@ class Listener {
   int fd_;
   std::vector<int> unheard_;
   std::map<std::pair<std::uint64_t, std::uint64_t>, CortexHello> heard_;
-};
-
-// The publisher's end. Not for several threads at once.
-class Broadcast {
- public:
-  // Null if there is no memory.
-  static std::unique_ptr<Broadcast> open(std::uint64_t source) {
-    std::unique_ptr<Broadcast> made(new Broadcast);
-    if (cortex_writer_open(&made->writer_, source, ring_bytes) < 0) return nullptr;
-    made->open_ = true;
-    return made;
-  }
-  Broadcast(const Broadcast&) = delete;
-  Broadcast& operator=(const Broadcast&) = delete;
-  ~Broadcast() {
-    if (open_) cortex_writer_close(&writer_);
-  }
-
-  // The reader's number, -1 if it has left; the descriptors are ours in any case.
-  int add(const CortexHello& hello, bool strict, std::uint64_t first) noexcept {
-    return cortex_writer_add(&writer_, &hello, strict ? 1 : 0, first);
-  }
-  void remove(int member) noexcept { cortex_writer_remove(&writer_, member); }
-  // CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL or CORTEX_TOO_LARGE.
-  int put(Span<const std::uint8_t> frame) noexcept { return cortex_writer_put(&writer_, frame.data(), frame.size(), 0); }
-  // The last frame of all, of 64 bytes.
-  void end(Span<const std::uint8_t> frame) noexcept { cortex_writer_end(&writer_, frame.data(), frame.size()); }
-  // Sends all readers another way; nothing else may be called after this.
-  void dissolve() noexcept { cortex_writer_dissolve(&writer_); }
-  // Whether a reliable reader has no room for a frame.
-  bool is_full(int member, std::size_t size) noexcept {
-    return cortex_member_is_full(&writer_, &writer_.members[member], cortex_entry_bytes(size) + CORTEX_SPARE_BYTES) != 0;
-  }
-  // Waits for it no more, until it has read half.
-  void give_up(int member) noexcept { cortex_member_give_up(&writer_, &writer_.members[member]); }
-  // Whether a reliable reader has still to come to a slot.
-  bool is_behind(int member) noexcept { return cortex_member_is_behind(&writer_, &writer_.members[member]) != 0; }
-
-  // Makes slots for bodies of a size, if need be; false if there is no memory for them.
-  bool provide(std::size_t size, bool exact) noexcept {
-    cortex_writer_provide(&writer_, size, exact ? 1 : 0, 0);
-    return writer_.map->slot_bytes >= size;
-  }
-
-  // A slot to be written; without a buffer if none is free.
-  Slot acquire() {
-    int late = 0;
-    if (cortex_writer_look(&writer_, &late) == 0 && late != 0) return {};
-    const int index = cortex_slot_acquire(&writer_);
-    if (index < 0) return {};
-    CortexMap* map = writer_.map;
-    __atomic_fetch_add(&map->users, 1, __ATOMIC_RELAXED);
-    const Span<std::uint8_t> buffer(cortex_slot_memory(map, index), static_cast<std::size_t>(map->slot_bytes));
-    return {buffer, index, std::shared_ptr<CortexMap>(map, cortex_map_end), nullptr};
-  }
-  // Whether its ring is still in use.
-  bool has(const Slot& slot) const noexcept { return slot.index >= 0 && slot.map.get() == writer_.map; }
-  void abandon(const Slot& slot) noexcept {
-    if (has(slot)) cortex_slot_abandon(&writer_, slot.index);
-  }
-  // Sends the header of what was written into a slot, as `put`.
-  int commit(const Slot& slot, std::uint64_t sequence, Span<const std::uint8_t> header) noexcept {
-    return cortex_slot_commit(&writer_, slot.index, sequence, header.data(), header.size(), 0);
-  }
-
- private:
-  Broadcast() = default;
-  CortexWriter writer_{};
-  bool open_ = false;
 };
 
 // The subscriber's end. Not for several threads at once.

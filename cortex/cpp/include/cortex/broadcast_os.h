@@ -275,7 +275,7 @@ static inline void cortex_hello_close(const CortexHello *hello) {
     cortex_close_fd(hello->socket);
 }
 
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first) {
     int number = 0;
     while (number < writer->count && writer->members[number].used) ++number;
     void *page = MAP_FAILED;
@@ -290,6 +290,7 @@ static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hel
     CortexMember *member = &writer->members[number];
     member->used = 1;
     member->strict = strict;
+    member->timeout_ms = timeout_ms;
     member->late = member->left = 0;
     member->socket = hello->socket;
     member->bell = hello->bell;
@@ -337,7 +338,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, ui
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
         member->late = 1;
     }
-    cortex_ring_append(ring, before->data, old_capacity, head, CORTEX_MOVED, NULL, 0); /* the spare bytes have room for it */
+    cortex_ring_move(ring, before->data, old_capacity, head); /* the spare bytes have room for it */
     cortex_writer_wake(writer);
     cortex_map_end(before);
     close(fd);
@@ -444,8 +445,8 @@ static inline void cortex_hello_close(const CortexHello *hello) { (void)hello; }
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity) {
     return (void)writer, (void)source, (void)capacity, cortex_unsupported();
 }
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
-    return (void)writer, (void)hello, (void)strict, (void)first, cortex_unsupported();
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first) {
+    return (void)writer, (void)hello, (void)strict, (void)timeout_ms, (void)first, cortex_unsupported();
 }
 static inline void cortex_writer_remove(CortexWriter *writer, int member) { (void)writer, (void)member; }
 static inline void cortex_writer_forget(CortexWriter *writer, int member) { (void)writer, (void)member; }

@@ -82,6 +82,29 @@ static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *me
     return member->strict && member->tail < end;
 }
 
+/* Whether a reliable reader has no room for a frame of a size, or with size 0 has not come to all slots. */
+static inline int cortex_member_is_in_the_way(CortexWriter *writer, CortexMember *member, uint64_t size) {
+    return size ? cortex_member_is_full(writer, member, cortex_entry_bytes(size) + CORTEX_SPARE_BYTES) : cortex_member_is_behind(writer, member);
+}
+
+/* The shortest time for which one that is in the way may hold up the publisher [ms]; -1: nobody is. */
+static inline int64_t cortex_writer_patience(CortexWriter *writer, uint64_t size) {
+    int64_t shortest = -1;
+    for (int index = 0; index < writer->count; ++index) {
+        CortexMember *member = &writer->members[index];
+        if ((shortest < 0 || member->timeout_ms < shortest) && cortex_member_is_in_the_way(writer, member, size)) shortest = member->timeout_ms;
+    }
+    return shortest;
+}
+
+/* Wait no more for those that have been in the way for their time. */
+static inline void cortex_writer_give_up(CortexWriter *writer, uint64_t size, int64_t waited_ms) {
+    for (int index = 0; index < writer->count; ++index) {
+        CortexMember *member = &writer->members[index];
+        if (member->timeout_ms <= waited_ms && cortex_member_is_in_the_way(writer, member, size)) cortex_member_give_up(writer, member);
+    }
+}
+
 static inline uint64_t cortex_most(uint64_t a, uint64_t b) { return a > b ? a : b; }
 static inline uint64_t cortex_least(uint64_t a, uint64_t b) { return a < b ? a : b; }
 

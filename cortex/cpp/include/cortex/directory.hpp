@@ -79,17 +79,17 @@ class Directory {
   // Without a registry (an empty address) nobody else is known.
   Directory(zmq::context_t& context, std::function<records::NodeRecord()> record, const std::string& registry,
             std::shared_ptr<const Keys> keys, std::shared_ptr<net::Complaints> complaints)
-      : record_(std::move(record)), keys_(std::move(keys)), complaints_(std::move(complaints)) {
+      : record_(std::move(record)), keys_(std::move(keys)), complaints_(std::move(complaints)), address_(registry) {
     own_ = next_record();
-    if (!registry.empty()) connect(context, registry);
+    if (has_registry()) connect(context);
   }
 
   // The socket to poll; null without a registry.
-  zmq::socket_t* socket() noexcept { return link_ == nullptr ? nullptr : &link_->socket; }
+  zmq::socket_t* socket() noexcept { return has_registry() ? &socket_ : nullptr; }
 
   const Nodes& nodes() const noexcept { return nodes_; }
   std::uint64_t rejected() const noexcept { return rejected_; }
-  bool connected() const noexcept { return link_ == nullptr || link_->welcomed; }
+  bool connected() const noexcept { return !has_registry() || welcomed_; }
   // Whether `nodes` has changed since the last call.
   bool take_changed() noexcept { return std::exchange(changed_, false); }
 
@@ -98,69 +98,51 @@ class Directory {
 
   std::int64_t deadline_ns() const {
     const std::int64_t deadline = tick_ns_ + heartbeat_ns;
-    return dirty_ ? tick_ns_ : link_ == nullptr ? deadline : std::min(deadline, link_->next_ns);
+    return dirty_ ? tick_ns_ : has_registry() ? std::min(deadline, next_ns_) : deadline;
   }
 
   void tick() {
     const std::int64_t now_ns = monotonic_ns();
     const std::int64_t stood_ns = tick_ns_ == 0 ? 0 : now_ns - tick_ns_;
     tick_ns_ = now_ns;
-    if (stood_ns > stall_ns && link_ != nullptr) forgive(*link_, stood_ns);
-    if (link_ != nullptr) receive(*link_, now_ns);
+    if (stood_ns > stall_ns) forgive(stood_ns);
+    if (has_registry()) receive(now_ns);
     if (dirty_) {
       own_ = next_record();
-      if (link_ != nullptr && link_->welcomed) say_hello(*link_, now_ns, false);
+      if (welcomed_) say_hello(now_ns, false);
     }
-    if (link_ == nullptr) return;
-    if (now_ns >= link_->next_ns) beat(*link_, now_ns);
-    expire(*link_, now_ns);
+    if (!has_registry()) return;
+    if (now_ns >= next_ns_) beat(now_ns);
+    expire(now_ns);
   }
 
   void leave() {
-    if (link_ != nullptr && link_->welcomed) try_send(link_->socket, control_frame(records::Leave{own_.node}));
+    if (welcomed_) try_send(control_frame(records::Leave{own_.node}));
   }
 
  private:
-  struct Link {
-    std::string address;
-    zmq::socket_t socket;
-    std::int64_t next_ns = 0;   // when to send the next heartbeat or `Hello`
-    std::int64_t heard_ns = 0;  // when the other side was last heard
-    std::int64_t wait_ns = first_wait_ns;
-    std::int64_t quiet_ns = 0;  // until when an `Alive` is no reason for a further `Hello`
-    bool asked = false;
-    bool welcomed = false;
-    std::uint64_t epoch = 0;
-    std::uint64_t version = 0;
-    std::map<std::uint64_t, std::uint64_t> missing;  // revisions that `Welcome` named and that have not come yet
-    std::map<std::uint64_t, std::int64_t> doubted;   // when to drop nodes that the registry did not name
-  };
-
   static constexpr std::int64_t first_wait_ns = 2'000'000;
   static constexpr std::int64_t last_wait_ns = 50'000'000;
 
-  static bool try_send(zmq::socket_t& socket, zmq::message_t frame) {
-    return socket.send(std::move(frame), zmq::send_flags::dontwait).has_value();
-  }
+  bool has_registry() const noexcept { return !address_.empty(); }
 
-  void connect(zmq::context_t& context, const std::string& address) {
-    if (address.rfind("tcp://", 0) != 0 && address.rfind("ipc://", 0) != 0) {
-      throw std::invalid_argument("a registry must be a tcp:// or ipc:// address, got '" + address + "'");
+  bool try_send(zmq::message_t frame) { return socket_.send(std::move(frame), zmq::send_flags::dontwait).has_value(); }
+
+  void connect(zmq::context_t& context) {
+    if (address_.rfind("tcp://", 0) != 0 && address_.rfind("ipc://", 0) != 0) {
+      throw std::invalid_argument("a registry must be a tcp:// or ipc:// address, got '" + address_ + "'");
     }
-    auto link = std::make_unique<Link>();
-    link->address = address;
-    link->socket = net::make_socket(context, zmq::socket_type::dealer, net::is_tcp(address), 4096, 200);
-    link->socket.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
+    socket_ = net::make_socket(context, zmq::socket_type::dealer, net::is_tcp(address_), 4096, 200);
+    socket_.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
     // Nothing may queue for a registry that is not there: a `send` that fails tells us so at once.
-    link->socket.set(zmq::sockopt::immediate, true);
-    if (keys_ != nullptr && net::is_tcp(address)) {
-      const std::string server_key = keys_->of_host(net::host_of(address));
-      if (!keys_->allows(server_key)) throw std::invalid_argument("the key of " + address + " is not authorised");
-      keys_->apply_client(link->socket, server_key);
+    socket_.set(zmq::sockopt::immediate, true);
+    if (keys_ != nullptr && net::is_tcp(address_)) {
+      const std::string server_key = keys_->of_host(net::host_of(address_));
+      if (!keys_->allows(server_key)) throw std::invalid_argument("the key of " + address_ + " is not authorised");
+      keys_->apply_client(socket_, server_key);
     }
-    link->socket.connect(address);
-    link->heard_ns = monotonic_ns();
-    link_ = std::move(link);
+    socket_.connect(address_);
+    heard_ns_ = monotonic_ns();
   }
 
   records::NodeRecord next_record() {
@@ -185,92 +167,92 @@ class Directory {
 
   // Sending
 
-  void beat(Link& link, std::int64_t now_ns) {
-    if (!link.welcomed) return say_hello(link, now_ns, true);
-    if (!try_send(link.socket, control_frame(records::Heartbeat{own_.node, own_.revision, 0}))) return lose(link, now_ns);
-    link.next_ns = now_ns + heartbeat_ns;
-    warn_of_silence(link, now_ns);
+  void beat(std::int64_t now_ns) {
+    if (!welcomed_) return say_hello(now_ns, true);
+    if (!try_send(control_frame(records::Heartbeat{own_.node, own_.revision, 0}))) return lose(now_ns);
+    next_ns_ = now_ns + heartbeat_ns;
+    warn_of_silence(now_ns);
   }
 
-  void say_hello(Link& link, std::int64_t now_ns, bool snapshot) {
-    if (!try_send(link.socket, control_frame(records::Hello{snapshot, own_}))) return lose(link, now_ns);
-    link.wait_ns = link.asked ? std::min(2 * link.wait_ns, lease_ns) : answer_ns;
-    link.asked = true;
-    link.quiet_ns = now_ns + answer_ns;
-    link.next_ns = now_ns + (link.welcomed ? heartbeat_ns : link.wait_ns);
+  void say_hello(std::int64_t now_ns, bool snapshot) {
+    if (!try_send(control_frame(records::Hello{snapshot, own_}))) return lose(now_ns);
+    wait_ns_ = asked_ ? std::min(2 * wait_ns_, lease_ns) : answer_ns;
+    asked_ = true;
+    quiet_ns_ = now_ns + answer_ns;
+    next_ns_ = now_ns + (welcomed_ ? heartbeat_ns : wait_ns_);
   }
 
   // The connection is gone. What was known through it stays, until its lease says otherwise.
-  void lose(Link& link, std::int64_t now_ns) {
-    if (link.welcomed || link.asked) link.wait_ns = first_wait_ns;
-    link.welcomed = link.asked = false;
-    link.next_ns = now_ns + link.wait_ns;
-    link.wait_ns = std::min(2 * link.wait_ns, last_wait_ns);
-    warn_of_silence(link, now_ns);
+  void lose(std::int64_t now_ns) {
+    if (welcomed_ || asked_) wait_ns_ = first_wait_ns;
+    welcomed_ = asked_ = false;
+    next_ns_ = now_ns + wait_ns_;
+    wait_ns_ = std::min(2 * wait_ns_, last_wait_ns);
+    warn_of_silence(now_ns);
   }
 
-  void warn_of_silence(const Link& link, std::int64_t now_ns) {
-    if (now_ns - link.heard_ns > 3 * lease_ns) {
-      complaints_->once("silent " + link.address, "no answer of the registry at " + link.address + "; is it running? Trying on.");
+  void warn_of_silence(std::int64_t now_ns) {
+    if (now_ns - heard_ns_ > 3 * lease_ns) {
+      complaints_->once("silent " + address_, "no answer of the registry at " + address_ + "; is it running? Trying on.");
     }
   }
 
   // Receiving
 
-  void receive(Link& link, std::int64_t now_ns) {
+  void receive(std::int64_t now_ns) {
     zmq::message_t frame;
-    for (int budget = 256; budget > 0 && link.socket.recv(frame, zmq::recv_flags::dontwait); --budget) {
+    for (int budget = 256; budget > 0 && socket_.recv(frame, zmq::recv_flags::dontwait); --budget) {
       try {
         if (frame.more()) {
-          net::drop_parts(link.socket);
+          net::drop_parts(socket_);
           throw MalformedMessage("several frames where one was expected");
         }
-        on_frame(link, parse_control(net::bytes(frame)), now_ns);
+        on_frame(parse_control(net::bytes(frame)), now_ns);
       } catch (const MalformedMessage& error) {
         ++rejected_;
-        complaints_->once("control " + link.address, "rejected a frame of " + link.address + ": " + error.what());
+        complaints_->once("control " + address_, "rejected a frame of " + address_ + ": " + error.what());
       }
     }
   }
 
-  void on_frame(Link& link, const ControlFrame& frame, std::int64_t now_ns) {
-    link.heard_ns = now_ns;
+  void on_frame(const ControlFrame& frame, std::int64_t now_ns) {
+    heard_ns_ = now_ns;
     if (frame.is<records::Welcome>()) {
-      on_welcome(link, frame.as<records::Welcome>(), now_ns);
+      on_welcome(frame.as<records::Welcome>(), now_ns);
     } else if (frame.is<records::Alive>()) {
-      on_alive(link, frame.as<records::Alive>(), now_ns);
+      on_alive(frame.as<records::Alive>(), now_ns);
     } else if (frame.is<records::Changed>()) {
-      on_changed(link, frame.as<records::Changed>());
+      on_changed(frame.as<records::Changed>());
     } else if (frame.is<records::Gone>()) {
       const auto gone = frame.as<records::Gone>();
-      count(link, gone.version);
-      link.missing.erase(gone.node);
-      link.doubted.erase(gone.node);
+      count(gone.version);
+      missing_.erase(gone.node);
+      doubted_.erase(gone.node);
       drop(gone.node);
     } else if (frame.is<records::Refused>()) {
-      complaints_->once("refused " + link.address,
-                        link.address + " refuses this node: " + frame.as<records::Refused>().reason);
-      link.wait_ns = lease_ns;
-      link.quiet_ns = now_ns + lease_ns;
-      if (!link.welcomed) link.next_ns = link.quiet_ns;
+      complaints_->once("refused " + address_,
+                        address_ + " refuses this node: " + frame.as<records::Refused>().reason);
+      wait_ns_ = lease_ns;
+      quiet_ns_ = now_ns + lease_ns;
+      if (!welcomed_) next_ns_ = quiet_ns_;
     } else {
       throw MalformedMessage("an unexpected control message");
     }
   }
 
-  void greet(Link& link, std::int64_t now_ns) {
-    if (!link.welcomed) link.next_ns = now_ns + heartbeat_ns;
-    link.welcomed = true;
-    link.asked = false;
-    link.quiet_ns = 0;
+  void greet(std::int64_t now_ns) {
+    if (!welcomed_) next_ns_ = now_ns + heartbeat_ns;
+    welcomed_ = true;
+    asked_ = false;
+    quiet_ns_ = 0;
   }
 
-  void on_welcome(Link& link, const records::Welcome& welcome, std::int64_t now_ns) {
+  void on_welcome(const records::Welcome& welcome, std::int64_t now_ns) {
     if (welcome.nodes.size() != welcome.revisions.size()) throw MalformedMessage("a welcome with lists of different lengths");
-    greet(link, now_ns);
-    link.epoch = welcome.epoch;
-    link.version = welcome.version;
-    link.missing.clear();
+    greet(now_ns);
+    epoch_ = welcome.epoch;
+    version_ = welcome.version;
+    missing_.clear();
     std::set<std::uint64_t> named;
     for (std::size_t index = 0; index < welcome.nodes.size(); ++index) {
       const std::uint64_t node = welcome.nodes[index];
@@ -278,7 +260,7 @@ class Directory {
       named.insert(node);
       const auto known = nodes_.find(node);
       if (known == nodes_.end() || known->second.revision != welcome.revisions[index]) {
-        link.missing[node] = welcome.revisions[index];
+        missing_[node] = welcome.revisions[index];
       }
     }
     // A registry that was just started does not know everybody yet: one lease of grace.
@@ -286,24 +268,24 @@ class Directory {
     for (const auto& entry : nodes_) {
       const std::uint64_t node = entry.first;
       if (named.count(node) != 0) continue;
-      const auto since = link.doubted.find(node);
-      doubted[node] = since != link.doubted.end() ? since->second : now_ns + lease_ns;
+      const auto since = doubted_.find(node);
+      doubted[node] = since != doubted_.end() ? since->second : now_ns + lease_ns;
     }
-    link.doubted = std::move(doubted);
+    doubted_ = std::move(doubted);
   }
 
-  void on_alive(Link& link, const records::Alive& alive, std::int64_t now_ns) {
-    if (!link.welcomed || now_ns < link.quiet_ns) return;  // the answer to our last `Hello` says more
-    if (alive.epoch != link.epoch || alive.version != link.version || !link.missing.empty()) return say_hello(link, now_ns, true);
-    if (alive.held != own_.revision) say_hello(link, now_ns, false);
+  void on_alive(const records::Alive& alive, std::int64_t now_ns) {
+    if (!welcomed_ || now_ns < quiet_ns_) return;  // the answer to our last `Hello` says more
+    if (alive.epoch != epoch_ || alive.version != version_ || !missing_.empty()) return say_hello(now_ns, true);
+    if (alive.held != own_.revision) say_hello(now_ns, false);
   }
 
-  void on_changed(Link& link, records::Changed changed) {
+  void on_changed(records::Changed changed) {
     check(changed.record);
     const std::uint64_t node = changed.record.node;
-    count(link, changed.version);
-    link.missing.erase(node);
-    link.doubted.erase(node);
+    count(changed.version);
+    missing_.erase(node);
+    doubted_.erase(node);
     if (node == own_.node) return;
     const auto known = nodes_.find(node);
     if (known != nodes_.end() && known->second.revision == changed.record.revision) return;
@@ -311,22 +293,22 @@ class Directory {
     changed_ = true;
   }
 
-  static void count(Link& link, std::uint64_t version) noexcept {
-    if (link.welcomed && version == link.version + 1) link.version = version;
+  void count(std::uint64_t version) noexcept {
+    if (welcomed_ && version == version_ + 1) version_ = version;
   }
 
   // What is known
 
-  static void forgive(Link& link, std::int64_t stood_ns) {
-    link.heard_ns += stood_ns;
-    for (auto& doubt : link.doubted) doubt.second += stood_ns;
+  void forgive(std::int64_t stood_ns) {
+    heard_ns_ += stood_ns;
+    for (auto& doubt : doubted_) doubt.second += stood_ns;
   }
 
-  void expire(Link& link, std::int64_t now_ns) {
-    if (!link.welcomed) return;  // without a registry nobody is removed
-    for (auto doubt = link.doubted.begin(); doubt != link.doubted.end();) {
+  void expire(std::int64_t now_ns) {
+    if (!welcomed_) return;  // without a registry nobody is removed
+    for (auto doubt = doubted_.begin(); doubt != doubted_.end();) {
       if (now_ns > doubt->second) drop(doubt->first);
-      doubt = now_ns > doubt->second ? link.doubted.erase(doubt) : std::next(doubt);
+      doubt = now_ns > doubt->second ? doubted_.erase(doubt) : std::next(doubt);
     }
   }
 
@@ -335,7 +317,6 @@ class Directory {
   std::function<records::NodeRecord()> record_;
   std::shared_ptr<const Keys> keys_;
   std::shared_ptr<net::Complaints> complaints_;
-  std::unique_ptr<Link> link_;
   records::NodeRecord own_;
   std::uint64_t revision_ = 0;
   bool dirty_ = false;
@@ -343,6 +324,18 @@ class Directory {
   std::uint64_t rejected_ = 0;
   std::int64_t tick_ns_ = 0;
   Nodes nodes_;
+  const std::string address_;  // of the registry; empty: there is none
+  zmq::socket_t socket_;
+  std::int64_t next_ns_ = 0;   // when to send the next heartbeat or `Hello`
+  std::int64_t heard_ns_ = 0;  // when the registry was last heard
+  std::int64_t wait_ns_ = first_wait_ns;
+  std::int64_t quiet_ns_ = 0;  // until when an `Alive` is no reason for a further `Hello`
+  bool asked_ = false;
+  bool welcomed_ = false;
+  std::uint64_t epoch_ = 0;
+  std::uint64_t version_ = 0;
+  std::map<std::uint64_t, std::uint64_t> missing_;  // revisions that `Welcome` named and that have not come yet
+  std::map<std::uint64_t, std::int64_t> doubted_;   // when to drop nodes that the registry did not name
 };
 
 }  // namespace cortex::detail

@@ -75,9 +75,9 @@ class Node {
   Publisher<T> advertise(const std::string& topic, const PublisherOptions& options = {}) {
     check_open(topic);
     const auto max_wait_ms = static_cast<std::uint32_t>(std::clamp<std::int64_t>(options.max_wait.count(), 0, 86'400'000));
-    auto core = std::make_shared<detail::PublisherCore>(pub_sockets_, topic, Codec<T>::fingerprint, Codec<T>::stamped,
-                                                        options.latch, options.inline_max, max_wait_ms, Codec<T>::fixed,
-                                                        complaints_);
+    auto core = detail::PublisherCore::enlist(std::make_shared<detail::PublisherCore>(
+        pub_sockets_, topic, Codec<T>::fingerprint, Codec<T>::stamped, options.latch, options.inline_max, max_wait_ms,
+        Codec<T>::fixed, complaints_));
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       publishers_.push_back({core, std::string(Codec<T>::name), std::string(Codec<T>::schema)});
@@ -123,6 +123,7 @@ class Node {
     {
       const std::lock_guard<std::mutex> lock(pub_sockets_->mutex);
       pub_sockets_->closed = true;
+      pub_sockets_->publishers.clear();
       pub_sockets_->lossy.socket.close();
       pub_sockets_->strict.socket.close();
     }
@@ -268,8 +269,7 @@ class Node {
       {
         const detail::Lock lock(pub_sockets_->mutex);
         pub_sockets_->refresh();
-        pub_sockets_->ended.repeat(monotonic_ns());
-        if (pub_sockets_->ended.empty()) return;
+        if (!pub_sockets_->repeat_ends(monotonic_ns())) return;
       }
       in_time = backoff.wait();
     }
@@ -318,7 +318,7 @@ class Node {
       const detail::Lock lock(pub_sockets_->mutex, std::try_to_lock);
       if (lock.owns_lock()) {
         pub_sockets_->refresh();
-        pub_sockets_->ended.repeat(monotonic_ns());
+        pub_sockets_->repeat_ends(monotonic_ns());
       }
     }
     changed = directory_->take_changed() || changed;

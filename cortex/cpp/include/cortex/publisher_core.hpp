@@ -40,12 +40,14 @@ class PublisherCore {
         inline_max_(inline_max),
         max_wait_ms_(max_wait_ms),
         exact_(exact),
-        complaints_(std::move(complaints)) {
-    const Lock lock(pub_sockets_->mutex);
-    pub_sockets_->publishers[source] = this;
-  }
+        complaints_(std::move(complaints)) {}
 
-  ~PublisherCore() { close(); }
+  // What users share: the publisher closes with the last of them, but lasts until readers of sockets have confirmed it.
+  static std::shared_ptr<PublisherCore> enlist(std::shared_ptr<PublisherCore> core) {
+    const Lock lock(core->pub_sockets_->mutex);
+    core->pub_sockets_->publishers[core->source] = core;
+    return {core.get(), [core](PublisherCore*) { core->close(); }};
+  }
   PublisherCore(const PublisherCore&) = delete;
   PublisherCore& operator=(const PublisherCore&) = delete;
 
@@ -91,11 +93,11 @@ class PublisherCore {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
     if (!provide(lock, size)) return private_slot(size);
-    Slot slot = readers_.ring().acquire();
+    Slot slot = readers_.acquire();
     if (slot.index < 0) {
       wait_for_readers(lock, 0, [&] {
         if (!readers_.has_members()) return true;
-        slot = readers_.ring().acquire();
+        slot = readers_.acquire();
         return slot.index >= 0;
       });
     }
@@ -110,7 +112,7 @@ class PublisherCore {
   void abandon(const Slot& slot) noexcept {
     if (slot.index < 0) return;
     const Lock lock(pub_sockets_->mutex);
-    if (readers_.has_members()) readers_.ring().abandon(slot);
+    readers_.abandon(slot);
   }
 
   // Sends what was written into a slot; false if a reliable subscriber lost it.
@@ -143,8 +145,7 @@ class PublisherCore {
     const Lock lock(pub_sockets_->mutex, std::try_to_lock);
     if (!lock.owns_lock() || closed_ || pub_sockets_->closed) return;
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
-    zmq::message_t frame(wire::header_size);
-    write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, 0);
+    zmq::message_t frame = last_frame();
     bool sent = !is_late_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
     if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
     if (has_sockets(pub_sockets_->strict)) sent &= pub_sockets_->strict.try_send(std::move(frame));
@@ -164,6 +165,7 @@ class PublisherCore {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
     if (reader->pub_socket->strict && reader->member < 0) is_late_ = false;
+    if (closed_) settle();
   }
 
   // A reliable reader has accounted for all below a sequence; called under the lock.
@@ -172,6 +174,18 @@ class PublisherCore {
       if (reader->request.reader == number) reader->confirmed = std::max(reader->confirmed, sequence);
     }
     if (sequence >= late_until_) is_late_ = false;  // else it was too late once more since
+    if (closed_) settle();
+  }
+
+  // Tells those that have not confirmed the end of it again: libzmq drops it where a queue is full; false if it has
+  // not ended. Called under the lock.
+  bool repeat_end() {
+    if (!closed_) return false;
+    zmq::message_t frame = last_frame();
+    for (PubSocket* pub_socket : {&pub_sockets_->lossy, &pub_sockets_->strict}) {
+      if (has_sockets(*pub_socket)) pub_socket->try_send(share(frame));
+    }
+    return true;
   }
 
   std::size_t reader_count() {
@@ -185,6 +199,9 @@ class PublisherCore {
     return counters_;
   }
 
+  // Whether it waits for readers to confirm its end; called under the lock.
+  bool is_ending() const noexcept { return closed_; }
+
   bool closed() const {
     const Lock lock(pub_sockets_->mutex);
     return closed_ || pub_sockets_->closed;
@@ -195,12 +212,13 @@ class PublisherCore {
     const Lock lock(pub_sockets_->mutex);
     if (closed_) return;
     closed_ = true;
-    pub_sockets_->publishers.erase(source);
+    latched_.clear();
     try {
-      say_end();
-    } catch (...) {  // no memory to keep it: it is lost, as with the end of the process
-      readers_.release();
+      readers_.end(net::bytes(last_frame()));  // what is in the ring stays the readers'
+      if (!pub_sockets_->closed) repeat_end();
+    } catch (...) {  // no memory to say so: the node does it again
     }
+    settle();
   }
 
  private:
@@ -227,21 +245,17 @@ class PublisherCore {
     pub_sockets_->refresh();
   }
 
-  // Tells readers that this was all; the node says it again to those that read sockets, until they confirm it.
-  void say_end() {
-    std::uint8_t last[wire::header_size];
-    write_header(last, 'N', sequence_, 0, 0, 0);
-    readers_.end({last, sizeof last});  // what is in the ring stays the readers'
-    if (pub_sockets_->closed) return;
-    zmq::message_t frame(last, sizeof last);
-    if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
-    if (has_sockets(pub_sockets_->strict)) pub_sockets_->strict.try_send(std::move(frame));
-    std::vector<EndedPublishers::Reader> owed;
-    for (const auto& reader : readers_.release()) {
-      const bool owes = reader->request.confirms && reader->member < 0 && reader->confirmed < sequence_;
-      if (owes) owed.push_back({reader->key, reader->pub_socket, reader->request.reader});
-    }
-    pub_sockets_->ended.add(sequence_, std::string(reinterpret_cast<const char*>(last), sizeof last), std::move(owed));
+  // Says how many messages there were.
+  zmq::message_t last_frame() const {
+    zmq::message_t frame(wire::header_size);
+    write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, 0);
+    return frame;
+  }
+
+  // Lets go of readers that know all there was, or need not say so; the last ends it.
+  void settle() noexcept {
+    readers_.settle(sequence_);
+    if (readers_.empty()) pub_sockets_->publishers.erase(source);
   }
 
   void answer(const Reader& reader, const std::string& latched) {
@@ -310,14 +324,14 @@ class PublisherCore {
   template <class Attempt>
   bool wait_for_readers(Lock& lock, std::size_t frame_size, Attempt attempt) {
     const std::int64_t begin_ns = monotonic_ns();
+    const auto waited_ms = [&] { return (monotonic_ns() - begin_ns) / 1'000'000; };
     while (!attempt()) {
-      const std::uint32_t patience_ms = readers_.patience_ms(frame_size);
-      if (patience_ms == UINT32_MAX) return attempt();
-      const std::int64_t end_ns = begin_ns + std::int64_t{patience_ms} * 1'000'000;
-      const std::int64_t left_ms = std::max<std::int64_t>((end_ns - monotonic_ns() + 999'999) / 1'000'000, 0);
+      const std::int64_t patience_ms = readers_.patience_ms(frame_size);
+      if (patience_ms < 0) return attempt();
+      const std::int64_t left_ms = std::max<std::int64_t>(patience_ms - waited_ms(), 0);
       if (await_room(lock, static_cast<std::uint32_t>(left_ms), attempt)) break;
       if (closed_ || pub_sockets_->closed) return false;
-      readers_.give_up(frame_size, monotonic_ns() - begin_ns);
+      readers_.give_up(frame_size, waited_ms());
     }
     return true;
   }
@@ -325,12 +339,12 @@ class PublisherCore {
   // A body that found no slot travels through the ring as a message.
   bool send_large_to_ring(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
     if (!readers_.has_members()) return true;
-    if (readers_.ring().has(slot)) {
+    if (readers_.has(slot)) {
       std::uint8_t header[wire::header_size];
       write_header(header, 'S', sequence, stamp_ns, size, static_cast<std::uint64_t>(slot.index));
       return send_to_ring(lock, sizeof header, [&] {
         if (!readers_.has_members()) return static_cast<int>(CORTEX_WRITTEN);
-        return readers_.ring().commit(slot, sequence, {header, sizeof header});
+        return readers_.commit(slot, sequence, {header, sizeof header});
       });
     }
     std::vector<std::uint8_t> frame(wire::header_size + size);
@@ -363,7 +377,7 @@ class PublisherCore {
   // their sockets, and waited for a little.
   bool provide(Lock& lock, std::size_t size) {
     if (!readers_.has_members()) return false;
-    if (readers_.ring().provide(size, exact_)) return true;
+    if (readers_.provide(size, exact_)) return true;
     complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
     readers_.dissolve();
     const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(pub_sockets_->lossy), readers_.timeout_ms(pub_sockets_->strict)});
@@ -405,27 +419,29 @@ inline void PubSockets::refresh() {
         std::uint64_t reader = 0;
         std::uint64_t sequence = 0;
         const auto resumed = publishers.find(wire::read_resume(subscription, reader, sequence));
-        if (bytes[0] != 1) continue;
-        if (resumed != publishers.end()) {
-          resumed->second->resume(reader, sequence);
-        } else {
-          ended.confirm(reader, sequence);
-        }
+        if (bytes[0] == 1 && resumed != publishers.end()) std::shared_ptr(resumed->second)->resume(reader, sequence);
         continue;
       }
       const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
       const auto publisher = publishers.find(request.source);
       if (publisher == publishers.end()) {
         attached.erase(key);
-        if (bytes[0] == 0) ended.detach(key);
       } else if (bytes[0] == 1) {
         attached[key] = pub_socket;
         publisher->second->attach(*pub_socket, key, request);
       } else if (attached.erase(key) > 0) {
-        publisher->second->detach(key);
+        std::shared_ptr(publisher->second)->detach(key);
       }
     }
   }
+}
+
+inline bool PubSockets::repeat_ends(std::int64_t now_ns) {
+  const bool is_due = now_ns - told_ns_ >= 20'000'000;
+  if (is_due) told_ns_ = now_ns;
+  bool some = false;
+  for (const auto& publisher : publishers) some |= is_due ? publisher.second->repeat_end() : publisher.second->is_ending();
+  return some;
 }
 
 }  // namespace cortex::detail

@@ -10,8 +10,9 @@
 #include <utility>
 #include <vector>
 
-#include "cortex/pub_socket.hpp"
 #include "cortex/broadcast.hpp"
+#include "cortex/pub_socket.hpp"
+#include "cortex/slot.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
@@ -60,19 +61,22 @@ class Readers {
     const std::shared_ptr<Reader> reader = std::move(*found);
     all_.erase(found);
     --(reader->member >= 0 ? members_ : reader->pub_socket->strict ? strict_ : lossy_);
-    if (reader->member >= 0) ring_->remove(reader->member);
+    if (reader->member >= 0) cortex_writer_remove(ring_.get(), reader->member);
     return reader;
   }
 
-  // Sends a frame through the ring, see `Broadcast`.
-  int put(Span<const std::uint8_t> frame) noexcept { return has_members() ? ring_->put(frame) : CORTEX_WRITTEN; }
+  // Sends a frame through the ring: CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL or CORTEX_TOO_LARGE.
+  int put(Span<const std::uint8_t> frame) noexcept {
+    return has_members() ? cortex_writer_put(ring_.get(), frame.data(), frame.size(), 0) : CORTEX_WRITTEN;
+  }
+  // The last frame of all, of 64 bytes.
   void end(Span<const std::uint8_t> frame) noexcept {
-    if (has_members()) ring_->end(frame);
+    if (has_members()) cortex_writer_end(ring_.get(), frame.data(), frame.size());
   }
 
   // Sends all members of the ring to their sockets, for good.
   void dissolve() noexcept {
-    ring_->dissolve();
+    cortex_writer_dissolve(ring_.get());
     ring_.reset();
     is_dissolved_ = true;
     for (const auto& reader : all_) {
@@ -90,32 +94,52 @@ class Readers {
     });
   }
 
-  // The ring; there is one if it has members.
-  Broadcast& ring() noexcept { return *ring_; }
+  // What follows is of the ring; there is one if it has members.
 
-  // The shortest time for which a reliable reader that has no room in the ring, or with size 0 has not come to all slots,
-  // may hold up the publisher; UINT32_MAX: there is none.
-  std::uint32_t patience_ms(std::size_t frame_size) const noexcept {
-    std::uint32_t shortest = UINT32_MAX;
-    for (const auto& reader : all_) {
-      if (is_full(*reader, frame_size)) shortest = std::min(shortest, reader->request.timeout_ms);
-    }
-    return shortest;
+  // Makes slots for bodies of a size, if need be; false if there is no memory for them.
+  bool provide(std::size_t size, bool exact) noexcept {
+    cortex_writer_provide(ring_.get(), size, exact ? 1 : 0, 0);
+    return ring_->map->slot_bytes >= size;
   }
-
+  // A slot to be written; without a buffer if none is free.
+  Slot acquire() {
+    int late = 0;
+    if (cortex_writer_look(ring_.get(), &late) == 0 && late != 0) return {};
+    const int index = cortex_slot_acquire(ring_.get());
+    if (index < 0) return {};
+    CortexMap* map = ring_->map;
+    __atomic_fetch_add(&map->users, 1, __ATOMIC_RELAXED);
+    const Span<std::uint8_t> buffer(cortex_slot_memory(map, index), static_cast<std::size_t>(map->slot_bytes));
+    return {buffer, index, std::shared_ptr<CortexMap>(map, cortex_map_end), nullptr};
+  }
+  // Whether a slot's ring is still in use.
+  bool has(const Slot& slot) const noexcept { return has_members() && slot.index >= 0 && slot.map.get() == ring_->map; }
+  void abandon(const Slot& slot) noexcept {
+    if (has(slot)) cortex_slot_abandon(ring_.get(), slot.index);
+  }
+  // Sends the header of what was written into a slot, as `put`.
+  int commit(const Slot& slot, std::uint64_t sequence, Span<const std::uint8_t> header) noexcept {
+    return cortex_slot_commit(ring_.get(), slot.index, sequence, header.data(), header.size(), 0);
+  }
+  // How long a reliable reader may still take that has no room for a frame, or with size 0 has not come to all slots
+  // [ms]; -1: there is none.
+  std::int64_t patience_ms(std::size_t size) noexcept { return has_members() ? cortex_writer_patience(ring_.get(), size) : -1; }
   // Waits no more for those that have held it up for their time.
-  void give_up(std::size_t frame_size, std::int64_t waited_ns) noexcept {
-    for (const auto& reader : all_) {
-      const bool is_over = std::int64_t{reader->request.timeout_ms} * 1'000'000 <= waited_ns;
-      if (is_over && is_full(*reader, frame_size)) ring_->give_up(reader->member);
-    }
+  void give_up(std::size_t size, std::int64_t waited_ms) noexcept {
+    if (has_members()) cortex_writer_give_up(ring_.get(), size, waited_ms);
   }
 
-  // Gives all readers away.
-  List release() noexcept {
-    ring_.reset();
-    members_ = lossy_ = strict_ = 0;
-    return std::exchange(all_, {});
+  // Keeps those only that have yet to say that they have accounted for all below a sequence, which come through sockets.
+  void settle(std::uint64_t sequence) noexcept {
+    ring_.reset();  // its readers keep what is in it
+    const auto is_settled = [&](const auto& reader) {
+      return reader->member >= 0 || !reader->request.confirms || reader->confirmed >= sequence;
+    };
+    all_.erase(std::remove_if(all_.begin(), all_.end(), is_settled), all_.end());
+    const auto strict = std::count_if(all_.begin(), all_.end(), [](const auto& reader) { return reader->pub_socket->strict; });
+    members_ = 0;
+    strict_ = static_cast<std::size_t>(strict);
+    lossy_ = all_.size() - strict_;
   }
 
   // The longest that a reader which this socket itself serves may hold up the publisher.
@@ -128,24 +152,30 @@ class Readers {
   }
 
  private:
-  bool is_full(const Reader& reader, std::size_t frame_size) const noexcept {
-    if (reader.member < 0) return false;
-    return frame_size == 0 ? ring_->is_behind(reader.member) : ring_->is_full(reader.member, frame_size);
-  }
+  struct Close {
+    void operator()(CortexWriter* ring) const noexcept {
+      cortex_writer_close(ring);
+      delete ring;
+    }
+  };
 
   void join(Reader& reader, std::uint64_t first, Listener& listener) {
     CortexHello hello;
-    if (!listener.take(reader.request.source, reader.request.reader, hello)) return;
-    if (ring_ == nullptr && !is_dissolved_) ring_ = Broadcast::open(reader.request.source);
+    const auto& request = reader.request;
+    if (!listener.take(request.source, request.reader, hello)) return;
+    if (ring_ == nullptr && !is_dissolved_) {
+      auto made = std::make_unique<CortexWriter>();
+      if (cortex_writer_open(made.get(), request.source, ring_bytes) == 0) ring_.reset(made.release());
+    }
     if (ring_ == nullptr) {
       cortex_hello_close(&hello);
     } else {
-      reader.member = ring_->add(hello, reader.request.strict, first);
+      reader.member = cortex_writer_add(ring_.get(), &hello, request.strict ? 1 : 0, request.timeout_ms, first);
     }
   }
 
   List all_;
-  std::unique_ptr<Broadcast> ring_;
+  std::unique_ptr<CortexWriter, Close> ring_;
   bool is_dissolved_ = false;
   std::size_t members_ = 0;
   std::size_t lossy_ = 0;
