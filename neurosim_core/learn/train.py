@@ -314,8 +314,7 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
-    zeros = {"motion.weight": policy.motion.weight}  # runs of before have no such layer
-    policy.load_state_dict(zeros | state["weights"])
+    policy.load_state_dict(state["weights"])
     return policy
 
 

@@ -115,7 +115,6 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
 
     training = Training(tmp_path, small(), models=[hall])
     policy = training.student
-    torch.nn.init.normal_(policy.motion.weight, 0.0, 0.05)  # zero at first
     export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
     pilot = Pilot(tmp_path / "policy.onnx")
     rng = np.random.default_rng(0)
@@ -156,7 +155,6 @@ def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):
 
     training = Training(tmp_path, small(), models=[hall])
     policy = training.student
-    torch.nn.init.normal_(policy.motion.weight, 0.0, 0.05)  # zero at first
     export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
     rng = np.random.default_rng(3)
