@@ -334,7 +334,7 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
 
     wait_for(has_caught_up)
     assert counters.received > 1
-    assert counters.lost > 0
+    assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
 
 def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):
