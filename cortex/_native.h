@@ -33,6 +33,9 @@ extern PyTypeObject SocketType;
    without the GIL, for as long as the socket's RCVTIMEO says. */
 PyObject *socket_take(PyObject *socket, int may_wait);
 
+/* Whether `receive` is one of ours, which runs no Python code where it may not wait. */
+int is_native_receive(PyObject *receive);
+
 /* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);
 

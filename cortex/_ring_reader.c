@@ -267,6 +267,11 @@ static PyTypeObject RingReaderType = {
     .tp_getset = reader_properties,
 };
 
+int is_native_receive(PyObject *receive) {
+    PyObject *self = PyCFunction_CheckExact(receive) ? PyCFunction_GET_SELF(receive) : NULL;
+    return self != NULL && (Py_IS_TYPE(self, &SocketType) || (Py_IS_TYPE(self, &RingReaderType) && is_native_receive(((RingReader *)self)->receive)));
+}
+
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait) {
     if (PyCFunction_CheckExact(receive)) { /* one of ours needs no exception */
         PyObject *self = PyCFunction_GET_SELF(receive);
