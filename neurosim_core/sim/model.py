@@ -131,12 +131,13 @@ def make_fleet(
 
     device = find_device(config.device)
     with ThreadPoolExecutor(max_workers=1) as aside:
-        aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
+        beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
         with phase("scene"):
             members = {name: config.of(name) for name in config.vehicles}
             seeing = any(plan_render_groups(member.sensors) for member in members.values())
             scene = config.scene.load(pictures=seeing) if scene is None else scene
             bodies = make_bodies(config.bodies) if seeing else ()
+        beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
         light = functools.partial(  # needs no path: both at once
             upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
         )
