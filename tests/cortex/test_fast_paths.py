@@ -160,3 +160,20 @@ def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
         assert publisher._fast_send.sequence == 1
     thread.join()
     assert [subscriber.recv(SOON_S).value for _ in range(2)] == [0, 1]
+
+
+def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
+    """As a publisher; what is there is taken once the lock is free, in order."""
+    publisher, subscriber = numbers
+    assert publisher.publish(Number(0, 0))
+    assert subscriber.recv(SOON_S).value == 0
+    assert publisher.publish(Number(1, 1))
+    got = []
+    with subscriber._lock:
+        thread = threading.Thread(target=lambda: got.append(subscriber.recv(SOON_S).value))
+        thread.start()
+        thread.join(0.05)
+        assert got == []
+    thread.join()
+    assert got == [1]
+    assert subscriber.counters.received == 2
