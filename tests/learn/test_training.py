@@ -250,7 +250,7 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert set(found) == {"events", "blind"}
     assert found["events"].episodes == 3
     slow = next(evaluate_run(tmp_path, scenes=str(file), worlds=3, speed_m_s=0.1))[1]
-    assert slow.metrics["speed_m_s"] < 0.5 * found["events"].metrics["speed_m_s"]
+    assert slow.metrics["speed_m_s"] < 0.7 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
 
