@@ -120,7 +120,7 @@ static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
     if (fast->link == NULL) return Py_NewRef(fast->nothing);
     PyObject *link = Py_NewRef(fast->link), *receive = PyObject_GetAttr(link, receive_name), *message = NULL, *other = NULL;
     int is_done = receive == NULL;
-    if (!is_done && is_native_receive(receive) && fast_is_alone(fast)) {
+    if (!is_done && may_look_unlocked(receive, may_wait) && fast_is_alone(fast)) {
         const int collects = PyGC_Disable();
         message = fast_look(fast, link, receive, 0, now_ns, &other);
         if (collects) PyGC_Enable();

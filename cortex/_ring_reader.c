@@ -267,9 +267,12 @@ static PyTypeObject RingReaderType = {
     .tp_getset = reader_properties,
 };
 
-int is_native_receive(PyObject *receive) {
+int may_look_unlocked(PyObject *receive, int may_wait) {
     PyObject *self = PyCFunction_CheckExact(receive) ? PyCFunction_GET_SELF(receive) : NULL;
-    return self != NULL && (Py_IS_TYPE(self, &SocketType) || (Py_IS_TYPE(self, &RingReaderType) && is_native_receive(((RingReader *)self)->receive)));
+    if (self == NULL || !Py_IS_TYPE(self, &RingReaderType)) return self != NULL && Py_IS_TYPE(self, &SocketType) && !may_wait;
+    const RingReader *reader = (const RingReader *)self;
+    if (may_wait && (reader->ring.ring == NULL || !cortex_reader_has_more(&reader->ring))) return 0;
+    return may_look_unlocked(reader->receive, 0);
 }
 
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait) {
