@@ -27,6 +27,7 @@
 enum {
     CORTEX_MEMBERS = 64,
     CORTEX_MARKS = 16,
+    CORTEX_STEPS = 64, /* `reserved` is raised by a part of the ring, of so many */
     CORTEX_HEAD_BYTES = 1 << 16, /* before the frames: a multiple of every page size */
     CORTEX_PAGE_BYTES = 4096,
     CORTEX_ENTRY_BYTES = 8,      /* before each frame: its size, and what it is */
@@ -46,18 +47,19 @@ enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a 
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
 enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT, CORTEX_CROWDED }; /* what a reader finds in a slot */
 
-#define CORTEX_RING_MAGIC 0x3254534143585443u /* "CTXCAST2" */
+#define CORTEX_RING_MAGIC 0x3354534143585443u /* "CTXCAST3" */
 
 typedef struct {
     uint64_t magic, capacity, source, generation, slots, slot_bytes;
     uint64_t quota; /* how many slots a reader may lease at once; further messages it copies */
     uint64_t unused;
     uint64_t reserved; /* bytes below this, less the capacity, may have been written over */
-    uint64_t head;     /* all below this is whole */
-    uint64_t last;     /* where the last entry begins */
-    uint64_t unused_too[5];
+    uint64_t unused_two[7];
+    uint64_t head; /* all below this is whole; in a cache line that readers look at once for all that has come */
+    uint64_t last; /* where the last entry begins */
+    uint64_t unused_three[6];
     uint64_t marks[CORTEX_MARKS]; /* where the first entry of each part of the ring begins */
-    uint64_t unused_three[480];
+    uint64_t unused_four[472];
     uint64_t words[CORTEX_SLOTS]; /* of each slot: the sequence of its message and 1; 0: it is being written */
 } CortexRing;
 
@@ -125,6 +127,7 @@ typedef struct {
     const uint8_t *data;
     CortexPage *page;
     uint64_t capacity, source, tail;
+    uint64_t seen;  /* the head when it was looked at last */
     uint64_t first; /* sequence of the first message that is sent to it */
     int socket, bell;
     int armed;
@@ -232,11 +235,13 @@ static inline void cortex_member_give_up(const CortexWriter *writer, CortexMembe
 }
 
 /* Where the frame of the next entry is to be written, for which there is room. If it is not after all, nothing has happened:
-   `reserved` stays, as the bytes below it may have changed. */
-static inline uint8_t *cortex_ring_begin(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, size_t size) {
+   `reserved` stays, as the bytes below it may have changed. It may be raised as far as `ahead` where it has to be raised. */
+static inline uint8_t *cortex_ring_begin(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, size_t size, uint64_t ahead) {
     const uint64_t next = at + cortex_entry_bytes(size);
-    if (next > __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED)) __atomic_store_n(&ring->reserved, next, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
+    if (next > __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED)) {
+        __atomic_store_n(&ring->reserved, next > ahead ? next : ahead, __ATOMIC_RELAXED);
+        __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
+    }
     return data + (at & (capacity - 1)) + CORTEX_ENTRY_BYTES;
 }
 
@@ -254,7 +259,7 @@ static inline uint64_t cortex_ring_finish(CortexRing *ring, uint8_t *data, uint6
 
 /* Say that the ring goes on elsewhere; where that entry ends. */
 static inline uint64_t cortex_ring_move(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at) {
-    cortex_ring_begin(ring, data, capacity, at, 0);
+    cortex_ring_begin(ring, data, capacity, at, 0, 0);
     return cortex_ring_finish(ring, data, capacity, at, CORTEX_MOVED, 0);
 }
 
@@ -298,6 +303,19 @@ static inline void cortex_writer_tidy(CortexWriter *writer) {
     }
 }
 
+/* How far `reserved` may be raised for an entry, so that readers seldom find its cache line changed: not over what reliable ones have
+   still to read. */
+static inline uint64_t cortex_writer_ahead(const CortexWriter *writer, size_t size) {
+    uint64_t ahead = writer->head + writer->capacity / CORTEX_STEPS;
+    if (writer->head + cortex_entry_bytes(size) <= __atomic_load_n(&writer->ring->reserved, __ATOMIC_RELAXED)) return 0; /* it is */
+    for (int index = 0; index < writer->count; ++index) {
+        const CortexMember *member = &writer->members[index];
+        const uint64_t end = member->tail + writer->capacity;
+        if (member->used && !member->left && member->strict && !member->late && end < ahead) ahead = end;
+    }
+    return ahead;
+}
+
 /* Where a frame for all readers is to be written, in `place`, before `cortex_writer_finish`: NULL if nobody gets it. If all are
    late it is not written: what waits for them stays. With `mind`, somebody who is late counts as having no room. */
 static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int mind, uint8_t **place) {
@@ -310,7 +328,7 @@ static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int min
     if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     for (int index = 0; index < writer->count; ++index)
         if (cortex_member_is_full(writer, &writer->members[index], bytes) && !cortex_writer_widen(writer)) return CORTEX_FULL;
-    *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size);
+    *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size, cortex_writer_ahead(writer, size));
     return late ? CORTEX_LATE : CORTEX_WRITTEN;
 }
 
@@ -331,7 +349,7 @@ static inline int cortex_writer_put(CortexWriter *writer, const void *frame, siz
 
 /* Send the last frame, for which there is room always; of at most 64 bytes. */
 static inline void cortex_writer_end(CortexWriter *writer, const void *frame, size_t size) {
-    memcpy(cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size), frame, size);
+    memcpy(cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size, 0), frame, size);
     cortex_writer_finish(writer, size);
 }
 

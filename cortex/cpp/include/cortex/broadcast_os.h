@@ -379,6 +379,7 @@ static inline int cortex_reader_map(CortexReader *reader) {
     reader->ring = map->ring;
     reader->data = map->data;
     reader->capacity = capacity;
+    reader->seen = said[3];
     cortex_reader_move(reader, said[3]);
     return 1;
 }

@@ -18,7 +18,7 @@ static inline void cortex_reader_move(CortexReader *reader, uint64_t tail) {
 /* Go on with the oldest entry that will not be written over in a moment. */
 static inline void cortex_reader_skip(CortexReader *reader) {
     const CortexRing *ring = reader->ring;
-    const uint64_t head = __atomic_load_n(&ring->head, __ATOMIC_ACQUIRE);
+    const uint64_t head = reader->seen = __atomic_load_n(&ring->head, __ATOMIC_ACQUIRE);
     const uint64_t oldest = __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED) - reader->capacity;
     uint64_t best = __atomic_load_n(&ring->last, __ATOMIC_RELAXED);
     for (int index = 0; index < CORTEX_MARKS; ++index) {
@@ -35,7 +35,8 @@ static inline int cortex_reader_has_more(const CortexReader *reader) {
 /* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
     while (reader->state == CORTEX_SOUND) {
-        const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
+        if (reader->seen == reader->tail) reader->seen = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE);
+        const uint64_t left = reader->seen - reader->tail;
         uint32_t entry[2];
         if (!left) return 0;
         const uint8_t *place = reader->data + (reader->tail & (reader->capacity - 1));
