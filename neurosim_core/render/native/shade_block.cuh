@@ -31,24 +31,11 @@ for (int lane = 0; lane < POSES; ++lane) {
     q_WC[lane] = view.q_WC.data[pose];
     for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[lane][axis] - origin[axis];
 }
-#include "transpose_quads.cuh"
+#include "aim_rays.cuh"
 alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
+auto pixel_of = [&](int lane) { return first_pixel + (lane % 4 < columns && lane / 4 < rows ? lane / 4 * width + lane % 4 : 0); };
 auto turn_rays = [&](int term) {
-    Quads quads[4];
-    const wp::vec4* const pixels = wp::address(rays, term, first_pixel);
-    if (columns == 4 && rows == 4)
-        for (int y = 0; y < 4; ++y) __builtin_memcpy(&quads[y], pixels + y * width, sizeof(Quads));
-    else
-        for (int lane = 0; lane < LANES; ++lane) {
-            const wp::vec4& pixel = pixels[lane % 4 < columns && lane / 4 < rows ? (lane / 4) * width + lane % 4 : 0];
-            for (int axis = 0; axis < 4; ++axis) quads[lane / 4][lane % 4 * 4 + axis] = pixel[axis];
-        }
-    transpose(quads, {ray[term][0], ray[term][1], ray[term][2], ray[term][3]});
-    for (int lane = 0; lane < LANES; ++lane) {
-        const wp::vec3 turned =
-            wp::quat_rotate(q_WC[TIMED ? lane : 0], wp::vec3(ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]));
-        for (int axis = 0; axis < 3; ++axis) ray[term][axis][lane] = turned[axis];
-    }
+    aim_rays([&](int) { return term; }, pixel_of, [&](int lane) { return q_WC[TIMED ? lane : 0]; }, ray[term]);
 };
 turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
