@@ -39,7 +39,7 @@ auto turn_rays = [&](int term) {
 };
 turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
-    return 0.01f * SHARPNESS * wp::sqrt(points_shown / SAMPLES);
+    return 0.01f * SHARPNESS * __builtin_elementwise_sqrt(points_shown / SAMPLES);
 };
 constexpr int PAIRS_MAX = LANES * SAMPLES; // of a pixel and a surface that it shows
 alignas(64) float direction[3][PAIRS_MAX], from[3][TIMED ? PAIRS_MAX : 1], spread_of[PAIRS_MAX], share[PAIRS_MAX], total[3][LANES] = {};
@@ -75,23 +75,31 @@ if (!other_surface) {
             for (int channel = 0; channel < 3; ++channel)
                 total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
     }
-    for (int layer = 0; layer < layer_count; ++layer)
+    for (int layer = 0; layer < layer_count; ++layer) {
+        alignas(64) float middles[3][LANES], spreads[LANES], shares[LANES];
+        alignas(64) int shows[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
-            if (number[layer][lane] == 0.0f) continue;
-            wp::vec3 toward;
             for (int axis = 0; axis < 3; ++axis)
-                toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
-                               + middle[1][layer][lane] * ray[2][axis][lane];
+                middles[axis][lane] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
+                                      + middle[1][layer][lane] * ray[2][axis][lane];
+            spreads[lane] = footprint_width(number[layer][lane]) * ray[0][3][lane];
+            shares[lane] = number[layer][lane] * weight[lane];
+            shows[lane] = number[layer][lane] != 0.0f;
+        }
+        for (unsigned rest = lanes_where(shows); rest; rest &= rest - 1) {
+            const int lane = lowest_of(rest);
             const wp::vec3& place = position[TIMED ? lane : 0];
+            const wp::vec3 toward(middles[0][lane], middles[1][lane], middles[2][lane]);
             faces_of[pair_count] = part_of(layer, own[lane], place, toward);
             if constexpr (TIMED)
                 for (int axis = 0; axis < 3; ++axis) from[axis][pair_count] = place[axis];
             owner[pair_count] = lane;
-            spread_of[pair_count] = footprint_width(number[layer][lane]) * ray[0][3][lane];
-            share[pair_count] = number[layer][lane] * weight[lane];
+            spread_of[pair_count] = spreads[lane];
+            share[pair_count] = shares[lane];
             for (int axis = 0; axis < 3; ++axis) direction[axis][pair_count] = toward[axis];
             ++pair_count;
         }
+    }
     for (int pair = pair_count; pair % N != 0; ++pair) {
         faces_of[pair] = faces_of[pair_count - 1];
         spread_of[pair] = spread_of[pair_count - 1];
