@@ -375,7 +375,8 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
             light = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            for packet in range(RAY_COUNT):  # four rays of each of 2 x 2 pixels
+            packets = int(RAY_COUNT)  # of four rays of each of 2 x 2 pixels; a variable: the loop is not unrolled
+            for packet in range(packets):
                 quarter = packet % 4
                 corner = quarter // 2 * 2 * _SIDE + quarter % 2 * 2
                 if (unresolved >> corner) & _QUARTER == 0:
