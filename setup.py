@@ -30,7 +30,7 @@ setup(
                 *(f"cortex/_{name}.h" for name in HEADERS),
                 *(
                     f"cortex/cpp/include/cortex/{name}.h"
-                    for name in ("broadcast", "broadcast_os", "broadcast_slots")
+                    for name in ("broadcast", "broadcast_os", "broadcast_reader", "broadcast_slots")
                 ),
             ],
             libraries=["dl"] if sys.platform == "linux" else [],

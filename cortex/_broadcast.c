@@ -96,6 +96,8 @@ static CortexWriter *writer_of(PyObject *send) {
     return self != NULL && Py_IS_TYPE(self, &BroadcastType) && ((Broadcast *)self)->open ? &((Broadcast *)self)->writer : NULL;
 }
 
+int broadcast_is_open(PyObject *send) { return writer_of(send) != NULL; }
+
 int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size) {
     CortexWriter *writer = writer_of(send);
     return writer == NULL ? -1 : cortex_writer_put(writer, frame, (size_t)size, 1);

@@ -9,6 +9,9 @@
    CORTEX_WRITTEN, CORTEX_TOO_LARGE, or -1 if `send` is something else. */
 int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size);
 
+/* Whether `send` is that of a `Broadcast` that is open. */
+int broadcast_is_open(PyObject *send);
+
 /* Where a frame of so many bytes may be written for all readers, if `send` is that of a `Broadcast` that nobody is late in and
    that has room; else NULL. `broadcast_finish` sends it. */
 char *broadcast_begin(PyObject *send, Py_ssize_t size);

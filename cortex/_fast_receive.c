@@ -13,9 +13,9 @@ typedef struct {
         struct {
             PyObject *link;  /* NULL: every message takes the slow path */
             PyObject *coder; /* the link's */
-            PyObject *receive_lock, *queue, *counters, *again, *accept, *acquire, *release, *latency, *nothing;
+            PyObject *receive_lock, *queue, *counters, *again, *accept, *acquire, *release, *locked, *latency, *nothing;
         };
-        PyObject *held[11];
+        PyObject *held[12];
     };
     int64_t clock_offset_ns;
     char exhausted;
@@ -60,19 +60,14 @@ static int fast_count(FastReceive *fast, PyObject *link, int64_t expected, int64
         && set_number(fast->counters, received_name, received + 1) && note_latency(fast->latency, now_ns - sent_ns);
 }
 
-/* The message of a frame; NULL without error if it was handed on. */
+/* The message of a frame; NULL without error if it is something else, or does not follow. */
 static PyObject *fast_read(FastReceive *fast, PyObject *link, PyObject *frame, int64_t now_ns) {
     const int64_t expected = number_of(link, expected_name);
     if (expected == -1 && PyErr_Occurred()) return NULL;
     int64_t publish_ns;
     PyObject *message = read_expected((const Coder *)fast->coder, frame, (uint64_t)expected, &publish_ns);
-    if (message != NULL) {
-        if (fast_count(fast, link, expected, publish_ns, now_ns)) return message;
-        Py_DECREF(message);
-    } else if (!PyErr_Occurred()) {
-        PyObject *arguments[3] = {NULL, link, frame};
-        Py_XDECREF(PyObject_Vectorcall(fast->accept, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL));
-    }
+    if (message == NULL || fast_count(fast, link, expected, publish_ns, now_ns)) return message;
+    Py_DECREF(message);
     return NULL;
 }
 
@@ -85,28 +80,55 @@ static int fast_is_open(const FastReceive *fast, int may_wait) {
     return waiting < 0 ? -1 : waiting == 0;
 }
 
-/* The next message, with the lock held; NULL as for `fast_read`. */
-static PyObject *fast_take_locked(FastReceive *fast, int may_wait, int64_t now_ns) {
+/* The next message; NULL without error if there is none, or a frame that `other` gets. */
+static PyObject *fast_look(FastReceive *fast, PyObject *link, PyObject *receive, int may_wait, int64_t now_ns, PyObject **other) {
     if (fast_is_open(fast, may_wait) <= 0) return NULL;
-    PyObject *link = Py_NewRef(fast->link), *message = NULL;
-    PyObject *receive = PyObject_GetAttr(link, receive_name);
-    PyObject *frame = receive == NULL ? NULL : take_frame(receive, fast->again, may_wait);
+    PyObject *frame = take_frame(receive, fast->again, may_wait);
     fast->exhausted = frame == NULL;
-    if (frame != NULL) message = fast_read(fast, link, frame, now_ns);
-    Py_XDECREF(frame);
-    Py_XDECREF(receive);
-    Py_DECREF(link);
+    if (frame == NULL) return NULL;
+    PyObject *message = fast_read(fast, link, frame, now_ns);
+    if (message == NULL && !PyErr_Occurred()) *other = frame;
+    else Py_DECREF(frame);
     return message;
 }
 
-/* The next message, or `nothing`; NULL with an error set. The time may have passed a little. */
+/* As `fast_look`, with the lock; a frame that is something else is handed on. */
+static PyObject *fast_look_locked(FastReceive *fast, PyObject *link, PyObject *receive, int may_wait, int64_t now_ns, PyObject *other) {
+    PyObject *acquired = PyObject_CallNoArgs(fast->acquire), *message = NULL;
+    if (acquired != NULL && other == NULL) message = fast_look(fast, link, receive, may_wait, now_ns, &other);
+    if (acquired != NULL && other != NULL) {
+        PyObject *arguments[3] = {NULL, link, other};
+        Py_XDECREF(PyObject_Vectorcall(fast->accept, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL));
+    }
+    Py_XDECREF(other);
+    if (acquired != NULL) give_back(fast->release);
+    Py_XDECREF(acquired);
+    return message;
+}
+
+/* Whether nobody has the lock: others need the GIL to take it. */
+static int fast_is_alone(const FastReceive *fast) {
+    PyObject *locked = PyObject_CallNoArgs(fast->locked);
+    if (locked == NULL) PyErr_Clear();
+    Py_XDECREF(locked);
+    return locked == Py_False;
+}
+
+/* The next message, or `nothing`; NULL with an error set. The time may have passed a little. The lock is not taken where it
+   is free and no Python code runs, that of the garbage collector included. */
 static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
     if (fast->link == NULL) return Py_NewRef(fast->nothing);
-    PyObject *acquired = PyObject_CallNoArgs(fast->acquire);
-    if (acquired == NULL) return NULL;
-    Py_DECREF(acquired);
-    PyObject *message = fast_take_locked(fast, may_wait, now_ns);
-    give_back(fast->release);
+    PyObject *link = Py_NewRef(fast->link), *receive = PyObject_GetAttr(link, receive_name), *message = NULL, *other = NULL;
+    int is_done = receive == NULL;
+    if (!is_done && may_look_unlocked(receive, may_wait) && fast_is_alone(fast)) {
+        const int collects = PyGC_Disable();
+        message = fast_look(fast, link, receive, 0, now_ns, &other);
+        if (collects) PyGC_Enable();
+        is_done = message != NULL || PyErr_Occurred() || (other == NULL && !may_wait);
+    }
+    if (!is_done) message = fast_look_locked(fast, link, receive, may_wait, now_ns, other);
+    Py_XDECREF(receive);
+    Py_DECREF(link);
     return message != NULL || PyErr_Occurred() ? message : Py_NewRef(fast->nothing);
 }
 
@@ -209,8 +231,9 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
     fast->nothing = Py_NewRef(nothing);
     fast->acquire = PyObject_GetAttrString(lock, "acquire");
     fast->release = PyObject_GetAttrString(lock, "release");
+    fast->locked = PyObject_GetAttrString(lock, "locked");
     fast->latency = PyObject_GetAttrString(counters, "latency");
-    if (fast->acquire == NULL || fast->release == NULL || fast->latency == NULL) Py_CLEAR(fast);
+    if (fast->acquire == NULL || fast->release == NULL || fast->locked == NULL || fast->latency == NULL) Py_CLEAR(fast);
     return (PyObject *)fast;
 }
 

@@ -16,12 +16,12 @@ typedef struct {
     Coder *coder;
     union {
         struct {
-            PyObject *acquire, *release, *slowly, *retry, *again;
+            PyObject *acquire, *release, *locked, *slowly, *retry, *again;
             PyObject *sends; /* a tuple; empty or NULL: every message takes the slow path */
             PyObject *ring;  /* a Broadcast, into whose slots larger bodies go; NULL or None: the slow path */
             PyObject *prepare, *large_acquire, *large_release, *finish;
         };
-        PyObject *held[11];
+        PyObject *held[12];
     };
     Py_ssize_t limit;
     uint64_t sequence;
@@ -30,12 +30,13 @@ typedef struct {
 } FastSend;
 
 PyDoc_STRVAR(fast_doc,
-"FastSend(coder, acquire, release, slowly, retry, again, limit)\n--\n\n"
+"FastSend(coder, acquire, release, locked, slowly, retry, again, limit)\n--\n\n"
 "Called with a message, it sends it; see `fast_send.py`.\n\n"
 "Args:\n"
 "    coder: Makes the frames; has a head.\n"
 "    acquire: Takes the lock.\n"
 "    release: Gives it back.\n"
+"    locked: Whether somebody has it.\n"
 "    slowly: Called without the lock with a message that has to take the slow path.\n"
 "    retry: Called with the lock held, a frame, and that of `sends` which had no room for it.\n"
 "    again: What that raised.\n"
@@ -75,14 +76,33 @@ static PyObject *fast_send_frame(FastSend *fast, PyObject *frame) {
     return on_time < 0 ? NULL : PyBool_FromLong(on_time);
 }
 
-/* Write a small message where the only reader is the ring; 0 if it has to be sent as bytes, or is not as usual. */
+/* Whether all that is to be done is to write into the ring. */
+static int fast_has_ring_only(const FastSend *fast) {
+    return fast->sends != NULL && PyTuple_CheckExact(fast->sends) && PyTuple_GET_SIZE(fast->sends) == 1
+        && broadcast_is_open(PyTuple_GET_ITEM(fast->sends, 0));
+}
+
+/* Write a small message there; 0 if it has to be sent as bytes, or is not as usual. */
 static int fast_write_frame(FastSend *fast, PyObject *message, Py_ssize_t size, int64_t now_ns) {
-    if (PyTuple_GET_SIZE(fast->sends) != 1) return 0;
     PyObject *send = PyTuple_GET_ITEM(fast->sends, 0);
     char *place = broadcast_begin(send, HEADER_SIZE + size);
     if (place == NULL || !write_frame(fast->coder, message, place, size, fast->sequence, now_ns)) return 0;
     broadcast_finish(send, HEADER_SIZE + size);
+    fast->sequence += 1;
+    fast->bytes += size;
     return 1;
+}
+
+/* Send a small message through the ring without the lock, if nobody has it: others need the GIL to take it, which is kept
+   here, as no Python code runs; 0 if there is more to do. */
+static int fast_send_unlocked(FastSend *fast, PyObject *message) {
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= fast->refresh_ns || !fast_has_ring_only(fast)) return 0;
+    PyObject *locked = PyObject_CallNoArgs(fast->locked);
+    if (locked == NULL) PyErr_Clear();
+    Py_XDECREF(locked);
+    const Py_ssize_t size = locked == Py_False ? measure_body(fast->coder, message) : -1;
+    return size >= 0 && size <= fast->limit && fast_write_frame(fast, message, size, now_ns);
 }
 
 /* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
@@ -190,13 +210,13 @@ static PyObject *fast_send(FastSend *fast, PyObject *message) {
     const Py_ssize_t size = measure_body(fast->coder, message);
     if (size < 0) return NULL;
     if (size > fast->limit) return fast_send_slot(fast, message, size, now_ns);
-    PyObject *frame = NULL, *sent;
-    const int is_written = fast_write_frame(fast, message, size, now_ns);
-    if (!is_written && (frame = make_frame(fast->coder, message, size, fast->sequence, now_ns)) == NULL) return NULL;
+    if (fast_has_ring_only(fast) && fast_write_frame(fast, message, size, now_ns)) Py_RETURN_TRUE;
+    PyObject *frame = make_frame(fast->coder, message, size, fast->sequence, now_ns);
+    if (frame == NULL) return NULL;
     fast->sequence += 1;
     fast->bytes += size;
-    sent = is_written ? Py_NewRef(Py_True) : fast_send_frame(fast, frame);
-    Py_XDECREF(frame);
+    PyObject *sent = fast_send_frame(fast, frame);
+    Py_DECREF(frame);
     return sent;
 }
 
@@ -206,6 +226,7 @@ static PyObject *fast_call(PyObject *self, PyObject *const *arguments, size_t fl
         PyErr_SetString(PyExc_TypeError, "publish() takes one message, by position");
         return NULL;
     }
+    if (fast_send_unlocked(fast, arguments[0])) Py_RETURN_TRUE;
     PyObject *acquired = PyObject_CallNoArgs(fast->acquire);
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
@@ -240,11 +261,11 @@ static PyMethodDef fast_methods[] = {
 };
 
 static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", NULL};
-    PyObject *coder, *acquire, *release, *slowly, *retry, *again;
+    static char *names[] = {"coder", "acquire", "release", "locked", "slowly", "retry", "again", "limit", NULL};
+    PyObject *coder, *acquire, *release, *locked, *slowly, *retry, *again;
     Py_ssize_t limit;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOn:FastSend", names, &CoderType, &coder, &acquire, &release,
-                                     &slowly, &retry, &again, &limit))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOOn:FastSend", names, &CoderType, &coder, &acquire, &release,
+                                     &locked, &slowly, &retry, &again, &limit))
         return NULL;
     FastSend *fast = (FastSend *)type->tp_alloc(type, 0);
     if (fast == NULL) return NULL;
@@ -252,6 +273,7 @@ static PyObject *fast_new(PyTypeObject *type, PyObject *arguments, PyObject *key
     fast->coder = (Coder *)Py_NewRef(coder);
     fast->acquire = Py_NewRef(acquire);
     fast->release = Py_NewRef(release);
+    fast->locked = Py_NewRef(locked);
     fast->slowly = Py_NewRef(slowly);
     fast->retry = Py_NewRef(retry);
     fast->again = Py_NewRef(again);

@@ -16,7 +16,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     import_array();
     PyObject *module = PyModule_Create(&native_module);
     if (module == NULL) return NULL;
-    if (PyModule_AddIntConstant(module, "INTERFACE", 18) < 0 /* compiled.py compares it */
+    if (PyModule_AddIntConstant(module, "INTERFACE", 19) < 0 /* compiled.py compares it */
         || add_broadcast(module) < 0 || add_coder(module) < 0 || add_construct(module) < 0 || add_fast_send(module) < 0
         || add_fast_receive(module) < 0 || add_ring_reader(module) < 0 || add_socket(module) < 0) {
         Py_DECREF(module);

@@ -33,6 +33,10 @@ extern PyTypeObject SocketType;
    without the GIL, for as long as the socket's RCVTIMEO says. */
 PyObject *socket_take(PyObject *socket, int may_wait);
 
+/* Whether `receive` is one of ours, so that a look without waiting runs no Python code; if one would wait after it, also whether
+   there is something to be found: to look twice costs more than the lock. */
+int may_look_unlocked(PyObject *receive, int may_wait);
+
 /* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);
 

@@ -267,6 +267,14 @@ static PyTypeObject RingReaderType = {
     .tp_getset = reader_properties,
 };
 
+int may_look_unlocked(PyObject *receive, int may_wait) {
+    PyObject *self = PyCFunction_CheckExact(receive) ? PyCFunction_GET_SELF(receive) : NULL;
+    if (self == NULL || !Py_IS_TYPE(self, &RingReaderType)) return self != NULL && Py_IS_TYPE(self, &SocketType) && !may_wait;
+    const RingReader *reader = (const RingReader *)self;
+    if (may_wait && (reader->ring.ring == NULL || !cortex_reader_has_more(&reader->ring))) return 0;
+    return may_look_unlocked(reader->receive, 0);
+}
+
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait) {
     if (PyCFunction_CheckExact(receive)) { /* one of ours needs no exception */
         PyObject *self = PyCFunction_GET_SELF(receive);

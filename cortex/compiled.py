@@ -12,7 +12,7 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-INTERFACE = 18
+INTERFACE = 19
 """What `_native.c` must say of itself: counts up with each change of what it offers."""
 
 

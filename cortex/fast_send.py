@@ -69,6 +69,8 @@ def make_fast_send(
     """
     if coder is None:
         return FastSend(slowly)
-    fast_send: FastSend = NativeFastSend(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
+    fast_send: FastSend = NativeFastSend(
+        coder, lock.acquire, lock.release, lock.locked, slowly, retry, zmq.Again, limit
+    )
     fast_send.sends = ()
     return fast_send

@@ -233,9 +233,10 @@ class Publisher(Generic[T]):
             if size <= self._inline_max:
                 return self._publish_inline(buffer[:size].tobytes(), stamp_ns, now_ns)
             if slot is None or not slot.is_current:  # its ring was replaced by one of larger slots
-                slot, written = self._acquire(size, now_ns, may_wait=True), buffer
-                buffer = self._memory(slot, size)
-                buffer[:size] = written[:size]
+                replaced, slot = slot, self._acquire(size, now_ns, may_wait=True)
+                if slot is not None or replaced is not None:  # else it stays where it is
+                    written, buffer = buffer, self._memory(slot, size)
+                    buffer[:size] = written[:size]
             return self._send_written(buffer, slot, size, stamp_ns, now_ns)
 
     def _send_loaned(self, message: Any, slot: Any) -> bool | None:

@@ -23,8 +23,6 @@ METRICS = {
     "cpu_us": Metric("subscriber's CPU", "us/msg"),
     "rtt_p50_us": Metric("round trip p50", "us"),
     "rtt_p99_us": Metric("round trip p99", "us"),
-    "age_p50_us": Metric("age p50", "us"),
-    "age_p99_us": Metric("age p99", "us"),
     "known_ms": Metric("death known", "ms"),
     "grown_kb": Metric("memory grown", "kB"),
     "shm_files": Metric("shm files left", ""),
@@ -93,16 +91,8 @@ class Case:
 FLOATS = {"40": 10, "4k": 1_000, "39k": 9_750, "900k": 225_000, "23.7M": 5_925_000}
 """Payloads: their name, their number of float32."""
 _LABELS = {"40": "40 B", "4k": "4 kB", "39k": "39 kB", "900k": "0.9 MB", "23.7M": "23.7 MB"}
-_AGE_COUNT = 30_000
-"""Messages at 10 kHz, of which somebody who works 2 ms on each uses over 1,000: p99 means something."""
 _RTT = ("rtt_p50_us", "rtt_p99_us")
-_AGE = ("age_p50_us", "age_p99_us")
-_RAW1, _RAW2, _RING, _AT_ONCE = (
-    "pyzmq 1 frame",
-    "pyzmq 2 frames, no copy",
-    "copy into ring",
-    "copy in + copy out",
-)
+_RAW1, _RAW2, _RING = "pyzmq 1 frame", "pyzmq 2 frames, no copy", "copy into ring"
 
 
 def _cortex(name: str = "cortex", peer: str = "cortex", kind: Kind = "flood", **options: Any) -> Contestant:
@@ -113,7 +103,6 @@ def _raw(frames: int, kind: Kind = "flood", **options: Any) -> Contestant:
     return Contestant(_RAW1 if frames == 1 else _RAW2, "pyzmq", {"frames": frames, **options}, kind)
 
 
-_ZENOH = Contestant("zenoh shm", "zenoh")
 _ROS = (Contestant("Cyclone DDS", "Cyclone DDS"), Contestant("rclpy", "rclpy"))
 _COPIES = (Contestant("copy, private", kind="copy"), Contestant(_RING, "", {"ring": True}, "copy"))
 _PING = _cortex(kind="roundtrip")
@@ -129,7 +118,7 @@ def _under(bound: float, *against: str, metric: str, who: str = "cortex") -> Bar
 
 def _small(size: str, bound: float) -> Case:
     title = f"{_LABELS[size]}, typed, decoded to the message object in a callback"
-    contestants = (_cortex(), _raw(1), _ZENOH, *_ROS)
+    contestants = (_cortex(), _raw(1), *_ROS)
     return Case(f"typed-{size}", title, FLOATS[size], contestants, (_over(0.85, _RAW1),), bound=bound)
 
 
@@ -141,15 +130,6 @@ def _tcp(size: str) -> Case:
     return Case(
         f"tcp-{size}", f"{_LABELS[size]} over tcp on loopback, callback", FLOATS[size], contestants, (bar,)
     )
-
-
-def _latest(name: str, *, busy: bool) -> Case:
-    options: dict[str, Any] = {"rate_hz": 10_000, "busy": busy, "latest": True}
-    title = f"age of a datum at use, publisher at 10 kHz, 2 ms of {'busy work' if busy else 'sleep'} on each"
-    ours = [_cortex(f"cortex {how}", how=how, **options) for how in ("recv", "callback")]
-    contestants = (*ours, Contestant("pyzmq CONFLATE", "pyzmq", options))
-    bars = tuple(_under(1000.0, metric="age_p99_us", who=contestant.name) for contestant in ours)
-    return Case(f"latest-{name}", title, FLOATS["40"], contestants, bars, _AGE, count=_AGE_COUNT)
 
 
 def _memory(size: str) -> Case:
@@ -181,15 +161,14 @@ CASES: tuple[Case, ...] = (
     _small("40", 2.0),
     _small("4k", 1.8),
     Case("medium", "39 kB through shared memory, callback", FLOATS["39k"],
-         (_cortex(), _raw(1), _raw(2), _ZENOH, *_ROS), (_over(2.0, _RAW1, _RAW2),)),
+         (_cortex(), _raw(1), _raw(2), *_ROS), (_over(2.0, _RAW1, _RAW2),)),
     Case("large", "0.9 MB through shared memory, callback", FLOATS["900k"],
-         (_cortex(), _raw(1), _raw(2), _ZENOH, *_COPIES), (_over(3.0, _RAW1, _RAW2), _over(0.7, _RING))),
+         (_cortex(), _raw(1), _raw(2), *_COPIES), (_over(3.0, _RAW1, _RAW2), _over(0.7, _RING))),
     Case("huge", "23.7 MB through shared memory, as a view, callback", FLOATS["23.7M"],
-         (_cortex(), _raw(2), _ZENOH, *_COPIES),
+         (_cortex(), _raw(2), *_COPIES),
          (_over(0.85, _RING), _over(1.8, _RAW2)), bound=1.0),
     Case("consume", "23.7 MB, the subscriber copies every byte out", FLOATS["23.7M"],
-         (_cortex(consume=True), _raw(2, consume=True),
-          Contestant(_AT_ONCE, "", {"out": True}, "copy")), (_over(0.85, _AT_ONCE),)),
+         (_cortex(consume=True), _raw(2, consume=True)), (_over(1.0, _RAW2),)),
     Case("loan", "23.7 MB, the producer writes into the slot", FLOATS["23.7M"], (_cortex(loan=True),),
          (_over(10_000.0),)),
     Case("roundtrip-40", "round trip, 40 B out, 40 B back", FLOATS["40"], (_PING, _raw(1, "roundtrip")),
@@ -204,8 +183,6 @@ CASES: tuple[Case, ...] = (
          (_over(0.8, "recv", who="async iterator"),)),
     Case("fanout", "40 B to 8 subscribers, each in its own process, callback; the slowest one's rate",
          FLOATS["40"], (_cortex(), _raw(1)), (_over(0.8, _RAW1), _over(100_000.0)), subscribers=8),
-    _latest("busy", busy=True),
-    _latest("asleep", busy=False),
     _memory("40"),
     _memory("39k"),
     Case("deaths", "from the kill of a process under load until the other side knows", FLOATS["40"],

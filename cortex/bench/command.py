@@ -65,11 +65,10 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
         raise ValueError(
             f"wants repeats >= 1 and 0 < seconds <= 600, got {options.repeats}, {options.seconds}"
         )
-    quick = options.quick
     settings = Settings(
-        repeats=min(options.repeats, _QUICK_REPEATS) if quick else options.repeats,
-        seconds=min(options.seconds, _QUICK_SECONDS) if quick else options.seconds,
-        count_max=_QUICK_COUNT if quick else 0,
+        repeats=min(options.repeats, _QUICK_REPEATS) if options.quick else options.repeats,
+        seconds=min(options.seconds, _QUICK_SECONDS) if options.quick else options.seconds,
+        count_max=_QUICK_COUNT if options.quick else 0,
     )
     results: list[CaseResult] = []
     with ExitStack() as stack:
@@ -77,7 +76,7 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
         print_header(console)
         console.print(
             f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved; "
-            "median ± half of its 95 % interval\n"
+            "median ± half of what lies between the quartiles\n"
         )
         try:
             for case in cases:
@@ -85,7 +84,7 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
                 print_case(console, results[-1])
         except KeyboardInterrupt:
             console.print("interrupted; what was measured until then:\n")
-    print_summary(console, results, judged=not quick)
+    print_summary(console, results, judged=not options.quick)
     return results
 
 

@@ -1,13 +1,12 @@
 """Runs a case: its contestants in turn, again and again, each repetition in processes of its own.
 
 What a machine does besides changes by the second, and from process to process: so repetitions are short,
-their order is turned round each time, ratios are taken within each, and a bar that lies within the interval
-of what was measured is said to: `--repeats` narrows it.
+their order is turned round each time, ratios are taken within each, and a bar that lies between the quartiles
+of what was measured is said to.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import tempfile
@@ -27,7 +26,6 @@ from cortex.bench.peers import Job, missing
 from cortex.bench.processes import Child, ChildFailed
 from cortex.bench.tally import make_payloads
 
-_CONFIDENCE = 0.95
 _SHM = Path("/dev/shm")
 _GRACE_S = 120.0
 _SLOWEST_HZ = 2_000.0
@@ -49,27 +47,16 @@ class Settings(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """A median, and between what the true one lies."""
+    """A median, and the quartiles around it."""
 
     median: float
     low: float
-    """With `high`, the 95 % interval of the median, whatever the distribution; the range of 8 or fewer."""
     high: float
 
 
 def spread_of(values: list[float]) -> Spread | None:
-    """Return the spread of some figures; None if there are none.
-
-    The true median exceeds each figure with probability 1/2: so how many lie below it is binomial.
-    """
-    if not values:
-        return None
-    ordered = sorted(values)
-    count, outside, below = len(ordered), 0, 1 + len(ordered)
-    while 2 * below <= (1.0 - _CONFIDENCE) * 2**count:
-        outside += 1
-        below += math.comb(count, outside + 1)
-    return Spread(float(np.median(ordered)), ordered[outside], ordered[-1 - outside])
+    """Return the spread of some figures; None if there are none."""
+    return Spread(*map(float, np.quantile(values, [0.5, 0.25, 0.75]))) if values else None
 
 
 def values_of(reports: list[Report], metric: str) -> list[float]:
@@ -108,7 +95,7 @@ class Verdict(NamedTuple):
 
     @property
     def is_open(self) -> bool:
-        """Whether the bar lies within the noise: more repetitions might give another verdict."""
+        """Whether the bar lies between the quartiles: more repetitions might give another verdict."""
         return bool(
             self.measured and not self.note and self.measured.low < self.bar.bound < self.measured.high
         )
@@ -182,12 +169,7 @@ def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str,
             report = runs[contestant.kind](job, partial(Child, deadline_s=deadline_s))
         except ChildFailed as failure:
             return {"error": str(failure)}
-        finally:
-            left = set(_SHM.glob("*")) - before
-            for path in left:  # what a peer that was killed left behind
-                if path.suffix == ".zenoh":
-                    path.unlink(missing_ok=True)
-        return {**report, "shm_files": len(left)}
+        return {**report, "shm_files": len(set(_SHM.glob("*")) - before)}
 
 
 def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> dict[str, Any]:
@@ -204,11 +186,10 @@ def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> dict[s
         publisher.expect()
     total = {key: sum(report[key] for report in reports) for key in ("received", "misordered", "corrupt")}
     result = {**reports[0], **total, "sent": sent["sent"] * subscribers}
-    if "rate" in result:  # messages under `latest` are passed over on purpose
-        result["rate"] = min(report["rate"] for report in reports)
-        result["lost"] = result["sent"] - result["received"]
-        result["grown_kb"] = max(sent["grown_kb"], *(report["grown_kb"] for report in reports))
-        result["cpu_us"] = 1e6 * sum(report["cpu_s"] for report in reports) / max(1, result["received"])
+    result["rate"] = min(report["rate"] for report in reports)
+    result["lost"] = result["sent"] - result["received"]
+    result["grown_kb"] = max(sent["grown_kb"], *(report["grown_kb"] for report in reports))
+    result["cpu_us"] = 1e6 * sum(report["cpu_s"] for report in reports) / max(1, result["received"])
     return result
 
 
@@ -216,7 +197,7 @@ def _round_trips(job: Job, child: Callable[..., Child]) -> Any:
     with child(roles.ask, job) as client, child(roles.answer, job) as server:
         report = client.expect([server])
         server.expect()
-    return report
+        return report
 
 
 def _publisher_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
@@ -239,17 +220,12 @@ def _reader_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
 
 
 def _copies(job: Job, child: Callable[..., Child]) -> Any:
-    """Copy into a private array, into a ring, or, in two processes at once, into a ring and out of it."""
-    payloads, private = list(make_payloads(job.floats)), [np.zeros(job.floats, np.float32)]
-    ring = roles.make_ring(job) if job.options else private
-    pairs = [(payloads, ring)] + ([(ring, private)] if job.options.get("out") else [])
-    with ExitStack() as stack:
-        copiers = [stack.enter_context(child(roles.copy, (job.seconds, *pair))) for pair in pairs]
-        for copier in copiers:
-            copier.expect()
-        for copier in copiers:
-            copier.tell("go")
-        return min((copier.expect() for copier in copiers), key=lambda report: float(report["rate"]))
+    """Copy into a private array, or into a ring."""
+    ring = roles.make_ring(job) if job.options else [np.zeros(job.floats, np.float32)]
+    with child(roles.copy, (job.seconds, list(make_payloads(job.floats)), ring)) as copier:
+        copier.expect()
+        copier.tell("go")
+        return copier.expect()
 
 
 def _free_port() -> int:

@@ -1,6 +1,6 @@
 """Cortex itself, used as its documentation says: typed messages, decoded to objects.
 
-Options: ``loan``, ``inline_max``, ``max_wait_s``, ``latest``, ``tcp`` (an address).
+Options: ``loan``, ``inline_max``, ``max_wait_s``, ``tcp`` (an address).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from cortex.bench.peers import PATIENCE_S, Job, Peer, Send
 from cortex.bench.tally import Finished, Floats, Handler
 from cortex.message import Array, message
 from cortex.node import Node
-from cortex.policy import latest, reliable
+from cortex.policy import reliable
 
 
 @message(name="bench/Sample")
 class Sample:
-    """A stamp and an array of any length; the stamp counts the messages, or says when each was published."""
+    """A stamp and an array of any length; the stamp counts the messages."""
 
     stamp_ns: int
     data: Array["float32", "n"]
@@ -65,8 +65,7 @@ def _publisher(job: Job, topic: str) -> Send:
 
 def _receive(job: Job, topic: str, handle: Handler, how: str) -> None:
     # Large messages wait in the publisher's ring, which bounds their memory.
-    patient = reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
-    policy = latest() if job.options.get("latest") else patient
+    policy = reliable(depth=max(8, job.depth), timeout_s=PATIENCE_S)
     subscribe = _node(job, listens=False).subscriber
     done = threading.Event()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import array
 import importlib
 import importlib.util
-import json
 import os
 import struct
 import sys
@@ -33,10 +32,6 @@ _HEADER = struct.Struct("<qq48x")
 _HEADER_BYTES = _HEADER.size
 _F32 = np.dtype(np.float32)
 _VIEW: Any = np.ndarray
-_WAIT_US = int(PATIENCE_S * 1e6)
-_KEPT: list[Any] = []
-"""Sessions, which end when they are forgotten."""
-
 
 Send = Callable[[int, Floats], object]
 """Sends a sequence and a payload, and rather blocks than loses, where that is possible."""
@@ -92,7 +87,7 @@ class Peer(NamedTuple):
 
 
 # pyzmq: XPUB_NODROP and bounded queues make the publisher wait instead of losing anything. Options: `frames`
-# (1 or 2), `latest` (CONFLATE), `tcp` (an address).
+# (1 or 2), `tcp` (an address).
 
 
 def _zmq_publisher(job: Job, topic: str) -> Send:
@@ -112,13 +107,8 @@ def _zmq_publisher(job: Job, topic: str) -> Send:
 
 def _zmq_receive(job: Job, topic: str, handle: Handler, how: str) -> None:
     socket = _zmq_socket(job, topic, zmq.SUB)
-    recv, unpack, view, dtype, shape = (
-        socket.recv,
-        _HEADER.unpack_from,
-        _VIEW,
-        _F32,
-        (PONG_FLOATS if topic == "pong" else job.floats,),
-    )
+    recv, unpack, view, dtype = socket.recv, _HEADER.unpack_from, _VIEW, _F32
+    shape = (PONG_FLOATS if topic == "pong" else job.floats,)
     if job.options.get("frames") == 2 and topic != "pong":
         while True:
             header = recv()
@@ -131,10 +121,7 @@ def _zmq_receive(job: Job, topic: str, handle: Handler, how: str) -> None:
 def _zmq_socket(job: Job, topic: str, kind: int) -> zmq.Socket[Any]:
     """Open a socket; who publishes a flood or a ping binds, the other one connects."""
     socket: zmq.Socket[Any] = zmq.Context.instance().socket(kind)
-    if job.options.get("latest") and kind == zmq.SUB:
-        socket.setsockopt(zmq.CONFLATE, 1)
-    else:
-        socket.sndhwm = socket.rcvhwm = job.depth
+    socket.sndhwm = socket.rcvhwm = job.depth
     socket.sndtimeo = socket.rcvtimeo = int(PATIENCE_S * 1000)
     socket.copy_threshold = 0  # two frames "without copy" means it, also for small payloads
     if kind == zmq.SUB:
@@ -147,51 +134,6 @@ def _zmq_socket(job: Job, topic: str, kind: int) -> zmq.Socket[Any]:
     return socket
 
 
-# zenoh with shared memory: reliable, blocking when congested, two peers on loopback, no scouting. Its Python
-# binding hands shared memory over as bytes, so each side copies once.
-
-
-def _zenoh_publisher(job: Job, topic: str) -> Send:
-    zenoh, shm = importlib.import_module("zenoh"), importlib.import_module("zenoh.shm")
-    publisher = _zenoh_session(zenoh, "listen", job).declare_publisher(
-        topic, congestion_control=zenoh.CongestionControl.BLOCK, reliability=zenoh.Reliability.RELIABLE
-    )
-    size = _HEADER_BYTES + job.payload_bytes
-    provider = shm.ShmProvider.default_backend((size + 4096) * job.slots + 65536)
-    policy = shm.BlockOn(shm.GarbageCollect())
-
-    def send(sequence: int, data: Floats) -> None:
-        buffer = provider.alloc(size, policy)
-        buffer[0:size] = _HEADER.pack(sequence, 0) + data.tobytes()
-        publisher.put(buffer)
-
-    return send
-
-
-def _zenoh_receive(job: Job, topic: str, handle: Handler, how: str) -> None:
-    session = _zenoh_session(importlib.import_module("zenoh"), "connect", job)
-    recv, shape = session.declare_subscriber(topic).recv, (job.floats,)
-    while True:
-        payload = recv().payload.to_bytes()
-        handle(_HEADER.unpack_from(payload)[0], _VIEW(shape, _F32, payload, _HEADER_BYTES))
-
-
-def _zenoh_session(zenoh: Any, role: str, job: Job) -> Any:
-    config = zenoh.Config()
-    for key, value in {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/shared_memory/enabled": True,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": _WAIT_US,
-        "listen/endpoints": [],
-        f"{role}/endpoints": [f"tcp/127.0.0.1:{job.port}"],
-    }.items():
-        config.insert_json5(key, json.dumps(value))
-    _KEPT.append(zenoh.open(config))
-    return _KEPT[-1]
-
-
 # Cyclone DDS by its own Python binding: typed messages, reliable, everything kept until it is acknowledged.
 
 
@@ -202,7 +144,7 @@ def _dds(job: Job, topic: str) -> tuple[Any, Any, Any, Any]:
     kind = load("cyclonedds.idl").make_idl_struct("Sample", "bench.Sample", fields)
     participant = load("cyclonedds.domain").DomainParticipant(job.port % 200)
     policies = qos.Qos(
-        qos.Policy.Reliability.Reliable(max_blocking_time=1000 * _WAIT_US),
+        qos.Policy.Reliability.Reliable(max_blocking_time=int(PATIENCE_S * 1e9)),
         qos.Policy.History.KeepAll,
         qos.Policy.ResourceLimits(max_samples=job.depth),
     )
@@ -218,7 +160,7 @@ def _dds_publisher(job: Job, topic: str) -> Send:
 def _dds_receive(job: Job, topic: str, handle: Handler, how: str) -> None:
     participant, dds_topic, policies, _ = _dds(job, topic)
     reader = importlib.import_module("cyclonedds.sub").DataReader(participant, dds_topic, policies)
-    for sample in reader.take_iter(timeout=1000 * _WAIT_US):
+    for sample in reader.take_iter(timeout=int(PATIENCE_S * 1e9)):
         handle(sample.stamp_ns, np.asarray(sample.data, _F32))
 
 
@@ -231,12 +173,8 @@ def _rclpy_node(job: Job) -> tuple[Any, Any, Any, Any]:
     rclpy.init(domain_id=job.port % 100)
     keep_all, reliable = qos.HistoryPolicy.KEEP_ALL, qos.ReliabilityPolicy.RELIABLE
     profile = qos.QoSProfile(history=keep_all, reliability=reliable)
-    return (
-        rclpy,
-        rclpy.create_node("bench"),
-        importlib.import_module("std_msgs.msg").Float32MultiArray,
-        profile,
-    )
+    kind = importlib.import_module("std_msgs.msg").Float32MultiArray
+    return rclpy, rclpy.create_node("bench"), kind, profile
 
 
 def _rclpy_publisher(job: Job, topic: str) -> Send:
@@ -259,7 +197,6 @@ def _rclpy_receive(job: Job, topic: str, handle: Handler, how: str) -> None:
 
 PEERS = {
     "pyzmq": Peer(_zmq_publisher, _zmq_receive, close=lambda: zmq.Context.instance().destroy(1000)),
-    "zenoh": Peer(_zenoh_publisher, _zenoh_receive, "zenoh"),
     "Cyclone DDS": Peer(_dds_publisher, _dds_receive, "cyclonedds"),
     "rclpy": Peer(_rclpy_publisher, _rclpy_receive, "rclpy"),
 }

@@ -18,7 +18,7 @@ from cortex.bench.cases import METRICS, Bar
 from cortex.bench.measure import CaseResult, Spread, Verdict, faults_of, spread_of, values_of
 
 WIDTH = 110
-_PEERS = ("numpy", "eclipse-zenoh", "cyclonedds", "rclpy")
+_PEERS = ("pyzmq", "numpy", "cyclonedds", "rclpy")
 
 
 def make_console() -> Console:
@@ -28,11 +28,7 @@ def make_console() -> Console:
 
 def print_header(console: Console) -> None:
     """Print what the figures depend on: date, machine, versions, load."""
-    versions = [
-        f"Python {platform.python_version()}",
-        f"pyzmq {zmq.pyzmq_version()}",
-        f"libzmq {zmq.zmq_version()}",
-    ]
+    versions = [f"Python {platform.python_version()}", f"libzmq {zmq.zmq_version()}"]
     for name in _PEERS:
         try:
             versions.append(f"{name} {importlib.metadata.version(name)}")

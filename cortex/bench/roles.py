@@ -15,13 +15,11 @@ from cortex.bench.peers import PATIENCE_S, PONG_FLOATS, Job, Peer, Send, peer_of
 from cortex.bench.tally import (
     END,
     WARM,
-    Ages,
     Finished,
     Floats,
     Handler,
     Tally,
     make_payloads,
-    percentiles,
     resident_kb,
 )
 
@@ -30,8 +28,6 @@ _WARM_S = 0.005
 """Between two WARM messages [s]."""
 _BLOCKED_NS = 50_000_000
 """A call of `publish` that takes longer was waiting for a reader."""
-
-Ring = list[Floats]
 
 
 def publish(pipe: Any, job: Job) -> None:
@@ -64,17 +60,9 @@ def receive(pipe: Any, job: Job) -> None:
 
     peer = peer_of(job)
     how = job.options.get("how", "callback")
-    counts: Tally | Ages
-    handle: Handler
-    if job.options.get("latest"):
-        counts = Ages(connected, busy=job.options["busy"])
-        handle = counts.use
-    else:
-        counts = tally = Tally(job.floats, connected, settle_at=job.count // 10)
-        consume = bool(job.options.get("consume"))
-        handle = tally.handler(consume=consume)
-    _receive(peer, job, "flood", handle, how)
-    pipe.send({"cpu_s": time.process_time() - cpu_s, **counts.report})
+    tally = Tally(job.floats, connected, settle_at=job.count // 10)
+    _receive(peer, job, "flood", tally.handler(consume=bool(job.options.get("consume"))), how)
+    pipe.send({"cpu_s": time.process_time() - cpu_s, **tally.report})
     peer.close()
 
 
@@ -116,8 +104,11 @@ def ask(pipe: Any, job: Job) -> None:
     _receive(peer, job, "pong", on_pong, "recv")
     send(END, payload)
     peer.close()
-    count = len(times_ns)
-    pipe.send({"sent": count, "received": count, **percentiles(times_ns, "rtt")})
+    figures = {}
+    if times_ns:
+        p50, p99 = np.percentile(times_ns, [50, 99], method="higher") / 1e3
+        figures = {"rtt_p50_us": float(p50), "rtt_p99_us": float(p99)}
+    pipe.send({"sent": len(times_ns), "received": len(times_ns), **figures})
 
 
 def answer(pipe: Any, job: Job) -> None:
@@ -173,7 +164,7 @@ def await_death(pipe: Any, job: Job) -> None:
     peer.receive(job, "flood", tally.handler(), "callback")
 
 
-def copy(pipe: Any, job: tuple[float, Ring, Ring]) -> None:
+def copy(pipe: Any, job: tuple[float, list[Floats], list[Floats]]) -> None:
     """Copy arrays in turn into others, again and again for some seconds, once told to go."""
     seconds, sources, targets = job
     for k in range(max(len(sources), len(targets))):  # touches every page before the clock starts
@@ -190,7 +181,7 @@ def copy(pipe: Any, job: tuple[float, Ring, Ring]) -> None:
     pipe.send({"rate": copied / (now - begin), "sent": copied, "received": copied})
 
 
-def make_ring(job: Job) -> Ring:
+def make_ring(job: Job) -> list[Floats]:
     """Return the slots of a mapping that forked children share, each at the start of a page, all touched."""
     stride = -(-job.payload_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
     memory = np.frombuffer(mmap.mmap(-1, stride * job.slots), np.float32)
@@ -208,11 +199,6 @@ def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> tuple[int, 
     pairs = max(1, min(32, 500_000 // job.payload_bytes))
     sent = settled_kb = 0
     begin = time.perf_counter()
-    if rate_hz := job.options.get("rate_hz"):  # stamps, on an absolute schedule: a late one delays no other
-        for sent in range(job.count):
-            time.sleep(max(0.0, begin + sent / rate_hz - time.perf_counter()))
-            send(time.monotonic_ns(), payloads[0])
-        return job.count, 0
     while sent < job.count if job.count else time.perf_counter() < begin + job.seconds:
         for _ in range(pairs):
             send(sent, payloads[0])

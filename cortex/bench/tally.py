@@ -1,10 +1,10 @@
-"""What a subscriber counts: messages, gaps, order, payload, age; and what it costs in time and memory."""
+"""What a subscriber counts: messages, gaps, order, payload; and what it costs in time and memory."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,6 @@ WARM = -1
 """Sequence of a message that only shows that the two sides are connected."""
 END = -2
 """Sequence of the message after the last one."""
-WORK_S = 0.002
-"""Work on each message whose age is measured [s]."""
 
 Floats = NDArray[np.float32]
 Handler = Callable[[Any, Any], None]
@@ -117,45 +115,6 @@ class Tally:
         if self._settled_kb:
             self.report["grown_kb"] = resident_kb() - self._settled_kb
         raise Finished
-
-
-class Ages:
-    """Records the age of each datum at the start of its use, then works 2 ms: busy, or asleep."""
-
-    def __init__(self, connected: Callable[[], None], *, busy: bool) -> None:
-        self.report: dict[str, Any] = {"received": 0, "lost": 0, "misordered": 0, "corrupt": 0}
-        self._busy = busy
-        self._connected = connected
-        self._is_connected = False
-        self._ages_ns: list[int] = []
-        self._last_ns = 0
-
-    def use(self, stamp_ns: int, _data: object) -> None:
-        """Use one message, stamped with CLOCK_MONOTONIC when it was published."""
-        now_ns = time.monotonic_ns()
-        if not self._is_connected:
-            self._is_connected = True
-            self._connected()
-        if stamp_ns == END:
-            self.report |= {"received": len(self._ages_ns), **percentiles(self._ages_ns, "age")}
-            raise Finished
-        if stamp_ns != WARM:
-            self._ages_ns.append(now_ns - stamp_ns)
-            self.report["misordered"] += stamp_ns <= self._last_ns
-            self._last_ns = stamp_ns
-            if self._busy:
-                while time.monotonic_ns() < now_ns + WORK_S * 1e9:
-                    pass
-            else:
-                time.sleep(WORK_S)
-
-
-def percentiles(times_ns: Sequence[int], name: str) -> dict[str, float]:
-    """Return ``{name}_p50_us`` and ``{name}_p99_us`` of some times."""
-    if not times_ns:
-        return {}
-    p50, p99 = np.percentile(times_ns, [50, 99], method="higher") / 1e3
-    return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99)}
 
 
 def resident_kb() -> int:

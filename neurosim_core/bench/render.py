@@ -71,8 +71,13 @@ def _settings(samples: Sequence[int], quick: bool) -> list[dict[str, Any]]:
     biases = (-2.0, 0.0) if quick else (-2.0, -1.0, 0.0, 1.0, 2.0)
     filters = [{"texture_filter": _DEFAULT, "mip_bias": bias} for bias in biases]
     filters += [{"texture_filter": name} for name in ("bilinear", _POINT)]
-    counts = dict.fromkeys((*samples, engine.RenderConfig().samples_per_pixel))
-    return [{"samples_per_pixel": count, **chosen} for chosen in filters for count in counts]
+    adaptive = engine.RenderConfig().samples_per_pixel
+    return [
+        {"samples_per_pixel": count, **chosen}
+        for chosen in filters
+        for count in dict.fromkeys((*samples, adaptive))
+        if count in samples or chosen["texture_filter"] == _DEFAULT or not quick
+    ]
 
 
 def _title(settings: dict[str, Any]) -> str:

@@ -104,8 +104,15 @@ class EventReader:
         """
         self.notes[:] = self._first_notes
         checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        held = NO_EVENTS
         for events in self._source.read():
-            yield checker.check(events)
+            if len(held.t) and len(events.t) and int(events.t.min()) < int(held.t.max()):
+                both = checker.sort(join_events([held, events]))
+                held, events = both.rows(slice(len(held.t))), both.rows(slice(len(held.t), None))
+            if len(held.t):
+                yield checker.check(held)
+            held = events
+        yield checker.check(held)
 
     def close(self) -> None:
         """Close the file."""
@@ -151,7 +158,7 @@ class BlockChecker:
     def __init__(self, path: Path, *, width: int, height: int, notes: list[str] | None = None) -> None:
         self._path, self._width, self._height = path, width, height
         self._notes = notes
-        self._last_us: int | None = None
+        self._last_us = -_TIME_MAX_US
         self._count = 0
         self._disordered = 0
 
@@ -175,20 +182,31 @@ class BlockChecker:
             raise EventFileError(
                 f"{self._path}: times must be microseconds, got {int(t.max())}: nanoseconds?"
             )
-        late_us = np.maximum.accumulate(t) - t
-        worst_us = max(int(late_us.max()), 0 if self._last_us is None else self._last_us - int(t.min()))
-        crosses = self._last_us is not None and int(t.min()) < self._last_us
-        if worst_us > (0 if self._notes is None or crosses else _DISORDER_MAX_US):
+        if int(t[0]) < self._last_us:
+            raise EventFileError(
+                f"{self._path}: time goes back by {self._last_us - int(t[0])} us at event {self._count}"
+            )
+        events = self.sort(events)
+        self._last_us = int(events.t[-1])
+        self._count += len(t)
+        return events
+
+    def sort(self, events: EventArrays) -> EventArrays:
+        """Return events in the order of time; a reader's notes say whether they had another.
+
+        Raises:
+            EventFileError: Times decrease, or a reader's by more than 10 ms.
+        """
+        late_us = np.maximum.accumulate(events.t) - events.t
+        worst_us = int(late_us.max())
+        if worst_us > (0 if self._notes is None else _DISORDER_MAX_US):
             where = self._count + int(np.argmax(late_us))
             raise EventFileError(f"{self._path}: time goes back by {worst_us} us at event {where}")
         if worst_us > 0 and self._notes is not None:
             self._disordered += int(np.count_nonzero(late_us))
             note = f"{self._disordered} events were out of order, by less than 10 ms, and have been sorted"
             self._notes[:] = [n for n in self._notes if "out of order" not in n] + [note]
-            order = np.argsort(t, kind="stable")
-            events = events.rows(order)
-        self._last_us = int(events.t[-1])
-        self._count += len(t)
+            return events.rows(np.argsort(events.t, kind="stable"))
         return events
 
 

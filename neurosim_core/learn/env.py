@@ -156,6 +156,8 @@ class Env:
         self._lagging = torch.zeros((worlds, 4), device=self.device)
         self._each = torch.arange(worlds, device=self.device)
         self.view = self._make_view()
+        self._hover = torch.tensor([self.view.vehicle.hover_thrust_n, 0.0, 0.0, 0.0], device=self.device)
+        self._fall = torch.tensor([0.0, 0.0, -GRAVITY_M_S2], dtype=torch.float64, device=self.device)
         self._seed = seed
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
         self._thrown = torch.zeros((worlds, len(task.bodies), 6), dtype=torch.float64, device=self.device)
@@ -276,10 +278,8 @@ class Env:
         mask = self._mask[:, None]
         for array in (view.action, view.last_action):
             array.masked_fill_(mask, 0.0)
-        hover = torch.zeros(4, device=self.device)
-        hover[0] = view.vehicle.hover_thrust_n
-        self._queue = torch.where(mask, hover, self._queue)
-        self._lagging = torch.where(mask, hover, self._lagging)
+        self._queue = torch.where(mask, self._hover, self._queue)
+        self._lagging = torch.where(mask, self._hover, self._lagging)
         self.episode_length.masked_fill_(self._mask, 0)
         view.elapsed_s.masked_fill_(self._mask, 0.0)
         if self._surface is not None:
@@ -350,7 +350,7 @@ class Env:
         torch.not_equal(self._status, 0, out=self.view.crashed)
         if self.task.bodies:
             time_s = 1e-9 * wp.to_torch(observation.clock_ns).double()[:, None, None]
-            fallen = time_s * torch.tensor([0.0, 0.0, -GRAVITY_M_S2], device=self.device)
+            fallen = time_s * self._fall
             position, velocity = self._thrown.split(3, dim=2)
             moved = position + time_s * (velocity + 0.5 * fallen)
             self.view.bodies.copy_(torch.cat([moved, velocity + fallen], dim=2))

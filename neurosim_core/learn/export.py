@@ -42,11 +42,7 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
     inputs = graph.add("Concat", [features, estimate], axis=1)
     after = graph.gru(policy.memory, inputs, before)
     change = graph.add("Mul", [graph.layer(policy.change, after), graph.constant(np.float32(0.1))])
-    one = graph.constant(np.ones((1, 1), np.float32))
-    measured, known = (graph.add("Concat", [name, one], axis=1) for name in ("vector", estimate))
-    products = graph.add("Flatten", [graph.add("Gemm", [measured, known], transA=1)], axis=0)
-    moved = graph.add("Gemm", [products, graph.weights(policy.motion.weight)], transB=1)
-    estimate = graph.add("Add", [graph.add("Add", [estimate, moved]), change])
+    estimate = graph.add("Add", [estimate, change])
     memory = graph.add("Concat", [after, estimate], output="memory_out", axis=1)
     action = graph.add("Concat", [memory, "vector"], axis=1)
     for layer in policy.head:

@@ -85,9 +85,7 @@ class EventPolicy(nn.Module):
     """A convolutional network on event surfaces, a GRU over time, and an estimate that is integrated.
 
     The estimate (such as of the velocity) is part of the memory, and the network gives its change in each
-    step: a vehicle that does not see much goes on from what it saw, by dead reckoning. Part of the change is
-    bilinear in what is measured and in the estimate, as the equations of motion are in B: gravity, thrust,
-    drag, and the turn of the frame.
+    step: a vehicle that does not see much goes on from what it saw, by dead reckoning.
 
     Args:
         channels: Of the surfaces.
@@ -136,10 +134,8 @@ class EventPolicy(nn.Module):
         self.mix = nn.Sequential(nn.Linear(96 + vector_size, 96), nn.ELU())
         self.memory = nn.GRUCell(96 + hint_count, hidden)
         self.change = nn.Linear(hidden, hint_count)
-        self.motion = nn.Linear((vector_size + 1) * (hint_count + 1), hint_count, bias=False)
         nn.init.orthogonal_(self.change.weight, 0.02)
         nn.init.zeros_(self.change.bias)
-        nn.init.zeros_(self.motion.weight)
         self.head = nn.Sequential(
             nn.Linear(self.memory_size + vector_size, 64), nn.ELU(), nn.Linear(64, action_count)
         )
@@ -153,14 +149,11 @@ class EventPolicy(nn.Module):
         features: torch.Tensor = self.mix(torch.cat([seen, vector], dim=-1))
         return features
 
-    def remember(self, features: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
+    def remember(self, features: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
         """Return the memory after a step, [N, memory_size]."""
         hidden, estimate = memory[:, : self.hidden], memory[:, self.hidden :]
         hidden = self.memory(torch.cat([features, estimate], dim=1), hidden)
-        one = torch.ones_like(estimate[:, :1])
-        measured, known = torch.cat([vector, one], dim=1), torch.cat([estimate, one], dim=1)
-        moved = self.motion((measured[:, :, None] * known[:, None, :]).flatten(1))
-        return torch.cat([hidden, estimate + moved + 0.1 * self.change(hidden)], dim=1)
+        return torch.cat([hidden, estimate + 0.1 * self.change(hidden)], dim=1)
 
     def forward(
         self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
@@ -173,7 +166,7 @@ class EventPolicy(nn.Module):
         self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions (not clamped), and the memory for the next step."""
-        memory = self.remember(self.see(surfaces, vector), vector, memory)
+        memory = self.remember(self.see(surfaces, vector), memory)
         return self.head(torch.cat([memory, vector], dim=1)), memory
 
     def unroll(
@@ -189,8 +182,8 @@ class EventPolicy(nn.Module):
         """
         seen = self.see(surfaces.flatten(0, 1), vectors.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
         memories = []
-        for features, vector, keep in zip(seen, vectors, 1.0 - begun, strict=True):
-            memory = self.remember(features, vector, memory * keep[:, None])
+        for features, keep in zip(seen, 1.0 - begun, strict=True):
+            memory = self.remember(features, memory * keep[:, None])
             memories.append(memory)
         remembered = torch.stack(memories)
         return self.head(torch.cat([remembered, vectors], dim=2)), remembered[..., self.hidden :]

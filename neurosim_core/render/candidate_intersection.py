@@ -7,10 +7,11 @@ edges by more than rounding, and the hit is within the reach of the list. `ray_i
 then computes the exact point, with the tree's own arithmetic. Otherwise the answer is UNRESOLVED.
 
 Error bounds. Corners relative to the camera are rounded the same way in both tests, so they count as exact.
-The edge function d . (b x (c - b)) is off by at most 6e-7 |b| |c - b|, that of Woop's test by 1.4e-6
-max|a, b, c| |c - b|; a ray is within rounding of an edge if the function is below EDGE = 4e-6 of the same
-product. The distance of a triangle is off by less than TIE / 2 of it, unless the triangle is seen nearly from
-the side or is a sliver (SIDE): rays within rounding of such a triangle are unresolved.
+The edge function d . (b x (c - b)) is off by at most 6e-7 |b| |c - b|, that of Woop's test by 1.4e-6 max|a,
+b, c| |c - b|. Rays keep their direction in C, and the functions are turned there: that adds 1.2e-6. A ray is
+within rounding of an edge if the function is below EDGE = 5e-6 of the same product. The distance of a
+triangle is off by less than TIE / 2 of it, unless the triangle is seen nearly from the side or is a sliver
+(SIDE): rays within rounding of such a triangle are unresolved.
 
 Reference: Woop, Benthin, Wald (2013), Watertight Ray/Triangle Intersection.
 """

@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,22 +112,21 @@ def refine(scene: Scene, edge_max_m: float | None, *, added_count_max: int = 4_0
 def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> RefinedMesh | None:
     """Return what `refine` returns; None if more faces are added than allowed."""
     vertices, normals, uv = scene.vertices, scene.normals, scene.uv
-    faces = scene.faces
-    origin = np.arange(len(faces), dtype=np.int32)
-    while edge_max_m is not None:
+    faces, origin = scene.faces, np.arange(len(scene.faces), dtype=np.int32)
+    short: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
+    while edge_max_m is not None and len(faces):
         tips = vertices[faces]
         sides = tips[:, (1, 2, 0)] - tips  # side k goes from corner k to corner k + 1
         long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
         split = long.any(axis=1)
-        if not split.any():
-            break
-        if len(faces) + int(long.sum()) > len(scene.faces) + added_count_max:
+        added_count_max -= int(long.sum())
+        if added_count_max < 0:
             return None
+        short.append((faces[~split], origin[~split]))
         chosen, chosen_long = faces[split], long[split]
-        ends = np.sort(np.stack([chosen, chosen[:, (1, 2, 0)]], axis=-1), axis=-1)[chosen_long].astype(
-            np.int64
-        )
-        keys, index = np.unique(ends[:, 0] * len(vertices) + ends[:, 1], return_inverse=True)
+        one, other = (ends[chosen_long].astype(np.int64) for ends in (chosen, chosen[:, (1, 2, 0)]))
+        ends = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
+        keys, index = np.unique(ends, return_inverse=True)
         first, second = keys // len(vertices), keys % len(vertices)
         middle = np.full(chosen.shape, -1, dtype=np.int32)
         middle[chosen_long] = len(vertices) + index
@@ -136,9 +136,9 @@ def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> Ref
         vertices = np.concatenate([vertices, np.float32(0.5) * (vertices[first] + vertices[second])])
         normals = np.concatenate([normals, halves])
         uv = np.concatenate([uv, np.float32(0.5) * (uv[first] + uv[second])])
-        parts, parents = _split_faces(vertices, chosen, middle)
-        faces = np.concatenate([faces[~split], parts])
-        origin = np.concatenate([origin[~split], origin[split][parents]])
+        faces, parents = _split_faces(vertices, chosen, middle)
+        origin = origin[split][parents]
+    faces, origin = (np.concatenate(each) for each in zip(*short, (faces, origin), strict=True))
     order = np.argsort(origin, kind="stable")  # parts of a face stay together: neighbours in space and memory
     return RefinedMesh(vertices=vertices, normals=normals, uv=uv, faces=faces[order], origin=origin[order])
 
@@ -428,9 +428,12 @@ def bake_light(
     """
 
     def compute() -> dict[str, NDArray[Any]]:
-        normals = corner_normals(mesh)
-        group, example = _group_corners(mesh, normals)
-        light, openness = _light_groups(scene, mesh, config, normals, group, example, device, embree)
+        with ThreadPoolExecutor(max_workers=1) as aside:
+            building = aside.submit(_build_occluders, scene, device, embree=embree)
+            normals = corner_normals(mesh)
+            group, example = _group_corners(mesh, normals)
+            occluders = building.result()
+        light, openness = _light_groups(scene, mesh, config, normals, group, example, occluders, device)
         _unbury(light, openness, group.reshape(-1, 3))
         return {"light": light, "group": group.astype(np.int32)}
 
@@ -441,6 +444,11 @@ def bake_light(
     found = cached_arrays((*inputs, *rest), compute) if large else compute()
     per_corner = found["light"][found["group"]]
     return np.ascontiguousarray(np.moveaxis(per_corner, 1, 0)).reshape(2, -1, 3, 3)
+
+
+def _build_occluders(scene: Scene, device: str, *, embree: bool) -> wp.Mesh | EmbreeTree:
+    """Return the tree of the triangles that cast shadows."""
+    return EmbreeTree(scene.vertices, _shading_faces(scene)) if embree else shading_mesh(scene, device)
 
 
 @functools.cache
@@ -455,14 +463,12 @@ def _light_groups(
     normals: NDArray[np.float32],
     group: NDArray[np.int64],
     example: NDArray[np.int64],
+    occluders: wp.Mesh | EmbreeTree,
     device: str,
-    embree: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return light, shape [G, 2, 3], and openness, [G, 2], of each group of corners on both sides."""
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
-    tree = EmbreeTree(scene.vertices, _shading_faces(scene)) if embree else None
-    occluders = shading_mesh(scene, device) if tree is None else None
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
     openness = wp.empty(2 * len(example), dtype=float, device=device)
     lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
@@ -471,8 +477,8 @@ def _light_groups(
         _bake,
         dim=2 * len(example),
         inputs=[
-            wp.uint64(tree.scene if tree is not None else occluders.id if occluders is not None else 0),
-            wp.uint64(0 if tree is None else tree.intersect_one),
+            wp.uint64(occluders.scene if isinstance(occluders, EmbreeTree) else occluders.id),
+            wp.uint64(occluders.intersect_one if isinstance(occluders, EmbreeTree) else 0),
             wp.vec3(*scene.ambient.up),
             wp.vec3(*scene.ambient.down),
             wp.array(lamps, dtype=wp.vec3, device=device),

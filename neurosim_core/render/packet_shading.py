@@ -16,6 +16,7 @@ import warp as wp
 
 from neurosim_core.native_code import read_native
 from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.view_data import ViewData
 
 
 @cache
@@ -114,24 +115,22 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
 
 
 @cache
-def face_caster(width: int) -> Any:
+def face_caster(width: int, *, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that writes the faces that 4 x 4 pixels see, -1: none.
 
-    It casts the rays of the last layer. Its parameters are those of `packet_program`, but for its last, of
-    which these pixels are written.
+    It casts the rays of the last layer. Its parameters: the scene; the view; the rest as of `packet_program`,
+    but for its last, of which these pixels are written.
 
     Args:
         width: `embree.packet_width()`.
+        timed: Rays have times of their own, the same in all layers.
     """
 
-    @wp.func_native(read_native(__file__, "cast_faces", N=16, SIDE=4, WIDTH=width))
+    @wp.func_native(read_native(__file__, "cast_faces", N=16, SIDE=4, WIDTH=width, TIMED=timed))
     def cast_faces(
         scene: SceneData,
-        rays: wp.array2d[wp.vec4],
+        view: ViewData,
         first_pixel: int,
-        width: int,
-        origin: wp.vec3,
-        q_WC: wp.quat,
         far_m: float,
         instant: int,
         top: int,

@@ -58,8 +58,8 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         packet_program(terms.embree, textured=terms.textured, emissive=terms.emissive) if fused else None
     )
 
-    plain = requested.faces and not (requested.radiance or terms.bodies or terms.timed or listed)
-    cast_faces = face_caster(terms.embree) if plain else None
+    plain = requested.faces and not (requested.radiance or terms.bodies or listed)
+    cast_faces = face_caster(terms.embree, timed=terms.timed) if plain else None
 
     @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
     def raycast_packets(
@@ -115,11 +115,8 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             if slot < 0 or wp.static(not requested.geometry):
                 cast_faces(
                     scene,
-                    view.rays,
+                    view,
                     first_ray + top * view.width + left,
-                    view.width,
-                    origin,
-                    q,
                     FAR_M,
                     instant,
                     top,

@@ -284,8 +284,8 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     place = np.zeros(len(vertices), dtype=np.int64)
     place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
     corner, others = place[mesh.faces], ((1, 2), (2, 0), (0, 1))
-    ends = np.sort(corner[:, others].reshape(-1, 2), axis=1)
-    key = ends[:, 0] << 32 | ends[:, 1]
+    first, last = corner[:, (1, 2, 0)].reshape(-1), corner[:, (2, 0, 1)].reshape(-1)
+    key = np.minimum(first, last) << 32 | np.maximum(first, last)
     order = np.argsort(key, kind="stable")
     same = key[order[1:]] == key[order[:-1]]
     one, other = order[:-1][same], order[1:][same]
@@ -294,8 +294,8 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
     normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    along = np.argsort(corner[:, others].reshape(-1, 2), axis=1)
-    uv = np.take_along_axis(mesh.uv[mesh.faces][:, others].reshape(-1, 2, 2), along[..., None], axis=1)
+    uv = mesh.uv[mesh.faces][:, others].reshape(-1, 2, 2)
+    uv = np.where((first > last)[:, None, None], uv[:, ::-1], uv)
     joined = (material[one // 3] == material[other // 3]) & (uv[one] == uv[other]).all(axis=(1, 2))
     joined &= np.einsum("ec,ec->e", normal[one // 3], normal[other // 3]) > _PLANE_COSINE
     pairs = (one[joined] // 3, other[joined] // 3)

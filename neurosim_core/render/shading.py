@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,misc,no-any-return,operator,arg-type,return-value"
+# mypy: disable-error-code="index,misc,no-any-return,operator,arg-type,return-value,empty-body"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import APART
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
@@ -60,6 +61,8 @@ def surface_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
         beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not. The
             texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
     """
+    if terms.baked and not (beyond or terms.finest_level):
+        return _baked_shader(textured=terms.textured, emissive=terms.emissive)
     surface_albedo, emitted = albedo_reader(terms, beyond=beyond), _emission(terms)
 
     @wp.func
@@ -103,6 +106,35 @@ def surface_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
                     scene.light_radius_m,
                 )
         return reflect_light(albedo, light, emitted(scene, hit))
+
+    return shade
+
+
+@cache
+def _baked_shader(*, textured: bool, emissive: bool) -> wp.Function:
+    """Return the function for baked light and filtered textures: the program of packets, for one ray."""
+    terms = {"TEXTURED": textured, "EMISSIVE": emissive}
+    code = read_native(__file__, "shade_hit", **terms, UNIT=True, LIGHT_WITHIN=False, APART=0)
+
+    @wp.func_native(code)
+    def shade_hit(
+        scene: SceneData,
+        hit: int,
+        direction: wp.vec3,
+        t: float,
+        u: float,
+        v: float,
+        front: wp.vec3,
+        spread_rad: float,
+    ) -> wp.vec3: ...
+
+    @wp.func
+    def shade(
+        scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit, slope: wp.vec2
+    ) -> wp.vec3:
+        if hit.face < 0:
+            return scene.sky
+        return shade_hit(scene, hit.face, ray, hit.t, hit.u, hit.v, hit.normal, spread_rad)
 
     return shade
 

@@ -1,13 +1,13 @@
 """The bounds of the rays of a tile of pixels: slopes, widened by an angle that covers rounding.
 
 Frustums and the sides of tiles hold all rays of a tile by an angle of 1e-5 rad to spare. What that has to
-cover is the rounding of rays and of the camera's axes when they are rotated (5e-7 rad each), of the unit
-normals of the sides (5e-7 rad), and of a triangle's corners along them (1e-6 of the distance): 3e-6 rad
-together, wherever in the picture, because all of it is measured as angles. Bounds are kept as slopes x / z,
-and a slope is an angle only short of 90 degrees from the axis: lenses are taken up to a slope of 100 (89.4
-degrees), where the 1e-5 rad move a bound by two thousandths of itself at most, and are refused beyond. A
-triangle whose plane contains the ray to within rounding is the one exception: Woop's test can hit it outside
-of its edges, and where that is outside of the frustum, too, the tree finds it and a list does not.
+cover is the rounding of rays and of the camera's axes when they are rotated (5e-7 rad each), and of a
+triangle's corners along the sides (1e-6 of the distance): 2e-6 rad together, wherever in the picture,
+because all of it is measured as angles. Bounds are kept as slopes x / z, and a slope is an angle only
+short of 90 degrees from the axis: lenses are taken up to a slope of 100 (89.4 degrees), where the 1e-5
+rad move a bound by two thousandths of itself at most, and are refused beyond. A triangle whose plane
+contains the ray to within rounding is the one exception: Woop's test can hit it outside of its edges, and
+where that is outside of the frustum, too, the tree finds it and a list does not.
 """
 
 from __future__ import annotations

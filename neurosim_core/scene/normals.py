@@ -49,14 +49,13 @@ def smooth_normals(
     # half-edges c -> c + 1 of each face; the two of one edge become neighbours when sorted by their ends
     tail = np.arange(faces.size)
     head = tail + 1 - 3 * (tail % 3 == 2)
-    ends = np.sort(point[faces].reshape(-1)[np.stack([tail, head], axis=1)], axis=1)
-    edge_key = ends[:, 0] << 32 | ends[:, 1]
+    at = point[faces].reshape(-1)
+    edge_key = np.minimum(at, at[head]) << 32 | np.maximum(at, at[head])
     sorted_edges = np.argsort(edge_key, kind="stable")
     first, second = sorted_edges[:-1], sorted_edges[1:]
     gentle = edge_key[first] == edge_key[second]
     gentle &= np.einsum("ex,ex->e", face_normal[first // 3], face_normal[second // 3]) > np.cos(CREASE_RAD)
     first, second = first[gentle], second[gentle]
-    at = point[faces].reshape(-1)
     same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
     joined_a = np.concatenate([first, head[first]])
     joined_b = np.concatenate([np.where(same, second, head[second]), np.where(same, head[second], second)])

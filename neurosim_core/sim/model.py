@@ -130,13 +130,15 @@ def make_fleet(
         return timed(setup_s, name)
 
     device = find_device(config.device)
-    with phase("scene"):
-        members = {name: config.of(name) for name in config.vehicles}
-        seeing = any(plan_render_groups(member.sensors) for member in members.values())
-        scene = config.scene.load(pictures=seeing) if scene is None else scene
-        bodies = make_bodies(config.bodies) if seeing else ()
-    with ThreadPoolExecutor(max_workers=1) as aside:  # light needs no path: both at once
-        light = functools.partial(
+    with ThreadPoolExecutor(max_workers=1) as aside:
+        beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
+        with phase("scene"):
+            members = {name: config.of(name) for name in config.vehicles}
+            seeing = any(plan_render_groups(member.sensors) for member in members.values())
+            scene = config.scene.load(pictures=seeing) if scene is None else scene
+            bodies = make_bodies(config.bodies) if seeing else ()
+        beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
+        light = functools.partial(  # needs no path: both at once
             upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
         )
         lit = aside.submit(light) if seeing else None

@@ -1,20 +1,13 @@
 """Decode damaged bodies, and demand that each one is decoded or rejected, the same way by all decoders.
 
-    python tests/cortex/fuzz_decode.py --count 1000000           # mutations of the test vectors
-    python tests/cortex/fuzz_decode.py --atheris --count 1000000 # guided by coverage (pip install atheris)
-
 The short cuts must agree with the general decoder on every body, and on every twentieth with the reading of
-WIRE.md in `wire_oracle`. Memory is limited to 2 GiB of address space.
+WIRE.md in `wire_oracle`.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
-import resource
-import sys
-import time
 from collections import Counter
 from typing import Any
 
@@ -132,43 +125,3 @@ def run(count: int, seed: int, oracle_every: int = 20) -> Counter[str]:
         accepted = check(target, body, with_oracle=index % oracle_every == 0)
         results["accepted" if accepted else "rejected"] += 1
     return results
-
-
-def run_atheris(count: int, seed: int) -> None:
-    """Let atheris choose the bodies; the first byte is the type."""
-    import atheris
-
-    atheris.instrument_all()
-    all_targets = targets()
-
-    def one(data: bytes) -> None:
-        if data:
-            check(all_targets[data[0] % len(all_targets)], data[1:], with_oracle=False)
-
-    atheris.Setup([sys.argv[0], f"-atheris_runs={count}", f"-seed={seed}", "-max_len=512"], one)
-    atheris.Fuzz()
-
-
-def main() -> int:
-    """Run the fuzzer from the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--count", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--atheris", action="store_true")
-    options = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
-    if options.atheris:
-        run_atheris(options.count, options.seed)
-        return 0
-    start = time.monotonic()
-    results = run(options.count, options.seed)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    seconds = time.monotonic() - start
-    print(f"{options.count} bodies, {dict(results)}, {seconds:.0f} s, peak memory {peak} MiB")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,22 +8,20 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from processes import SOON_S, wait_for
-from scipy import stats
 
 from cortex.bench.cases import CASES, Bar, Case, Contestant, choose
 from cortex.bench.command import main
-from cortex.bench.measure import CaseResult, Report, Settings, Spread, judge, run_case, spread_of
+from cortex.bench.measure import CaseResult, Report, Settings, Spread, judge, run_case
 from cortex.bench.peers import PEERS
 from cortex.bench.processes import Child, ChildFailed
 from cortex.bench.report import WIDTH, make_console, print_case, print_summary, write_csv
-from cortex.bench.tally import END, WARM, Ages, Finished, Tally, make_payloads
+from cortex.bench.tally import END, WARM, Finished, Tally, make_payloads
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOATS = 10
@@ -72,17 +70,6 @@ def test_tally_sees_a_torn_payload(at: int):
     torn[at] = 2.0
     tally.handler()(0, torn)
     assert tally.report["corrupt"] == 1
-
-
-def test_ages_count_from_the_stamp_to_the_use():
-    ages = Ages(lambda: None, busy=False)
-    ages.use(WARM, None)
-    for early_s in (0.001, 0.003):
-        ages.use(time.monotonic_ns() - int(1e9 * early_s), None)
-    with pytest.raises(Finished):
-        ages.use(END, None)
-    assert ages.report["received"] == 2
-    assert ages.report["age_p99_us"] >= 3_000.0  # what a busy machine adds has no bound
 
 
 # Children.
@@ -145,16 +132,6 @@ def test_child_that_hangs_is_killed_with_all_that_it_started():
 # Judging.
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 8, 9, 12, 20, 36])
-def test_the_interval_of_a_median_is_that_of_the_binomial(count: int):
-    """As few figures lie outside as `scipy` says that 2.5 % on each side allow."""
-    spread = spread_of([float(k) for k in range(count, 0, -1)])
-    assert spread is not None
-    outside = max(0, int(stats.binom(count, 0.5).ppf(0.025)) - 1)
-    assert (spread.low, spread.high) == (1.0 + outside, count - outside)
-    assert spread.median == (count + 1) / 2.0
-
-
 def rates(*values: float, **more: object) -> list[Report]:
     return [{"rate": value, "sent": 10, "lost": 0, **more} for value in values]
 
@@ -163,7 +140,7 @@ def test_ratio_is_taken_within_each_repetition():
     """A machine that is twice as slow in the second repetition changes no ratio."""
     outcomes = {"a": rates(90.0, 45.0, 80.0), "b": rates(100.0, 50.0, 100.0)}
     verdict = judge(Bar("a", ("b",), ">=", 0.85), outcomes)
-    assert verdict.measured == Spread(*map(pytest.approx, (0.9, 0.8, 0.9)))
+    assert verdict.measured == Spread(*map(pytest.approx, (0.9, 0.85, 0.9)))
     assert verdict.word == "met"
     assert judge(Bar("a", ("b",), ">=", 0.91), outcomes).word == "missed"
     assert judge(Bar("a", ("b",), "<=", 0.91), outcomes).word == "met"
@@ -214,9 +191,9 @@ def test_cases_are_chosen_by_name_or_family():
 
 def test_a_peer_that_is_not_installed_is_reported(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("cortex.bench.measure.missing", lambda transport: "not installed")
-    case = Case("x", "title", 10, (Contestant("zenoh", "zenoh"),))
+    case = Case("x", "title", 10, (Contestant("a peer", "Cyclone DDS"),))
     result = run_case(case, Settings())
-    assert result.reports == {"zenoh": [{"absent": "not installed"}]}
+    assert result.reports == {"a peer": [{"absent": "not installed"}]}
     assert "not installed" in printed(print_case, result)
 
 
@@ -285,7 +262,18 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[dict[s
     """One repetition of every case, a few milliseconds each, in a process that has no ZeroMQ context yet."""
     path = tmp_path_factory.mktemp("bench") / "out.csv"
     before = set(Path("/dev/shm").glob("*")) if Path("/dev/shm").is_dir() else set()
-    command = [sys.executable, "-m", "cortex.bench", *TINY, "--quick", "--repeats", "1", "--seconds", "0.02"]
+    command = [
+        sys.executable,
+        "-m",
+        "cortex",
+        "bench",
+        *TINY,
+        "--quick",
+        "--repeats",
+        "1",
+        "--seconds",
+        "0.02",
+    ]
     done = subprocess.run(
         [*command, "--csv", str(path)], cwd=ROOT, capture_output=True, text=True, timeout=600.0, check=False
     )
@@ -326,7 +314,7 @@ def test_tiny_run_prints_every_bar(tiny_run: tuple[str, list[dict[str, str]]]):
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_run_that_is_ended_leaves_no_process(short_folder: Path, number: signal.Signals):
-    command = [sys.executable, "-m", "cortex.bench", "typed-40", "--seconds", "300"]
+    command = [sys.executable, "-m", "cortex", "bench", "typed-40", "--seconds", "300"]
     environment = {**os.environ, "TMPDIR": str(short_folder)}
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as bench:
         wait_for(lambda: len(children_of(bench.pid)) >= 3)  # the registry, a publisher, a subscriber

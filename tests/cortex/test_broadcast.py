@@ -319,7 +319,7 @@ def test_a_reader_cannot_write_to_the_ring(ring):
 
 
 @pytest.mark.parametrize(
-    "said", [b"", b"x" * 24, (b"CTXCAST2" * 3)], ids=["nothing", "nonsense", "no descriptors"]
+    "said", [b"", b"x" * 24, (b"CTXCAST3" * 3)], ids=["nothing", "nonsense", "no descriptors"]
 )
 def test_who_says_something_else_is_refused(ring, said):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import zmq
 from peer import Number, Scan, make
+from processes import SOON_S
 
 from cortex.codec import codec_of, coder_of
 from cortex.compiled import native
@@ -146,3 +147,33 @@ def test_frames_that_are_none_of_this_publisher():
         assert list(messages) == [make(Scan, 3, 40)]
         link.coder, link.expected = coder_of(codec_of(Scan), b""), 3  # it has no head
         assert path.drain(link, messages, 4, False) == frame
+
+
+def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
+    """It is not taken where it is free, but nobody passes one who has it."""
+    publisher, subscriber = numbers
+    assert publisher.publish(Number(0, 0))
+    with publisher._lock:
+        thread = threading.Thread(target=publisher.publish, args=(Number(1, 1),))
+        thread.start()
+        thread.join(0.05)
+        assert publisher._fast_send.sequence == 1
+    thread.join()
+    assert [subscriber.recv(SOON_S).value for _ in range(2)] == [0, 1]
+
+
+def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
+    """As a publisher; what is there is taken once the lock is free, in order."""
+    publisher, subscriber = numbers
+    assert publisher.publish(Number(0, 0))
+    assert subscriber.recv(SOON_S).value == 0
+    assert publisher.publish(Number(1, 1))
+    got = []
+    with subscriber._lock:
+        thread = threading.Thread(target=lambda: got.append(subscriber.recv(SOON_S).value))
+        thread.start()
+        thread.join(0.05)
+        assert got == []
+    thread.join()
+    assert got == [1]
+    assert subscriber.counters.received == 2

@@ -1,48 +1,17 @@
-"""Damaged bodies of every type are decoded or rejected and nothing else; `fuzz_decode.py` runs more."""
+"""Damaged bodies of every type are decoded or rejected and nothing else."""
 
 from __future__ import annotations
 
+import os
 import tracemalloc
 
-import numpy as np
-from fuzz_decode import outcome, run, targets, touch
-from hypothesis import given
-from hypothesis import strategies as st
-from random_schemas import any_message, schemas
-
-from cortex.codec import codec_of
-from cortex.schema import type_from_schema
+from fuzz_decode import outcome, run, targets
 
 
 def test_mutated_bodies():
-    results = run(20_000, seed=1)
+    results = run(int(os.environ.get("CORTEX_FUZZ_BODIES", "20000")), seed=1)
     assert results["accepted"] > 2_000  # else the mutations would only show that wrong sizes are rejected
     assert results["rejected"] > 5_000
-
-
-@given(schemas, st.binary(max_size=400))
-def test_random_bytes_as_any_type(schema, data):
-    codec = codec_of(type_from_schema(schema))
-    first = outcome(codec.decode, data)
-    general = outcome(codec._body.read, np.frombuffer(data, np.uint8))
-    assert (first is None) == (general is None)
-    if first is not None:
-        touch(first)
-
-
-@given(any_message(), st.data())
-def test_mutated_bodies_of_any_type(value, data):
-    codec = codec_of(type(value))
-    body = bytearray(codec.encode(value, 2**30))
-    for _ in range(data.draw(st.integers(1, 3))):
-        if body:
-            place = data.draw(st.integers(0, len(body) - 1))
-            body[place : place + 4] = data.draw(st.binary(min_size=4, max_size=4))
-    first = outcome(codec.decode, bytes(body))
-    general = outcome(codec._body.read, bytes(body))
-    assert (first is None) == (general is None)
-    if first is not None:
-        assert codec.encode(first, 2**20) == codec.encode(general, 2**20)
 
 
 def test_rejecting_takes_no_memory():

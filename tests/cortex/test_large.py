@@ -307,6 +307,12 @@ def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
         wait_for(lambda: publisher._fanout.large._free, SOON_S)
     assert max(peaks) < 1.5
     assert min(peaks) < 0.5
+    tracemalloc.start()
+    with publisher.loan(n=1_000_000) as draft:
+        draft.stamp_ns, draft.ranges[:] = message.stamp_ns, message.ranges
+    assert tracemalloc.get_traced_memory()[1] / message.ranges.nbytes < 1.5
+    tracemalloc.stop()
+    assert subscriber.recv(SOON_S) == message
 
 
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
@@ -328,7 +334,7 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
 
     wait_for(has_caught_up)
     assert counters.received > 1
-    assert counters.lost > 0
+    assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
 
 def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):

@@ -115,16 +115,16 @@ def test_who_sleeps_is_woken(left_out):
     assert bool(overslept) == (left_out is not None)
 
 
+@pytest.mark.parametrize("entries", [1, 2])
 @pytest.mark.parametrize("left_out", [None, ("order",)], ids=["as it is", "without the fence"])
-def test_what_is_written_over_is_not_taken(left_out):
-    """The reader copies two words of an entry while both are replaced, and then looks at `reserved`."""
-    publisher = [
-        ("store", "reserved", 2),
-        ("order",),
-        ("store", "one", 2),
-        ("store", "two", 2),
-        ("release", "head", 2),
-    ]
+def test_what_is_written_over_is_not_taken(left_out, entries):
+    """The reader copies two words of an entry while both are replaced, and then looks at `reserved`.
+
+    That was raised once for all entries.
+    """
+    publisher = [("store", "reserved", 1 + entries), ("order",)]
+    for entry in range(2, 2 + entries):
+        publisher += [("store", "one", entry), ("store", "two", entry), ("release", "head", entry)]
     reader = [("load", "one"), ("load", "two"), ("load", "reserved")]
     ends = explore({"reserved": 1, "head": 1, "one": 1, "two": 1}, without(publisher, left_out), reader)
     taken = [read for _, (_, read) in ends if read["reserved"] == 1]

@@ -205,6 +205,31 @@ def test_a_text_that_was_cut_off(tmp_path):
         assert "cut off" in reader.notes[0]
 
 
+def test_events_slightly_out_of_order(tmp_path, monkeypatch):
+    """Within blocks and across their ends; by more than 10 ms it is damage."""
+    monkeypatch.setattr("neurosim_core.io.csv._BLOCK_LINES", 50)
+    events, rng = draw(1000, span_us=1_000_000), np.random.default_rng(1)
+    order = np.argsort(events.t + rng.integers(-4000, 4000, 1000), kind="stable")
+    path = tmp_path / "events.csv"
+    np.savetxt(path, np.stack([column[order] for column in events], 1), "%d", ",")
+    reader = open_events(path, size=(WIDTH, HEIGHT))
+    blocks = [*reader.blocks()]
+    t = np.concatenate([block.t for block in blocks])
+    assert np.array_equal(t, events.t)
+    assert sum(len(block.t) for block in blocks) == 1000
+    late = np.count_nonzero(np.maximum.accumulate(events.t[order]) > events.t[order])
+    assert int(reader.notes[0].split()[0]) == late
+    assert sorted(
+        zip(*(np.concatenate(c).tolist() for c in zip(*blocks, strict=True)), strict=True)
+    ) == sorted(zip(*(column.tolist() for column in events), strict=True))
+    for first in (405, 440):  # in a block, and across the end of one
+        late = np.arange(1000)
+        late[[first, first + 30]] = late[[first + 30, first]]
+        np.savetxt(path, np.stack([column[late] for column in events], 1), "%d", ",")
+        with pytest.raises(EventFileError, match="time goes back by"):
+            read(path, size=(WIDTH, HEIGHT))
+
+
 @pytest.mark.parametrize("line", ["1,-1,5,0", "1,3,65536,0", "1,3.5,5,0", "1,3,5,nan", "1e300,3,5,0"])
 def test_numbers_that_are_no_event(line, tmp_path):
     path = tmp_path / "events.csv"

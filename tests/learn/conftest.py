@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from runtime_directory import runtime
 
 import neurosim_core as ns
@@ -39,3 +40,43 @@ def hall(tmp_path_factory):
             }
         )
     )
+
+
+@pytest.fixture(scope="module")
+def env(request):
+    """The task that the module names, in the first of its scenes to test in: without a camera, on a CPU."""
+    from neurosim_core.learn.env import find_task
+
+    options = dict(request.module.ENV)
+    task = find_task(options.pop("task"))
+    return ns.learn.make_env(task, device="cpu", scenes=task.scenes(unseen=True)[:1], **options)
+
+
+@pytest.fixture
+def host_tensors(monkeypatch):
+    """Return the function that counts how many tensors of numbers of the host another function makes.
+
+    On a CUDA device each is a copy that waits until all work there is done. Views of Warp's arrays are none.
+    """
+    from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+    to_torch = wp.to_torch
+
+    class Count(TorchDispatchMode):
+        made = 0
+
+        def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+            self.made += "lift_fresh" in str(operation)
+            return operation(*args, **(kwargs or {}))
+
+    def view(array):
+        with _disable_current_modes():
+            return to_torch(array)
+
+    def count(function) -> int:
+        monkeypatch.setattr(wp, "to_torch", view)
+        with Count() as counted:
+            function()
+        return counted.made
+
+    return count

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import neurosim_core as ns
-
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn.env import find_task  # noqa: E402
@@ -14,12 +12,7 @@ from neurosim_core.learn.env import find_task  # noqa: E402
 torch.set_num_threads(1)
 
 
-@pytest.fixture(scope="module")
-def env():
-    task = find_task("avoid")
-    return ns.learn.make_env(
-        task, worlds=24, device="cpu", observe=["state"], scenes=task.scenes(unseen=True)[:1], seed=3
-    )
+ENV = {"task": "avoid", "worlds": 24, "observe": ["state"], "seed": 3}
 
 
 def test_vehicles_begin_at_one_end_and_fly_towards_the_other(env):

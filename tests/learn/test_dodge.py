@@ -110,3 +110,10 @@ def test_who_climbs_as_long_as_a_sphere_comes_succeeds(env):
     found = evaluate(env, climb)
     assert found.metrics["hit"] < 0.1
     assert evaluate(env, lambda *_: torch.zeros(64, 4)).metrics["hit"] == 1.0
+
+
+def test_throwing_makes_no_tensor_of_host_numbers(env, host_tensors):
+    env.reset(seed=3)
+    actions = torch.zeros((64, 4))
+    env.episode_length.fill_(env.episode_steps - 1)
+    assert host_tensors(lambda: env.step(actions)) == 0

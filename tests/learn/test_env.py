@@ -9,6 +9,7 @@ import neurosim_core as ns
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
+from neurosim_core.learn.episodes import Randomisation  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 
 torch.set_num_threads(1)
@@ -108,13 +109,28 @@ def test_observations_share_memory_with_the_simulator(make):
     assert observations["events"].dtype == torch.float32
 
 
+def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors):
+    drawn = Randomisation(lag_s=(0.01, 0.05), mass_factor=(0.9, 1.1), wind_m_s=1.0)
+    env = make(randomise=drawn)
+    env.reset(seed=1)
+    actions = torch.zeros((3, 4))
+
+    def step_and_end() -> None:
+        env.episode_length.fill_(env.episode_steps - 1)
+        *_, truncated, _ = env.step(actions)
+        assert truncated.all()
+
+    assert host_tensors(step_and_end) == 0
+    assert host_tensors(lambda: torch.tensor(1.0)) == 1
+
+
 def test_the_student_sees_neither_velocity_nor_position(make):
     """Two worlds that differ in nothing else look alike to it before the first event."""
     env = make(worlds=2, randomise=False)
     env.reset(seed=1)
     env.view.velocity_B[:] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     env.view.gravity_measured[:], env.view.gyro[:] = 0.5, 0.25
-    seen = env.task.observe(env.view)
+    seen = env.task.observe(env.view) | {"events": env.view.surface}
     student = env.group(seen, "student")
     assert torch.equal(student[0], student[1])
     assert not torch.equal(*env.group(seen, "teacher"))

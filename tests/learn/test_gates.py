@@ -5,22 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import neurosim_core as ns
-
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
-from neurosim_core.learn.env import find_task  # noqa: E402
 from neurosim_core.learn.tasks.gates import track  # noqa: E402
 
 torch.set_num_threads(1)
 
 
-@pytest.fixture(scope="module")
-def env():
-    task = find_task("gates")
-    return ns.learn.make_env(
-        task, worlds=24, device="cpu", observe=["state", "next_gate"], scenes=task.scenes(unseen=True)[:1]
-    )
+ENV = {"task": "gates", "worlds": 24, "observe": ["state", "next_gate"]}
 
 
 def begin(env):

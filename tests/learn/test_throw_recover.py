@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-import neurosim_core as ns
-
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
-from neurosim_core.learn.env import find_task  # noqa: E402
 from neurosim_core.learn.evaluate import evaluate, teacher_actor  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 
 torch.set_num_threads(1)
 
 
-@pytest.fixture(scope="module")
-def env():
-    task = find_task("throw-recover")
-    return ns.learn.make_env(
-        task, worlds=128, device="cpu", observe=["state"], scenes=task.scenes(unseen=True)[:1], seed=3
-    )
+ENV = {"task": "throw-recover", "worlds": 128, "observe": ["state"], "seed": 3}
 
 
 def test_episodes_begin_any_way_up_and_spinning(env):

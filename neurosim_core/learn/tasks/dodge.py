@@ -86,7 +86,8 @@ class Dodge(Task):
         ahead = torch.stack([bearing.cos(), bearing.sin(), 0.0 * bearing], dim=2)
         velocity = -_FROM_M / flight_s[..., None] * ahead  # when it gets there
         velocity[..., 2] = (position[:, 2:] + _RADIUS_M) / flight_s - 0.5 * GRAVITY_M_S2 * flight_s
-        fallen = hit_s[..., None] * torch.tensor([0.0, 0.0, -GRAVITY_M_S2], device=draws.device)
+        fallen = torch.zeros_like(velocity)
+        fallen[..., 2] = -GRAVITY_M_S2 * hit_s
         return position[:, None] - hit_s[..., None] * (velocity - 0.5 * fallen), velocity - fallen
 
     def begin(self, view: View, mask: torch.Tensor) -> None:

@@ -1,6 +1,6 @@
 // CPU: `aim_rays` writes rays of 16 lanes in W, x, y, z and spread, to `out` [4][16]. The ray of a lane is that of pixel
-// `pixel_of`(lane), -1: none, all 0, in layer `layer_of`(lane), turned by `turn_of`(lane).
-auto aim_rays = [&](auto layer_of, auto pixel_of, auto turn_of, auto& out) {
+// `pixel_of`(lane), -1: none, all 0, in layer `layer_of`(lane); `turn`(lane, x, y, z) takes it to W.
+auto aim_rays = [&](auto layer_of, auto pixel_of, auto& out) {
     using Quad = float __attribute__((ext_vector_type(4)));
     using Quads = float __attribute__((ext_vector_type(16)));
     Quads quads[4], halves[4]; // of four lanes side by side; then of x and y, z and spread: transposed in registers
@@ -28,7 +28,7 @@ auto aim_rays = [&](auto layer_of, auto pixel_of, auto turn_of, auto& out) {
         __builtin_memcpy(out[term], rows, sizeof(rows));
     }
     for (int lane = 0; lane < 16; ++lane) {
-        const wp::vec3 turned = wp::quat_rotate(turn_of(lane), wp::vec3(out[0][lane], out[1][lane], out[2][lane]));
+        const wp::vec3 turned = turn(lane, out[0][lane], out[1][lane], out[2][lane]);
         for (int axis = 0; axis < 3; ++axis) out[axis][lane] = turned[axis];
     }
 };

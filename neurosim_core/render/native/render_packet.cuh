@@ -1,4 +1,5 @@
 auto origin_of = [&](int axis, int) { return origin[axis]; };
+auto turn = [&](int, float x, float y, float z) { return wp::quat_rotate(q_WC, wp::vec3(x, y, z)); };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
 alignas(64) float total[3][N] = {};
 const int layers = rays.shape[0];
@@ -14,7 +15,7 @@ for (int sample = 0; sample < samples; ++sample) {
     };
     auto layer_of = [&](int lane) { return layers > 1 ? 1 + (together == 4 ? sample - quarter + lane / 4 : sample) : 0; };
     alignas(64) float ray[4][N];
-    aim_rays(layer_of, pixel_of, [&](int) { return q_WC; }, ray);
+    aim_rays(layer_of, pixel_of, ray);
     const auto& spread = ray[3];
 #include "embree_packet.cuh"
     constexpr float slope[2][N] = {};

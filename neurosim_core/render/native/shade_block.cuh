@@ -2,7 +2,7 @@
 // pixel that has to be rendered by rays. Each face is shaded once per pixel, at the middle of the points that show it. With TIMED
 // each pixel has a pose of its own.
 const int width = view.width, height = view.height;
-constexpr int LANES = 16, N = 16, POSES = TIMED ? LANES : 1;
+constexpr int LANES = 16, N = 16;
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 const int* const own_faces = wp::address(faces, instant, top, left);
 alignas(64) int own[LANES];
@@ -19,32 +19,23 @@ for (int y = 0; y < 6; ++y)
         const int part = *wp::address(faces, instant, wp::min(upper + y, height - 1), wp::min(leftmost + x, width - 1));
         other_surface |= (part < 0) | (scene.face_surface.data[wp::max(part, 0)] ^ surface_here);
     }
-auto pose_of = [&](int row, int column) {
-    return TIMED ? instant * view.pose_count + *wp::address(view.pose, 0, row * width + column) : instant;
-};
-const wp::vec3 origin = view.p_WC.data[pose_of(top, left)];
+#include "pixel_poses.cuh"
+const wp::vec3 origin(position[0][0], position[1][0], position[2][0]);
 alignas(64) float shift[3][POSES]; // of the positions from `origin`
-wp::vec3 position[POSES];
-wp::quat q_WC[POSES];
-for (int lane = 0; lane < POSES; ++lane) {
-    const bool inside = lane % 4 < columns && lane / 4 < rows;
-    const int pose = pose_of(inside ? top + lane / 4 : top, inside ? left + lane % 4 : left);
-    position[lane] = view.p_WC.data[pose];
-    q_WC[lane] = view.q_WC.data[pose];
-    for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[lane][axis] - origin[axis];
-}
+for (int lane = 0; lane < POSES; ++lane)
+    for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[axis][lane] - origin[axis];
 #include "aim_rays.cuh"
 alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
 auto pixel_of = [&](int lane) { return first_pixel + (lane % 4 < columns && lane / 4 < rows ? lane / 4 * width + lane % 4 : 0); };
 auto turn_rays = [&](int term) {
-    aim_rays([&](int) { return term; }, pixel_of, [&](int lane) { return q_WC[TIMED ? lane : 0]; }, ray[term]);
+    aim_rays([&](int) { return term; }, pixel_of, ray[term]);
 };
 turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
     return 0.01f * SHARPNESS * __builtin_elementwise_sqrt(points_shown / SAMPLES);
 };
 constexpr int PAIRS_MAX = LANES * SAMPLES; // of a pixel and a surface that it shows
-alignas(64) float direction[3][PAIRS_MAX], from[3][TIMED ? PAIRS_MAX : 1], spread_of[PAIRS_MAX], share[PAIRS_MAX], total[3][LANES] = {};
+alignas(64) float direction[3][PAIRS_MAX], spread_of[PAIRS_MAX], share[PAIRS_MAX], total[3][LANES] = {};
 alignas(64) int faces_of[PAIRS_MAX], owner[PAIRS_MAX];
 int pair_count = 0, unresolved = 0;
 if (!other_surface) {
@@ -54,8 +45,6 @@ if (!other_surface) {
         spread_of[lane] = footprint_width(SAMPLES) * ray[0][3][lane];
         share[lane] = 1.0f;
         for (int axis = 0; axis < 3; ++axis) direction[axis][lane] = ray[0][axis][lane];
-        if constexpr (TIMED)
-            for (int axis = 0; axis < 3; ++axis) from[axis][lane] = position[lane][axis];
     }
     pair_count = LANES;
 } else {
@@ -90,11 +79,10 @@ if (!other_surface) {
         }
         for (unsigned rest = lanes_where(shows); rest; rest &= rest - 1) {
             const int lane = lowest_of(rest);
-            const wp::vec3& place = position[TIMED ? lane : 0];
+            const int pose = TIMED ? lane : 0;
+            const wp::vec3 from(position[0][pose], position[1][pose], position[2][pose]);
             const wp::vec3 toward(middles[0][lane], middles[1][lane], middles[2][lane]);
-            faces_of[pair_count] = part_of(layer, own[lane], place, toward);
-            if constexpr (TIMED)
-                for (int axis = 0; axis < 3; ++axis) from[axis][pair_count] = place[axis];
+            faces_of[pair_count] = part_of(layer, own[lane], from, toward);
             owner[pair_count] = lane;
             spread_of[pair_count] = spreads[lane];
             share[pair_count] = shares[lane];
@@ -104,10 +92,9 @@ if (!other_surface) {
     }
     for (int pair = pair_count; pair % N != 0; ++pair) {
         faces_of[pair] = faces_of[pair_count - 1];
+        owner[pair] = owner[pair_count - 1];
         spread_of[pair] = spread_of[pair_count - 1];
         for (int axis = 0; axis < 3; ++axis) direction[axis][pair] = direction[axis][pair_count - 1];
-        if constexpr (TIMED)
-            for (int axis = 0; axis < 3; ++axis) from[axis][pair] = from[axis][pair_count - 1];
     }
 }
 constexpr float NEARNESS_MIN = 1e-6f, COSINE_MIN = 0.05f; // as in `meet_plane.cuh`
@@ -129,7 +116,7 @@ for (int begin = 0; begin < pair_count; begin += N) {
     if constexpr (TIMED)
         for (int corner = 0; corner < 3; ++corner)
             for (int axis = 0; axis < 3; ++axis)
-                for (int lane = 0; lane < N; ++lane) tip[corner][axis][lane] -= from[axis][begin + lane];
+                for (int lane = 0; lane < N; ++lane) tip[corner][axis][lane] -= position[axis][owner[begin + lane]];
     for (int lane = 0; lane < N; ++lane) { // as in `meet_plane.cuh`
         float function[3][3], weight_of[3], unit[3], facing = 0.0f;
         for (int side = 0; side < 3; ++side)

@@ -27,6 +27,7 @@
 enum {
     CORTEX_MEMBERS = 64,
     CORTEX_MARKS = 16,
+    CORTEX_STEPS = 64, /* `reserved` is raised by a part of the ring, of so many */
     CORTEX_HEAD_BYTES = 1 << 16, /* before the frames: a multiple of every page size */
     CORTEX_PAGE_BYTES = 4096,
     CORTEX_ENTRY_BYTES = 8,      /* before each frame: its size, and what it is */
@@ -46,18 +47,19 @@ enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a 
 enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
 enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT, CORTEX_CROWDED }; /* what a reader finds in a slot */
 
-#define CORTEX_RING_MAGIC 0x3254534143585443u /* "CTXCAST2" */
+#define CORTEX_RING_MAGIC 0x3354534143585443u /* "CTXCAST3" */
 
 typedef struct {
     uint64_t magic, capacity, source, generation, slots, slot_bytes;
     uint64_t quota; /* how many slots a reader may lease at once; further messages it copies */
     uint64_t unused;
     uint64_t reserved; /* bytes below this, less the capacity, may have been written over */
-    uint64_t head;     /* all below this is whole */
-    uint64_t last;     /* where the last entry begins */
-    uint64_t unused_too[5];
+    uint64_t unused_two[7];
+    uint64_t head; /* all below this is whole; in a cache line that readers look at once for all that has come */
+    uint64_t last; /* where the last entry begins */
+    uint64_t unused_three[6];
     uint64_t marks[CORTEX_MARKS]; /* where the first entry of each part of the ring begins */
-    uint64_t unused_three[480];
+    uint64_t unused_four[472];
     uint64_t words[CORTEX_SLOTS]; /* of each slot: the sequence of its message and 1; 0: it is being written */
 } CortexRing;
 
@@ -125,6 +127,7 @@ typedef struct {
     const uint8_t *data;
     CortexPage *page;
     uint64_t capacity, source, tail;
+    uint64_t seen;  /* the head when it was looked at last */
     uint64_t first; /* sequence of the first message that is sent to it */
     int socket, bell;
     int armed;
@@ -232,11 +235,13 @@ static inline void cortex_member_give_up(const CortexWriter *writer, CortexMembe
 }
 
 /* Where the frame of the next entry is to be written, for which there is room. If it is not after all, nothing has happened:
-   `reserved` stays, as the bytes below it may have changed. */
-static inline uint8_t *cortex_ring_begin(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, size_t size) {
+   `reserved` stays, as the bytes below it may have changed. It may be raised as far as `ahead` where it has to be raised. */
+static inline uint8_t *cortex_ring_begin(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, size_t size, uint64_t ahead) {
     const uint64_t next = at + cortex_entry_bytes(size);
-    if (next > __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED)) __atomic_store_n(&ring->reserved, next, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
+    if (next > __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED)) {
+        __atomic_store_n(&ring->reserved, next > ahead ? next : ahead, __ATOMIC_RELAXED);
+        __atomic_thread_fence(__ATOMIC_RELEASE); /* pairs with the fence of `cortex_reader_is_whole` */
+    }
     return data + (at & (capacity - 1)) + CORTEX_ENTRY_BYTES;
 }
 
@@ -252,16 +257,10 @@ static inline uint64_t cortex_ring_finish(CortexRing *ring, uint8_t *data, uint6
     return next;
 }
 
-/* Write an entry for which there is room; where it ends. */
-static inline uint64_t cortex_ring_append(
-    CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at, uint32_t what, const void *frame, size_t size) {
-    uint8_t *place = cortex_ring_begin(ring, data, capacity, at, size);
-    if (size) memcpy(place, frame, size);
-    return cortex_ring_finish(ring, data, capacity, at, what, size);
-}
-
-static inline void cortex_writer_append(CortexWriter *writer, const void *frame, size_t size) {
-    writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_FRAME, frame, size);
+/* Say that the ring goes on elsewhere; where that entry ends. */
+static inline uint64_t cortex_ring_move(CortexRing *ring, uint8_t *data, uint64_t capacity, uint64_t at) {
+    cortex_ring_begin(ring, data, capacity, at, 0, 0);
+    return cortex_ring_finish(ring, data, capacity, at, CORTEX_MOVED, 0);
 }
 
 static inline uint64_t cortex_writer_readers(const CortexWriter *writer) {
@@ -304,6 +303,19 @@ static inline void cortex_writer_tidy(CortexWriter *writer) {
     }
 }
 
+/* How far `reserved` may be raised for an entry, so that readers seldom find its cache line changed: not over what reliable ones have
+   still to read. */
+static inline uint64_t cortex_writer_ahead(const CortexWriter *writer, size_t size) {
+    uint64_t ahead = writer->head + writer->capacity / CORTEX_STEPS;
+    if (writer->head + cortex_entry_bytes(size) <= __atomic_load_n(&writer->ring->reserved, __ATOMIC_RELAXED)) return 0; /* it is */
+    for (int index = 0; index < writer->count; ++index) {
+        const CortexMember *member = &writer->members[index];
+        const uint64_t end = member->tail + writer->capacity;
+        if (member->used && !member->left && member->strict && !member->late && end < ahead) ahead = end;
+    }
+    return ahead;
+}
+
 /* Where a frame for all readers is to be written, in `place`, before `cortex_writer_finish`: NULL if nobody gets it. If all are
    late it is not written: what waits for them stays. With `mind`, somebody who is late counts as having no room. */
 static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int mind, uint8_t **place) {
@@ -316,7 +328,7 @@ static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int min
     if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     for (int index = 0; index < writer->count; ++index)
         if (cortex_member_is_full(writer, &writer->members[index], bytes) && !cortex_writer_widen(writer)) return CORTEX_FULL;
-    *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size);
+    *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size, cortex_writer_ahead(writer, size));
     return late ? CORTEX_LATE : CORTEX_WRITTEN;
 }
 
@@ -337,186 +349,18 @@ static inline int cortex_writer_put(CortexWriter *writer, const void *frame, siz
 
 /* Send the last frame, for which there is room always; of at most 64 bytes. */
 static inline void cortex_writer_end(CortexWriter *writer, const void *frame, size_t size) {
-    cortex_writer_append(writer, frame, size);
-    cortex_writer_wake(writer);
+    memcpy(cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size, 0), frame, size);
+    cortex_writer_finish(writer, size);
 }
 
 /* Send all readers another way: they find the end of the ring after what is in it, and attach anew. It is to be closed. */
 static inline void cortex_writer_dissolve(CortexWriter *writer) {
-    writer->head = cortex_ring_append(writer->ring, writer->data, writer->capacity, writer->head, CORTEX_MOVED, NULL, 0);
+    writer->head = cortex_ring_move(writer->ring, writer->data, writer->capacity, writer->head);
     cortex_writer_wake(writer);
 }
 
 #include "broadcast_slots.h"
-
-/* A reader. Not for several threads at once. */
-
-/* Whether what was copied from the tail on has not been written over meanwhile. */
-static inline int cortex_reader_is_whole(const CortexReader *reader) {
-    __atomic_thread_fence(__ATOMIC_ACQUIRE);
-    return __atomic_load_n(&reader->ring->reserved, __ATOMIC_RELAXED) - reader->tail <= reader->capacity;
-}
-
-static inline void cortex_reader_move(CortexReader *reader, uint64_t tail) {
-    reader->tail = tail;
-    __atomic_store_n(&reader->page->tail, tail, __ATOMIC_RELEASE);
-}
-
-/* Go on with the oldest entry that will not be written over in a moment. */
-static inline void cortex_reader_skip(CortexReader *reader) {
-    const CortexRing *ring = reader->ring;
-    const uint64_t head = __atomic_load_n(&ring->head, __ATOMIC_ACQUIRE);
-    const uint64_t oldest = __atomic_load_n(&ring->reserved, __ATOMIC_RELAXED) - reader->capacity;
-    uint64_t best = __atomic_load_n(&ring->last, __ATOMIC_RELAXED);
-    for (int index = 0; index < CORTEX_MARKS; ++index) {
-        const uint64_t mark = __atomic_load_n(&ring->marks[index], __ATOMIC_RELAXED);
-        if (mark >= oldest + reader->capacity / 4 && mark < best) best = mark;
-    }
-    cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
-}
-
-/* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */
-static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
-    while (reader->state == CORTEX_SOUND) {
-        const uint64_t head = __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE), left = head - reader->tail;
-        uint32_t entry[2];
-        if (!left) return 0;
-        const uint8_t *place = reader->data + (reader->tail & (reader->capacity - 1));
-        if (left <= reader->capacity) memcpy(entry, place, sizeof entry);
-        if (left > reader->capacity || !cortex_reader_is_whole(reader)) {
-            cortex_reader_skip(reader);
-        } else if (entry[1] == CORTEX_MOVED) {
-            if (cortex_reader_follow(reader) < 0) reader->state = CORTEX_ENDED;
-        } else if (entry[1] != CORTEX_FRAME || !entry[0] || cortex_entry_bytes(entry[0]) > left) {
-            reader->state = CORTEX_BROKEN;
-        } else {
-            *frame = place + CORTEX_ENTRY_BYTES;
-            return entry[0];
-        }
-    }
-    return -1;
-}
-
-/* Lease the slot that a frame names. CORTEX_COPY: the reader has enough of them, but may copy the
-   message and then call `cortex_reader_has`; CORTEX_NO_SLOT: the frame is wrong. */
-static inline int cortex_reader_lease(CortexReader *reader, uint64_t slot, uint64_t sequence, uint64_t size, CortexLease *lease) {
-    CortexMap *map = reader->map;
-    if (slot >= map->slot_count || size > map->slot_bytes) return CORTEX_NO_SLOT;
-    lease->seat = reader->seat;
-    lease->map = map;
-    lease->slot = (uint32_t)slot;
-    const uint64_t *word = &map->ring->words[slot];
-    if (__atomic_load_n(&reader->page->leases[slot], __ATOMIC_RELAXED)) return CORTEX_NO_SLOT; /* it has a message of ours */
-    if (__atomic_load_n(&reader->seat->held, __ATOMIC_RELAXED) >= __atomic_load_n(&map->ring->quota, __ATOMIC_RELAXED))
-        return __atomic_load_n(word, __ATOMIC_ACQUIRE) == sequence + 1 ? CORTEX_COPY : CORTEX_OVERWRITTEN;
-    __atomic_store_n(&reader->page->leases[slot], 1, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_slot_take` */
-    if (__atomic_load_n(word, __ATOMIC_ACQUIRE) != sequence + 1) {
-        __atomic_store_n(&reader->page->leases[slot], 0, __ATOMIC_RELEASE);
-        return CORTEX_OVERWRITTEN;
-    }
-    __atomic_fetch_add(&lease->seat->held, 1, __ATOMIC_RELAXED);
-    __atomic_fetch_add(&lease->seat->users, 1, __ATOMIC_RELAXED);
-    __atomic_fetch_add(&map->users, 1, __ATOMIC_RELAXED);
-    return CORTEX_LEASED;
-}
-
-/* Whether a slot that was copied had this message all the time. */
-static inline int cortex_reader_has(const CortexReader *reader, uint64_t slot, uint64_t sequence) {
-    __atomic_thread_fence(__ATOMIC_ACQUIRE);
-    return __atomic_load_n(&reader->map->ring->words[slot], __ATOMIC_RELAXED) == sequence + 1;
-}
-
-static inline void cortex_seat_lock(CortexSeat *seat) {
-    while (__atomic_exchange_n(&seat->lock, 1, __ATOMIC_ACQUIRE)) cortex_yield();
-}
-static inline void cortex_seat_unlock(CortexSeat *seat) { __atomic_store_n(&seat->lock, 0, __ATOMIC_RELEASE); }
-
-/* Give a slot back. In a forked child nothing is: the lease is the parent's. */
-static inline void cortex_lease_end(const CortexLease *lease) {
-    CortexSeat *seat = lease->seat;
-    if (seat->process == cortex_process()) {
-        cortex_seat_lock(seat); /* the reader may be going on to another ring, whose slots have the same numbers */
-        if (seat->current == lease->map) __atomic_store_n(&seat->page->leases[lease->slot], 0, __ATOMIC_RELEASE);
-        cortex_seat_unlock(seat);
-    }
-    __atomic_fetch_sub(&seat->held, 1, __ATOMIC_RELAXED);
-    cortex_map_end(lease->map);
-    cortex_seat_end(seat);
-}
-
-/* Let go of a body; any thread may. */
-static inline void cortex_body_end(CortexBody *body) {
-    if (body->is_leased) {
-        cortex_lease_end(&body->lease);
-    } else if (body->data != NULL) {
-        __atomic_fetch_sub(&body->lease.seat->private_bytes, body->size, __ATOMIC_RELAXED);
-        cortex_seat_end(body->lease.seat);
-        free(body->data);
-    }
-    memset(body, 0, sizeof *body);
-}
-
-/* Copy what may not be leased: CORTEX_COPY, CORTEX_OVERWRITTEN, or CORTEX_CROWDED if too much is kept already. */
-static inline int cortex_body_copy(const CortexReader *reader, CortexBody *body, uint64_t sequence) {
-    CortexSeat *seat = reader->seat;
-    const uint64_t many = CORTEX_PRIVATE_BYTES, most = body->size < many / 4 ? many : 4 * body->size;
-    if (__atomic_load_n(&seat->private_bytes, __ATOMIC_RELAXED) + body->size > most) return CORTEX_CROWDED;
-    body->data = (uint8_t *)malloc((size_t)cortex_most(body->size, 1));
-    if (body->data == NULL) return CORTEX_CROWDED;
-    body->lease.seat = seat;
-    __atomic_fetch_add(&seat->users, 1, __ATOMIC_RELAXED);
-    __atomic_fetch_add(&seat->private_bytes, body->size, __ATOMIC_RELAXED);
-    cortex_copy(body->data, cortex_slot_memory(reader->map, (int)body->lease.slot), (size_t)body->size);
-    return cortex_reader_has(reader, body->lease.slot, sequence) ? CORTEX_COPY : CORTEX_OVERWRITTEN;
-}
-
-/* Done with a frame that was copied from where `cortex_reader_peek` found it: 1. If it names a slot, `body` gets what is there; its
-   data is NULL if there is nothing, as the frame is wrong. 0: frame or body were written over meanwhile. -1: the message has to
-   wait until the user lets others go, or to be passed over. */
-static inline int cortex_reader_finish(CortexReader *reader, const uint8_t *frame, int64_t size, CortexBody *body) {
-    int found = CORTEX_NO_SLOT;
-    memset(body, 0, sizeof *body);
-    if (!cortex_reader_is_whole(reader)) return 0;
-    if (size == CORTEX_FRAME_BYTES && frame[3] == 'S') {
-        uint64_t rest[5]; /* sequence, two times, size, slot */
-        memcpy(rest, frame + CORTEX_FRAME_BYTES - sizeof rest, sizeof rest);
-        found = cortex_reader_lease(reader, rest[4], rest[0], rest[3], &body->lease);
-        body->size = rest[3];
-        body->is_leased = found == CORTEX_LEASED;
-        if (body->is_leased) body->data = cortex_slot_memory(body->lease.map, (int)body->lease.slot);
-        if (found == CORTEX_COPY) found = cortex_body_copy(reader, body, rest[0]);
-        if (found == CORTEX_CROWDED) return -1;
-        if (found == CORTEX_OVERWRITTEN) cortex_body_end(body);
-    }
-    cortex_reader_move(reader, reader->tail + cortex_entry_bytes((uint64_t)size));
-    return found != CORTEX_OVERWRITTEN;
-}
-
-/* Leave out the message that has to wait. */
-static inline void cortex_reader_pass_over(CortexReader *reader) {
-    cortex_reader_move(reader, reader->tail + cortex_entry_bytes(CORTEX_FRAME_BYTES));
-}
-
-/* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring
-   later than we look: whoever finds nothing twice silences what was left of that. */
-static inline int cortex_reader_arm(CortexReader *reader) {
-    if (reader->armed) cortex_hush_bell(reader->bell);
-    reader->armed = 1;
-    if (!__atomic_load_n(&reader->page->sleeping, __ATOMIC_RELAXED)) {
-        __atomic_store_n(&reader->page->sleeping, 1, __ATOMIC_RELAXED);
-        __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_writer_wake` */
-    }
-    return __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE) == reader->tail;
-}
-
-/* Have it rung no more; if it was rung, it is silent again. */
-static inline void cortex_reader_disarm(CortexReader *reader) {
-    if (!reader->armed) return;
-    reader->armed = 0;
-    if (!__atomic_exchange_n(&reader->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_hush_bell(reader->bell);
-}
-
+#include "broadcast_reader.h"
 #include "broadcast_os.h"
 
 #endif

@@ -338,7 +338,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, ui
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
         member->late = 1;
     }
-    cortex_ring_append(ring, before->data, old_capacity, head, CORTEX_MOVED, NULL, 0); /* the spare bytes have room for it */
+    cortex_ring_move(ring, before->data, old_capacity, head); /* the spare bytes have room for it */
     cortex_writer_wake(writer);
     cortex_map_end(before);
     close(fd);
@@ -379,6 +379,7 @@ static inline int cortex_reader_map(CortexReader *reader) {
     reader->ring = map->ring;
     reader->data = map->data;
     reader->capacity = capacity;
+    reader->seen = said[3];
     cortex_reader_move(reader, said[3]);
     return 1;
 }

@@ -96,24 +96,6 @@ inline std::array<std::uint8_t, 8> blake2b_8(const std::string& data) {
 
 namespace runtime {
 
-// A file descriptor that is closed with its owner.
-class Descriptor {
- public:
-  explicit Descriptor(int fd = -1) noexcept : fd_(fd) {}
-  Descriptor(Descriptor&& other) noexcept : fd_(std::exchange(other.fd_, -1)) {}
-  Descriptor& operator=(Descriptor&& other) noexcept {
-    std::swap(fd_, other.fd_);
-    return *this;
-  }
-  ~Descriptor() {
-    if (fd_ >= 0) ::close(fd_);
-  }
-  int get() const noexcept { return fd_; }
-
- private:
-  int fd_;
-};
-
 inline std::string hexadecimal(std::uint64_t number) {
   static constexpr char digits[] = "0123456789abcdef";
   std::string text;
@@ -195,13 +177,9 @@ inline std::string host_id() {
                                 : base;
   const auto digest = blake2b_8(boot + "\n" + std::string(link, length > 0 ? static_cast<std::size_t>(length) : 0) +
                                 "\n" + std::to_string(::getuid()) + "\n" + place);
-  static constexpr char digits[] = "0123456789abcdef";
-  std::string text;
-  for (const auto byte : digest) {
-    text += digits[byte >> 4];
-    text += digits[byte & 15];
-  }
-  return text;
+  std::uint64_t number = 0;
+  for (const auto byte : digest) number = number << 8 | byte;
+  return hexadecimal(number);
 }
 
 // The files of one node: a lock that says it lives, and the paths of its sockets. Any process may remove the files

@@ -51,9 +51,19 @@ constexpr std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) n
   return (value + alignment - 1) / alignment * alignment;
 }
 
+// As it lies in a frame.
 struct Header {
+  Header() = default;
+  Header(char kind, std::uint8_t flags, std::uint64_t source, std::uint64_t fingerprint, std::uint64_t sequence,
+         std::int64_t stamp_ns, std::int64_t publish_ns, std::uint64_t body_size, std::uint64_t aux) noexcept
+      : kind(kind), flags(flags), source(source), fingerprint(fingerprint), sequence(sequence), stamp_ns(stamp_ns),
+        publish_ns(publish_ns), body_size(body_size), aux(aux) {}
+
+  char magic[3] = {'C', 'T', 'X'};
   char kind = 'M';
+  std::uint8_t version = wire::version;
   std::uint8_t flags = 0;
+  std::uint16_t size = header_size;
   std::uint64_t source = 0;
   std::uint64_t fingerprint = 0;
   std::uint64_t sequence = 0;
@@ -62,47 +72,25 @@ struct Header {
   std::uint64_t body_size = 0;
   std::uint64_t aux = 0;
 };
+static_assert(sizeof(Header) == header_size && offsetof(Header, source) == 8, "a header has 64 bytes");
+
+inline void write_header(std::uint8_t* out, const Header& header) noexcept { std::memcpy(out, &header, header_size); }
 
 inline void write_prefix(std::uint8_t* out, char kind, std::uint8_t flags, std::uint64_t source) noexcept {
-  out[0] = 'C';
-  out[1] = 'T';
-  out[2] = 'X';
-  out[3] = static_cast<std::uint8_t>(kind);
-  out[4] = version;
-  out[5] = flags;
-  store<std::uint16_t>(out + 6, header_size);
-  store(out + 8, source);
-}
-
-inline void write_header(std::uint8_t* out, const Header& header) noexcept {
-  write_prefix(out, header.kind, header.flags, header.source);
-  store(out + 16, header.fingerprint);
-  store(out + 24, header.sequence);
-  store(out + 32, header.stamp_ns);
-  store(out + 40, header.publish_ns);
-  store(out + 48, header.body_size);
-  store(out + 56, header.aux);
+  const Header header(kind, flags, source, 0, 0, 0, 0, 0, 0);
+  std::memcpy(out, &header, prefix_size);
 }
 
 inline Header read_header(Span<const std::uint8_t> frame) {
   if (frame.size() < header_size) {
     throw MalformedMessage("a frame of " + std::to_string(frame.size()) + " bytes is shorter than a header of 64");
   }
-  const std::uint8_t* at = frame.data();
-  if (at[0] != 'C' || at[1] != 'T' || at[2] != 'X' || at[4] != version || (at[5] & ~flag_stamp) != 0 ||
-      load<std::uint16_t>(at + 6) != header_size) {
+  Header header;
+  std::memcpy(&header, frame.data(), header_size);
+  if (std::memcmp(header.magic, "CTX", 3) != 0 || header.version != version || (header.flags & ~flag_stamp) != 0 ||
+      header.size != header_size) {
     throw MalformedMessage("not a frame of Cortex 1: wrong magic, version, flags or header length");
   }
-  Header header;
-  header.kind = static_cast<char>(at[3]);
-  header.flags = at[5];
-  header.source = load<std::uint64_t>(at + 8);
-  header.fingerprint = load<std::uint64_t>(at + 16);
-  header.sequence = load<std::uint64_t>(at + 24);
-  header.stamp_ns = load<std::int64_t>(at + 32);
-  header.publish_ns = load<std::int64_t>(at + 40);
-  header.body_size = load<std::uint64_t>(at + 48);
-  header.aux = load<std::uint64_t>(at + 56);
   return header;
 }
 
