@@ -85,10 +85,10 @@ struct Source {
 
 class SubscriptionCore {
  public:
-  SubscriptionCore(records::SubscriberRecord known, std::string schema, bool stamped, Policy policy,
+  SubscriptionCore(records::SubscriberRecord known, std::string schema, bool stamped, const Policy& wanted,
                    std::shared_ptr<net::Complaints> complaints)
       : record(std::move(known)),
-        policy(policy),
+        policy(wanted),
         schema_(std::move(schema)),
         type_{record.fingerprint, stamped},
         complaints_(std::move(complaints)) {}
