@@ -375,7 +375,7 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
             light = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            packets = int(RAY_COUNT)  # of four rays of each of 2 x 2 pixels; a variable: the loop is not unrolled
+            packets = int(RAY_COUNT)  # of 2 x 2 pixels; a variable: the loop is not unrolled
             for packet in range(packets):
                 quarter = packet % 4
                 corner = quarter // 2 * 2 * _SIDE + quarter % 2 * 2

@@ -1,15 +1,15 @@
-// CPU: `aim_rays` writes rays of 16 lanes in W, x, y, z and spread, to `out` [4][16]. The ray of a lane is that of pixel
-// `pixel_of`(lane), -1: none, all 0, in layer `layer_of`(lane); `turn`(lane, x, y, z) takes it to W.
-auto aim_rays = [&](auto layer_of, auto pixel_of, auto& out) {
+// CPU: `aim_rays` writes rays of 16 lanes in W, x, y, z and spread, to `out` [4][16]. `ray_of`(lane) points to the ray of a
+// lane, null: none, all 0, and `turn`(lane, x, y, z) takes it to W.
+auto aim_rays = [&](auto ray_of, auto& out) {
     using Quad = float __attribute__((ext_vector_type(4)));
     using Quads = float __attribute__((ext_vector_type(16)));
     Quads quads[4], halves[4]; // of four lanes side by side; then of x and y, z and spread: transposed in registers
     for (int group = 0; group < 4; ++group) {
         Quad own[4];
         for (int lane = 0; lane < 4; ++lane) {
-            const int pixel = pixel_of(4 * group + lane);
+            const wp::vec4* const from = ray_of(4 * group + lane);
             own[lane] = 0.0f;
-            if (pixel >= 0) __builtin_memcpy(&own[lane], wp::address(rays, layer_of(4 * group + lane), pixel), sizeof(Quad));
+            if (from) __builtin_memcpy(&own[lane], from, sizeof(Quad));
         }
         quads[group] = __builtin_shufflevector(__builtin_shufflevector(own[0], own[1], 0, 1, 2, 3, 4, 5, 6, 7),
                                                __builtin_shufflevector(own[2], own[3], 0, 1, 2, 3, 4, 5, 6, 7),

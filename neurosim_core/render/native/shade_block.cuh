@@ -26,9 +26,13 @@ for (int lane = 0; lane < POSES; ++lane)
     for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[axis][lane] - origin[axis];
 #include "aim_rays.cuh"
 alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
-auto pixel_of = [&](int lane) { return first_pixel + (lane % 4 < columns && lane / 4 < rows ? lane / 4 * width + lane % 4 : 0); };
+const bool all = columns == 4 && rows == 4;
 auto turn_rays = [&](int term) {
-    aim_rays([&](int) { return term; }, pixel_of, ray[term]);
+    const wp::vec4* const aimed = wp::address(rays, term, first_pixel);
+    auto ray_of = [&](int lane) {
+        return all || (lane % 4 < columns && lane / 4 < rows) ? aimed + lane / 4 * width + lane % 4 : aimed;
+    };
+    aim_rays(ray_of, ray[term]);
 };
 turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
