@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +74,13 @@ class Dagger:
         self.policy = make_event_policy(
             self._now["events"], vector, hint, hidden=config.hidden, widths=config.widths
         )
+        self._actor = self.policy
+        self._learner: ThreadPoolExecutor | None = None
+        if env.device.type == "cpu":  # it learns on one core while worlds are rendered on the others
+            if config.replay < 2:
+                raise ValueError("replay must be 2 at least on a CPU: one iteration is flown meanwhile")
+            self._actor = copy.deepcopy(self.policy)
+            self._learner = ThreadPoolExecutor(1, thread_name_prefix="learner")
         self.descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
@@ -88,7 +97,7 @@ class Dagger:
         self._flown = 0
 
     def iterate(self, done: float) -> dict[str, float]:
-        """Fly some steps and learn from them.
+        """Fly some steps and learn from them; on a CPU learn meanwhile from what was flown before.
 
         Args:
             done: Share of the training that lies behind.
@@ -100,9 +109,15 @@ class Dagger:
         rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0)))
         lead = 1.0 - (1.0 - config.lead_last) * min(done / max(config.lead, 1e-9), 1.0)
         lead = max(lead, 1e-9)
+        if self._learner is None:
+            with torch.no_grad():
+                log = self._fly(lead=lead)
+            return log | self._learn(rate, self._draw_stretches(config.replay))
+        self._actor.load_state_dict(self.policy.state_dict())
+        learning = self._learner.submit(self._learn, rate, self._draw_stretches(config.replay - 1))
         with torch.no_grad():
             log = self._fly(lead=lead)
-        return log | self._learn(rate)
+        return log | learning.result()
 
     def _make_mirrors(self) -> None:
         """Let half of the worlds be seen in a mirror, if the task says how."""
@@ -177,19 +192,24 @@ class Dagger:
         seen["hint"].mul_(self._hint_sign)
         seen["label"].copy_(self.teacher(self._told).clamp(-1.0, 1.0) * self._action_sign)
         memory = self._memory * (1.0 - seen["begun"])[:, None]
-        action, memory = self.policy(seen["surface"], seen["vector"], memory)
+        action, memory = self._actor(seen["surface"], seen["vector"], memory)
         self._action.copy_(action)
         self._memory.copy_(memory)
 
-    def _learn(self, rate: float) -> dict[str, float]:
-        """Learn from stretches of flight that are drawn from those kept."""
+    def _draw_stretches(self, iterations: int) -> torch.Tensor:
+        """Return numbers of stretches from so many of the last iterations, [updates, batch]; [0] at first."""
+        config, worlds, device = self.config, self.env.num_envs, self.env.device
+        if self._flown == 0:
+            return torch.zeros(0, device=device)
+        count, shape = min(self._flown, iterations) * worlds, (config.updates, config.batch)
+        back = torch.randint(count, shape, generator=self._generator, device=device)
+        return (self._flown * worlds - 1 - back) % (config.replay * worlds)
+
+    def _learn(self, rate: float, stretches: torch.Tensor) -> dict[str, float]:
+        """Learn from stretches of flight."""
         config = self.config
-        stretches = min(self._flown, config.replay) * self.env.num_envs
         self._losses.zero_()
-        for _ in range(config.updates):
-            rows = torch.randint(
-                stretches, (config.batch,), generator=self._generator, device=self.env.device
-            )
+        for rows in stretches:
             self._rows.copy_(rows)
             self.descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()

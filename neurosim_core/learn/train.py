@@ -29,6 +29,8 @@ from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, te
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
+from neurosim_core.learn.surfaces import LeakySurface, TimeSurface
+from neurosim_core.learn.task import Task
 from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
@@ -51,6 +53,8 @@ class TrainConfig:
     """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
     pixels: int | None = None
     """Width and height of the event camera [px]; None: as the task says."""
+    rate_hz: float | None = None
+    """Steps a second; time constants of surfaces are stretched with the step. None: as the task says."""
     randomise: str = "training"
     """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
     learn, or nothing (`none`)."""
@@ -63,6 +67,16 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
             raise ValueError(f"unknown randomise {self.randomise!r}, known: {', '.join(_RANDOMISE)}")
+
+    def make_task(self) -> Task:
+        """Return the task, with the steps of this training."""
+        task = find_task(self.task)
+        if self.rate_hz is not None:
+            stretch, task.rate_hz = task.rate_hz / self.rate_hz, self.rate_hz
+            if isinstance(task.surface, LeakySurface | TimeSurface):
+                slower = tuple(stretch * tau_s for tau_s in task.surface.tau_s)
+                task.surface = dataclasses.replace(task.surface, tau_s=slower)
+        return task
 
 
 class Training:
@@ -94,12 +108,12 @@ class Training:
         self.trained_s: dict[str, float] = {}
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
-        drawn = find_task(config.task).training
+        drawn = config.make_task().training
         randomise: bool | Randomisation = config.randomise != "none"
         if config.randomise == "training" and drawn is not None:
             randomise = drawn
         self.env = make_env(
-            config.task,
+            config.make_task(),
             worlds=config.student.worlds,
             device=config.device,
             models=models,
@@ -113,7 +127,7 @@ class Training:
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
             teacher_env = make_env(
-                config.task,
+                config.make_task(),
                 worlds=config.teacher.worlds,
                 device=config.device,
                 observe=states,
@@ -337,7 +351,7 @@ def evaluate_run(
     """
     config = read_config(folder)
     worlds = worlds or config.evaluation_worlds
-    task = find_task(config.task)
+    task = config.make_task()
     if speed_m_s is not None:
         task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
     env = make_env(

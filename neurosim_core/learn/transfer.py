@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.env import Env, find_task, make_env
+from neurosim_core.learn.env import Env, make_env
 from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate, student_actor
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import Observations, Task, View
@@ -61,7 +61,7 @@ def evaluate_transfer(
     where: dict[str, Any] = {"scenes": scenes}
     for name, changes in CONDITIONS.items():
         count = worlds or config.evaluation_worlds
-        task = _changed_task(config.task, changes)
+        task = _changed(config.make_task(), changes)
         if "lost" in changes and not isinstance(task.surface, LeakySurface):
             continue  # what other surfaces show without a packet is not known
         env = make_env(
@@ -116,9 +116,8 @@ def _lose_events(env: Env, share: float) -> None:
     task.advance = lose  # type: ignore[method-assign]
 
 
-def _changed_task(name: str, changes: Mapping[str, Any]) -> Task:
+def _changed(task: Task, changes: Mapping[str, Any]) -> Task:
     """Return a task with the changes of a condition."""
-    task = find_task(name)
     task.pixel = changes.get("pixel", {})
     task.rate_hz *= changes.get("rate_factor", 1.0)
     task.randomisation = dataclasses.replace(task.randomisation, **changes.get("drawn", {}))

@@ -114,14 +114,13 @@ def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> Ref
     vertices, normals, uv = scene.vertices, scene.normals, scene.uv
     faces, origin = scene.faces, np.arange(len(scene.faces), dtype=np.int32)
     short: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
-    count = len(faces)
     while edge_max_m is not None and len(faces):
         tips = vertices[faces]
         sides = tips[:, (1, 2, 0)] - tips  # side k goes from corner k to corner k + 1
         long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
         split = long.any(axis=1)
-        count += int(long.sum())
-        if count > len(scene.faces) + added_count_max:
+        added_count_max -= int(long.sum())
+        if added_count_max < 0:
             return None
         short.append((faces[~split], origin[~split]))
         chosen, chosen_long = faces[split], long[split]

@@ -27,7 +27,7 @@ CONFIG = TrainConfig(
     device="cpu",
     seed=3,
     teacher=PpoConfig(worlds=4, iterations=1, horizon=4, minibatches=1),
-    student=DaggerConfig(worlds=4, iterations=1, horizon=4, updates=1, batch=4, widths=(4, 4, 4)),
+    student=DaggerConfig(worlds=4, iterations=2, horizon=4, updates=1, batch=4, widths=(4, 4, 4)),
     pixels=8,
     evaluation_worlds=2,
 )

@@ -35,6 +35,7 @@ from neurosim_core.learn.train import (  # noqa: E402
     evaluate_run,
     load_student,
     make_card,
+    read_config,
     train,
 )
 
@@ -250,7 +251,7 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert set(found) == {"events", "blind"}
     assert found["events"].episodes == 3
     slow = next(evaluate_run(tmp_path, scenes=str(file), worlds=3, speed_m_s=0.1))[1]
-    assert slow.metrics["speed_m_s"] < 0.5 * found["events"].metrics["speed_m_s"]
+    assert slow.metrics["speed_m_s"] < 0.7 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
 
@@ -286,6 +287,18 @@ def test_weights_and_biases_must_be_there_before_anything_is_set_up(tmp_path, mo
     with pytest.raises(ImportError, match="--wandb needs the package wandb: pip install wandb"):
         train(tmp_path / "run", small(wandb=True))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_training_may_have_longer_steps(tmp_path, hall):
+    """Its surfaces remember as many steps, and whoever flies the policy is told."""
+    config = small(rate_hz=25.0)
+    env = Training(tmp_path, config, models=[hall]).env
+    assert env.episode_steps == round(25.0 * env.task.episode_s)
+    assert env.task.surface.tau_s == pytest.approx([2.0 * tau_s for tau_s in Hover.surface.tau_s])
+    card = make_card(env, config.task)
+    assert (card["rate_hz"], card["surface"]["tau_s"]) == (25.0, env.task.surface.tau_s)
+    assert read_config(tmp_path).make_task().rate_hz == 25.0
+    assert small().make_task().rate_hz == Hover.rate_hz
 
 
 def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):

@@ -29,7 +29,7 @@ static inline void cortex_reader_skip(CortexReader *reader) {
 }
 
 static inline int cortex_reader_has_more(const CortexReader *reader) {
-    return __atomic_load_n(&reader->ring->head, __ATOMIC_RELAXED) != reader->tail;
+    return reader->seen != reader->tail || __atomic_load_n(&reader->ring->head, __ATOMIC_RELAXED) != reader->tail;
 }
 
 /* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */

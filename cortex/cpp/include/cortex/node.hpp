@@ -76,12 +76,10 @@ class Node {
     check_open(topic);
     const auto max_wait_ms = static_cast<std::uint32_t>(std::clamp<std::int64_t>(options.max_wait.count(), 0, 86'400'000));
     auto core = detail::PublisherCore::enlist(std::make_shared<detail::PublisherCore>(
-        pub_sockets_, topic, Codec<T>::fingerprint, Codec<T>::stamped, options.latch, options.inline_max, max_wait_ms,
-        Codec<T>::fixed, complaints_));
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      publishers_.push_back({core, std::string(Codec<T>::name), std::string(Codec<T>::schema)});
-    }
+        pub_sockets_,
+        records::PublisherRecord{topic, random_number(), std::string(Codec<T>::name), Codec<T>::fingerprint,
+                                 std::string(Codec<T>::schema), options.latch},
+        Codec<T>::stamped, options.inline_max, max_wait_ms, Codec<T>::fixed, complaints_));
     change();
     return Publisher<T>(std::move(core));
   }
@@ -90,8 +88,8 @@ class Node {
   Subscription<T> subscribe(const std::string& topic, const Policy& policy = keep_last()) {
     check_open(topic);
     auto core = std::make_shared<detail::SubscriptionCore>(
-        topic, std::string(Codec<T>::name), std::string(Codec<T>::schema),
-        detail::TypeId{Codec<T>::fingerprint, Codec<T>::stamped}, policy, complaints_);
+        records::SubscriberRecord{topic, std::string(Codec<T>::name), Codec<T>::fingerprint, policy.text()},
+        std::string(Codec<T>::schema), Codec<T>::stamped, policy, complaints_);
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       subscriptions_.push_back(core);
@@ -135,12 +133,6 @@ class Node {
   }
 
  private:
-  struct Published {
-    std::weak_ptr<detail::PublisherCore> core;
-    std::string type_name;
-    std::string schema;
-  };
-
   static constexpr std::int64_t tick_ns = 20'000'000;
   static constexpr std::int64_t short_tick_ns = 2'000'000;  // for a while after a change, so that peers meet soon
   static constexpr std::int64_t busy_ns = 300'000'000;
@@ -215,27 +207,24 @@ class Node {
 
   std::vector<std::shared_ptr<detail::PublisherCore>> publishers() {
     std::vector<std::shared_ptr<detail::PublisherCore>> result;
-    const std::lock_guard<std::mutex> lock(mutex_);
-    for (const auto& published : publishers_) {
-      if (auto core = published.core.lock()) result.push_back(std::move(core));
+    const detail::Lock lock(pub_sockets_->mutex);
+    for (const auto& entry : pub_sockets_->publishers) {
+      if (!entry.second->is_ending()) result.push_back(entry.second);
     }
     return result;
   }
 
-  // Forgets those that have ended; true if there were any.
+  // Forgets subscriptions that have ended; true if there were any.
   bool prune() {
     const std::lock_guard<std::mutex> lock(mutex_);
-    const std::size_t before = publishers_.size() + subscriptions_.size();
-    publishers_.erase(std::remove_if(publishers_.begin(), publishers_.end(),
-                                     [](const Published& published) { return published.core.expired(); }),
-                      publishers_.end());
+    const std::size_t before = subscriptions_.size();
     subscriptions_.erase(std::remove_if(subscriptions_.begin(), subscriptions_.end(),
                                         [](const auto& weak) {
                                           const auto core = weak.lock();
                                           return core == nullptr || core->closed();
                                         }),
                          subscriptions_.end());
-    return publishers_.size() + subscriptions_.size() != before;
+    return subscriptions_.size() != before;
   }
 
   records::NodeRecord record() {
@@ -246,18 +235,8 @@ class Node {
     record.pid = static_cast<std::uint32_t>(::getpid());
     record.clock_offset_ns = clock_offset_ns_;
     record.endpoints = endpoints_;
-    const std::lock_guard<std::mutex> lock(mutex_);
-    for (const auto& published : publishers_) {
-      if (const auto core = published.core.lock()) {
-        record.publishers.push_back({core->topic(), core->source, published.type_name, core->fingerprint(),
-                                     published.schema, core->latch()});
-      }
-    }
-    for (const auto& weak : subscriptions_) {
-      if (const auto core = weak.lock()) {
-        record.subscribers.push_back({core->topic(), core->type_name(), core->fingerprint(), core->policy().text()});
-      }
-    }
+    for (const auto& core : publishers()) record.publishers.push_back(core->record);
+    for (const auto& core : subscriptions()) record.subscribers.push_back(core->record);
     return record;
   }
 
@@ -305,11 +284,9 @@ class Node {
 
   // Whether the next turn should come soon.
   bool turn() {
-    bool changed = changed_.exchange(false);
-    if (prune() || changed) {
-      changed = true;
-      directory_->announce();
-    }
+    const bool pruned = prune(), closed = pub_sockets_->changed.exchange(false);
+    bool changed = changed_.exchange(false) || pruned || closed;
+    if (changed) directory_->announce();
     if (authenticator_ != nullptr) authenticator_->serve();
     serve();
     directory_->tick();
@@ -339,12 +316,12 @@ class Node {
       std::vector<detail::Source> sources;
       for (const auto* node : nodes) {
         for (const auto& publisher : node->publishers) {
-          if (publisher.topic != subscription->topic()) continue;
+          if (publisher.topic != subscription->record.topic) continue;
           const bool same_host = node->host == host_;
           const records::Endpoint* endpoint = reach(*node, same_host);
           if (endpoint == nullptr) continue;
           sources.push_back({publisher.source, publisher.fingerprint, publisher.schema,
-                             subscription->policy().is_reliable ? endpoint->strict : endpoint->lossy,
+                             subscription->policy.is_reliable ? endpoint->strict : endpoint->lossy,
                              endpoint->transport == "ipc", same_host ? 0 : node->clock_offset_ns - clock_offset_ns_,
                              endpoint->server_key});
         }
@@ -405,12 +382,12 @@ class Node {
     reply.rejected = rejected_ + directory_->rejected();
     for (const auto& core : publishers()) {
       const auto counters = core->counters();
-      reply.publishers.push_back({core->topic(), core->source, static_cast<std::uint32_t>(core->reader_count()),
+      reply.publishers.push_back({core->record.topic, core->record.source, static_cast<std::uint32_t>(core->reader_count()),
                                   counters.published, counters.bytes, counters.timeouts, counters.skipped});
     }
     for (const auto& core : subscriptions()) {
       const auto counters = core->counters();
-      reply.subscribers.push_back({core->topic(), core->policy().text(), counters.received, counters.lost,
+      reply.subscribers.push_back({core->record.topic, core->record.policy, counters.received, counters.lost,
                                    counters.rejected, counters.overtaken, counters.latency});
     }
     return reply;
@@ -433,7 +410,6 @@ class Node {
   std::vector<records::Endpoint> endpoints_;
   std::unique_ptr<detail::Directory> directory_;
   std::mutex mutex_;
-  std::vector<Published> publishers_;
   std::vector<std::weak_ptr<detail::SubscriptionCore>> subscriptions_;
   net::Waker waker_;
   std::atomic<bool> changed_{true};

@@ -69,6 +69,7 @@ class PubSockets {
   PubSocket strict;
   std::map<std::uint64_t, std::shared_ptr<PublisherCore>> publishers;  // also those that wait for somebody at their end
   std::map<std::string, PubSocket*> attached;
+  std::atomic<bool> changed{false};  // a publisher has closed
   bool closed = false;
 
  private:

@@ -127,7 +127,7 @@ class Publisher {
 
   std::size_t subscriber_count() { return core_->reader_count(); }
   PublisherCounters counters() const { return core_->counters(); }
-  const std::string& topic() const noexcept { return core_->topic(); }
+  const std::string& topic() const noexcept { return core_->record.topic; }
 
  private:
   friend class Node;

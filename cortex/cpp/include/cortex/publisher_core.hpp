@@ -18,6 +18,7 @@
 #include "cortex/pub_socket.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/readers.hpp"
+#include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/slot.hpp"
 #include "cortex/socket.hpp"
@@ -28,15 +29,11 @@ namespace cortex::detail {
 // What does not depend on the type of the messages. Bodies are written without the lock, by one thread at a time.
 class PublisherCore {
  public:
-  PublisherCore(std::shared_ptr<PubSockets> pub_sockets, std::string topic, std::uint64_t fingerprint, bool stamped,
-                bool latch, std::size_t inline_max, std::uint32_t max_wait_ms, bool exact,
-                std::shared_ptr<net::Complaints> complaints)
-      : source(random_number()),
+  PublisherCore(std::shared_ptr<PubSockets> pub_sockets, records::PublisherRecord known, bool stamped, std::size_t inline_max,
+                std::uint32_t max_wait_ms, bool exact, std::shared_ptr<net::Complaints> complaints)
+      : record(std::move(known)),
         pub_sockets_(std::move(pub_sockets)),
-        topic_(std::move(topic)),
-        fingerprint_(fingerprint),
         flags_(stamped ? wire::flag_stamp : 0),
-        latch_(latch),
         inline_max_(inline_max),
         max_wait_ms_(max_wait_ms),
         exact_(exact),
@@ -45,17 +42,14 @@ class PublisherCore {
   // What users share: the publisher closes with the last of them, but lasts until readers of sockets have confirmed it.
   static std::shared_ptr<PublisherCore> enlist(std::shared_ptr<PublisherCore> core) {
     const Lock lock(core->pub_sockets_->mutex);
-    core->pub_sockets_->publishers[core->source] = core;
+    core->pub_sockets_->publishers[core->record.source] = core;
     return {core.get(), [core](PublisherCore*) { core->close(); }};
   }
   PublisherCore(const PublisherCore&) = delete;
   PublisherCore& operator=(const PublisherCore&) = delete;
 
-  const std::uint64_t source;
+  const records::PublisherRecord record;  // what others know of it
 
-  const std::string& topic() const noexcept { return topic_; }
-  std::uint64_t fingerprint() const noexcept { return fingerprint_; }
-  bool latch() const noexcept { return latch_; }
   std::size_t inline_max() const noexcept { return inline_max_; }
 
   // One thread at a time encodes large messages: order, and one slot in hand, not many.
@@ -65,7 +59,7 @@ class PublisherCore {
   bool wanted() {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, false);
-    if (!readers_.empty() || latch_) return true;
+    if (!readers_.empty() || record.latch) return true;
     ++sequence_;
     ++counters_.published;
     return false;
@@ -79,7 +73,7 @@ class PublisherCore {
     write_header(static_cast<std::uint8_t*>(frame.data()), 'M', sequence_++, stamp_ns, size, 0);
     ++counters_.published;
     counters_.bytes += size;
-    if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
+    if (record.latch) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
     if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
     bool on_time = !is_late_ && !readers_.is_moving(true);
     if (has_sockets(pub_sockets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
@@ -125,7 +119,7 @@ class PublisherCore {
     std::string head(wire::header_size, '\0');
     auto* header = reinterpret_cast<std::uint8_t*>(head.data());
     write_header(header, 'L', sequence, stamp_ns, size, 0);
-    if (latch_) {
+    if (record.latch) {
       latched_ = head;
       latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
     }
@@ -212,6 +206,7 @@ class PublisherCore {
     const Lock lock(pub_sockets_->mutex);
     if (closed_) return;
     closed_ = true;
+    pub_sockets_->changed = true;
     latched_.clear();
     try {
       readers_.end(net::bytes(last_frame()));  // what is in the ring stays the readers'
@@ -228,7 +223,7 @@ class PublisherCore {
 
   void write_header(std::uint8_t* out, char kind, std::uint64_t sequence, std::int64_t stamp_ns, std::uint64_t size,
                     std::uint64_t aux) const noexcept {
-    wire::write_header(out, {kind, flags_, source, fingerprint_, sequence, stamp_ns, monotonic_ns(), size, aux});
+    wire::write_header(out, {kind, flags_, record.source, record.fingerprint, sequence, stamp_ns, monotonic_ns(), size, aux});
   }
 
   // Waits for our turn if another thread is held up by a reader, and sees who has come and gone.
@@ -238,7 +233,7 @@ class PublisherCore {
       std::this_thread::sleep_for(std::chrono::microseconds(100));
       lock.lock();
     }
-    if (closed_ || pub_sockets_->closed) throw std::logic_error("the publisher of " + topic_ + " is closed");
+    if (closed_ || pub_sockets_->closed) throw std::logic_error("the publisher of " + record.topic + " is closed");
     const std::int64_t time_ns = monotonic_ns();
     if (!now && time_ns < refresh_at_ns_) return;
     refresh_at_ns_ = time_ns + refresh_ns;
@@ -255,7 +250,7 @@ class PublisherCore {
   // Lets go of readers that know all there was, or need not say so; the last ends it.
   void settle() noexcept {
     readers_.settle(sequence_);
-    if (readers_.empty()) pub_sockets_->publishers.erase(source);
+    if (readers_.empty()) pub_sockets_->publishers.erase(record.source);
   }
 
   void answer(const Reader& reader, const std::string& latched) {
@@ -290,7 +285,7 @@ class PublisherCore {
   }
 
   void say_late() {
-    complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
+    complaints_->once("slow " + record.topic, record.topic + ": a reliable subscriber did not keep up and lost a message");
   }
 
   // Sends over the strict socket, waiting for the slowest reader.
@@ -378,7 +373,7 @@ class PublisherCore {
   bool provide(Lock& lock, std::size_t size) {
     if (!readers_.has_members()) return false;
     if (readers_.provide(size, exact_)) return true;
-    complaints_->once("memory " + topic_, topic_ + ": no shared memory for slots of large messages");
+    complaints_->once("memory " + record.topic, record.topic + ": no shared memory for slots of large messages");
     readers_.dissolve();
     const std::uint32_t timeout_ms = std::max({move_ms, readers_.timeout_ms(pub_sockets_->lossy), readers_.timeout_ms(pub_sockets_->strict)});
     await_room(lock, timeout_ms, [&] { return !readers_.is_moving(false); });
@@ -386,10 +381,7 @@ class PublisherCore {
   }
 
   std::shared_ptr<PubSockets> pub_sockets_;
-  const std::string topic_;
-  const std::uint64_t fingerprint_;
   const std::uint8_t flags_;
-  const bool latch_;
   const std::size_t inline_max_;
   const std::uint32_t max_wait_ms_;
   const bool exact_;

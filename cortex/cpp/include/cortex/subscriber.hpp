@@ -19,6 +19,7 @@
 #include "cortex/codec.hpp"
 #include "cortex/link.hpp"
 #include "cortex/policy.hpp"
+#include "cortex/records.hpp"
 #include "cortex/socket.hpp"
 
 namespace cortex {
@@ -84,20 +85,17 @@ struct Source {
 
 class SubscriptionCore {
  public:
-  SubscriptionCore(std::string topic, std::string type_name, std::string schema, TypeId type, Policy policy,
+  SubscriptionCore(records::SubscriberRecord known, std::string schema, bool stamped, const Policy& wanted,
                    std::shared_ptr<net::Complaints> complaints)
-      : topic_(std::move(topic)),
-        type_name_(std::move(type_name)),
+      : record(std::move(known)),
+        policy(wanted),
         schema_(std::move(schema)),
-        type_(type),
-        policy_(policy),
+        type_{record.fingerprint, stamped},
         complaints_(std::move(complaints)) {}
   ~SubscriptionCore() { close(); }
 
-  const std::string& topic() const noexcept { return topic_; }
-  const std::string& type_name() const noexcept { return type_name_; }
-  std::uint64_t fingerprint() const noexcept { return type_.fingerprint; }
-  const Policy& policy() const noexcept { return policy_; }
+  const records::SubscriberRecord record;  // what others know of it
+  const Policy policy;
 
   // Connects to what is there and takes leave of what is gone; for the node's thread.
   void match(zmq::context_t& context, const std::vector<Source>& sources, const Keys* keys) {
@@ -120,7 +118,7 @@ class SubscriptionCore {
       const auto secure = [&](zmq::socket_t& socket) {
         if (!source.server_key.empty()) keys->apply_client(socket, source.server_key);
       };
-      links_.push_back(std::make_unique<Link>(context, source.address, source.source, type_, policy_, source.local,
+      links_.push_back(std::make_unique<Link>(context, source.address, source.source, type_, policy, source.local,
                                               source.clock_offset_ns, secure, counters_, complaints_));
     }
     waker_.set();
@@ -153,7 +151,7 @@ class SubscriptionCore {
           problems_.pop_front();
           throw problem;
         }
-        if (queue_.empty() || (!policy_.is_reliable && is_stale())) drain();
+        if (queue_.empty() || (!policy.is_reliable && is_stale())) drain();
         if (!queue_.empty()) {
           std::optional<Item> item(std::move(queue_.front()));
           queue_.pop_front();
@@ -190,7 +188,7 @@ class SubscriptionCore {
 
   std::size_t publisher_count() {
     const std::lock_guard<std::mutex> lock(mutex_);
-    if (queue_.size() < policy_.depth) drain();  // their answers may wait among the messages
+    if (queue_.size() < policy.depth) drain();  // their answers may wait among the messages
     return static_cast<std::size_t>(std::count_if(links_.begin(), links_.end(), [](const auto& link) {
       return link->attached() && link->leaving_ns == 0;
     }));
@@ -243,7 +241,7 @@ class SubscriptionCore {
 
   // Whether newer messages than those in the queue are to be looked for.
   bool is_stale() const {
-    return !exhausted_ || policy_.depth < fresh_depth ||
+    return !exhausted_ || policy.depth < fresh_depth ||
            monotonic_ns() - drained_ns_.load(std::memory_order_relaxed) > fresh_ns;
   }
 
@@ -252,7 +250,7 @@ class SubscriptionCore {
   void drain() {
     const std::int64_t now_ns = monotonic_ns();
     drained_ns_.store(now_ns, std::memory_order_relaxed);
-    if (policy_.is_reliable && queue_.size() >= policy_.depth) {
+    if (policy.is_reliable && queue_.size() >= policy.depth) {
       for (auto& link : links_) link->stay(now_ns);
       return;
     }
@@ -261,9 +259,9 @@ class SubscriptionCore {
     if (count > 1) first_ = (first_ + 1) % count;
     for (std::size_t index = 0; index < count; ++index) {
       Link& link = *links_[(first_ + index) % count];
-      const std::size_t room = policy_.depth - std::min(policy_.depth, queue_.size());
+      const std::size_t room = policy.depth - std::min(policy.depth, queue_.size());
       const std::size_t share = (room + count - index - 1) / (count - index);
-      if (policy_.is_reliable ? link.drain(queue_, share) : drain_lossy(link)) continue;
+      if (policy.is_reliable ? link.drain(queue_, share) : drain_lossy(link)) continue;
       link.stay(now_ns);
       exhausted_ = false;
     }
@@ -273,7 +271,7 @@ class SubscriptionCore {
   bool drain_lossy(Link& link) {
     for (std::size_t read = 0; read < drain_lossy_count; read += drain_count) {
       const bool empty = link.drain(queue_, drain_count);
-      while (queue_.size() > policy_.depth) {
+      while (queue_.size() > policy.depth) {
         queue_.pop_front();
         ++counters_->overtaken;
       }
@@ -296,15 +294,12 @@ class SubscriptionCore {
     mismatched_.push_back(source.source);
     ++counters_->rejected;
     if (problems_.size() >= 16) problems_.pop_front();
-    problems_.emplace_back("a publisher of " + topic_ + " sends another type than is subscribed\nexpected: " + schema_ +
+    problems_.emplace_back("a publisher of " + record.topic + " sends another type than is subscribed\nexpected: " + schema_ +
                            "\nactual: " + source.schema);
   }
 
-  const std::string topic_;
-  const std::string type_name_;
   const std::string schema_;
   const TypeId type_;
-  const Policy policy_;
   std::shared_ptr<net::Complaints> complaints_;
   mutable std::mutex mutex_;
   net::Waker waker_;
@@ -365,7 +360,7 @@ class Subscription {
 
   std::size_t publisher_count() { return core_->publisher_count(); }
   SubscriberCounters counters() const { return core_->counters(); }
-  const std::string& topic() const noexcept { return core_->topic(); }
+  const std::string& topic() const noexcept { return core_->record.topic; }
   bool closed() const { return core_->closed(); }
   void close() { core_->close(); }
 

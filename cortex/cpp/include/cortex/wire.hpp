@@ -54,10 +54,10 @@ constexpr std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) n
 // As it lies in a frame.
 struct Header {
   Header() = default;
-  Header(char kind, std::uint8_t flags, std::uint64_t source, std::uint64_t fingerprint, std::uint64_t sequence,
-         std::int64_t stamp_ns, std::int64_t publish_ns, std::uint64_t body_size, std::uint64_t aux) noexcept
-      : kind(kind), flags(flags), source(source), fingerprint(fingerprint), sequence(sequence), stamp_ns(stamp_ns),
-        publish_ns(publish_ns), body_size(body_size), aux(aux) {}
+  Header(char letter, std::uint8_t bits, std::uint64_t from, std::uint64_t type, std::uint64_t number, std::int64_t stamp,
+         std::int64_t published, std::uint64_t body, std::uint64_t other) noexcept
+      : kind(letter), flags(bits), source(from), fingerprint(type), sequence(number), stamp_ns(stamp), publish_ns(published),
+        body_size(body), aux(other) {}
 
   char magic[3] = {'C', 'T', 'X'};
   char kind = 'M';
