@@ -60,6 +60,7 @@ from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, til
 _CELLS = 4
 _SIDE = 4
 _LANES = _SIDE * _SIDE
+_QUARTER = 0x33  # bits of 2 x 2 of them
 
 
 def _rays_through(
@@ -372,24 +373,35 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
             v = wp.zeros(shape=(_LANES,), dtype=float)
             normal = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
+            light = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            for sample in range(RAY_COUNT):
-                point = ray_point(sample)
-                for y in range(rows):
-                    for x in range(columns):
-                        lane = _SIDE * y + x
-                        if (unresolved >> lane) & 1:
-                            pixel = first_ray + y * view.width + x
-                            sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
-                            toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                            pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
-                            origins[lane] = view.p_WC[pose]
-                            ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
-                            spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
+            packets = int(RAY_COUNT)  # of 2 x 2 pixels; a variable: the loop is not unrolled
+            for packet in range(packets):
+                quarter = packet % 4
+                corner = quarter // 2 * 2 * _SIDE + quarter % 2 * 2
+                if (unresolved >> corner) & _QUARTER == 0:
+                    continue
+                for lane in range(_LANES):
+                    pixel = corner + lane % 4 // 2 * _SIDE + lane % 2
+                    x = pixel % _SIDE
+                    y = pixel // _SIDE
+                    ray[lane] = wp.vec3(0.0)
+                    light[lane] = wp.vec3(0.0)
+                    if (unresolved >> pixel) & 1 == 1 and x < columns and y < rows:
+                        point = ray_point(packet // 4 * 4 + lane // 4)
+                        at = first_ray + y * view.width + x
+                        sum_C = rays[0, at] + point[0] * rays[1, at] + point[1] * rays[2, at]
+                        toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
+                        pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
+                        origins[lane] = view.p_WC[pose]
+                        ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
+                        spread_rad[lane] = RAY_WIDTH * rays[0, at][3]
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
                 )
-                shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
+                shade_packet(scene, ray, spread_rad, face, t, u, v, normal, light)
+                for lane in range(_LANES):
+                    total[corner + lane % 4 // 2 * _SIDE + lane % 2] += light[lane]
             for lane in range(_LANES):
                 if (unresolved >> lane) & 1:
                     radiance[lane] = total[lane] / float(RAY_COUNT)

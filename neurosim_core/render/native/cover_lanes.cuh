@@ -6,6 +6,18 @@ constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is ex
 #include "edge_functions.cuh"
 alignas(64) float number[MOST][LANES], middle[2][MOST][LANES];
 int layer_surface[MOST], layer_part[MOST], layer_count = 0; // layer_part: a part that a first ray hit, -1 - face: none
+// Bits of the lanes of which something holds.
+auto lanes_where = [](const auto& holds) {
+#ifndef __CUDA_ARCH__
+    if constexpr (LANES == 16) {
+        int values __attribute__((ext_vector_type(16)));
+        using Bits = bool __attribute__((ext_vector_type(16)));
+        __builtin_memcpy(&values, holds, sizeof(holds));
+        return (unsigned)__builtin_bit_cast(unsigned short, __builtin_convertvector(values != 0, Bits));
+    }
+#endif
+    return holds[0] ? 1u : 0u;
+};
 bool even = !sky;
 for (int entry = 1; entry < seen_count; ++entry)
     even &= scene.whole_surface.data[seen[entry]] == scene.whole_surface.data[seen[0]];
@@ -29,6 +41,7 @@ if (even) {
     }
 #endif
     int layer_of[MOST], touching = 0;
+    unsigned lanes_of[MOST]; // of touching faces: bits of the lanes that they reach
     float plane[MOST][3]; // of touching faces: the nearness [1/m] along a direction is its product with this
     alignas(64) float distance[TIMED ? MOST : 1][LANES]; // of their planes, by that from the origin
     alignas(64) unsigned shown[MOST][LANES]; // bits of the points that show it
@@ -51,20 +64,21 @@ if (even) {
                                         + function[side][2] * shift[2][lane];
                 shift_values([&](int side, int term) -> float& { return value[side][term][lane]; }, along_shift);
             }
-        unsigned touched = 0, crossed[3] = {}; // bits of the lanes
         alignas(64) unsigned* inside = shown[touching];
+        alignas(64) int reached[LANES], cut[3][LANES];
         for (int lane = 0; lane < LANES; ++lane) {
-            int reached = 1, cut[3];
+            reached[lane] = 1;
             for (int side = 0; side < 3; ++side) {
                 const float half = 0.5f * (wp::abs(value[side][1][lane]) + wp::abs(value[side][2][lane]));
-                reached &= value[side][0][lane] + half >= 0.0f;
-                cut[side] = value[side][0][lane] - half < 0.0f;
+                reached[lane] &= value[side][0][lane] + half >= 0.0f;
+                cut[side][lane] = value[side][0][lane] - half < 0.0f;
             }
-            inside[lane] = reached ? ALL_POINTS : 0u;
-            touched |= reached ? 1u << lane : 0u;
-            for (int side = 0; side < 3; ++side) crossed[side] |= cut[side] & reached ? 1u << lane : 0u;
+            for (int side = 0; side < 3; ++side) cut[side][lane] &= reached[lane];
+            inside[lane] = reached[lane] ? ALL_POINTS : 0u;
         }
+        const unsigned touched = lanes_where(reached); // bits of the lanes
         if (!touched) continue;
+        const unsigned crossed[3] = {lanes_where(cut[0]), lanes_where(cut[1]), lanes_where(cut[2])};
         if (entry < MOST)
             for (int side = 0; side < 3; ++side) {
                 const int beyond = crossed[side] ? scene.whole_neighbor.data[3 * (size_t)face + side] : -1;
@@ -105,7 +119,7 @@ if (even) {
                 distance[touching][lane] = 1.0f - (plane[touching][0] * shift[0][lane] + plane[touching][1] * shift[1][lane]
                                                    + plane[touching][2] * shift[2][lane]);
         for (int other = 0; other < touching; ++other) { // which of two shows where both are
-            if (layer_of[other] == layer) continue;
+            if (layer_of[other] == layer || !(lanes_of[other] & touched)) continue;
             alignas(64) unsigned contested[LANES], undecided[LANES];
             alignas(64) float nearer[3][LANES];
             unsigned any = 0;
@@ -135,6 +149,7 @@ if (even) {
                     (in_front ? shown[other] : inside)[lane] &= ~(rest & -rest);
                 }
         }
+        lanes_of[touching] = touched;
         layer_of[touching++] = layer;
         if (!listed) break;
     }

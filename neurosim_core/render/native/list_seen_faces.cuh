@@ -4,11 +4,20 @@
 // hit, `part_hit`, and `sky`, whether some rays hit nothing. More than MOST, or a moving body: `listed` is false.
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 int seen[MOST], part_hit[MOST], seen_count = 0, previous = -2;
+#ifndef __CUDA_ARCH__
+for (int& face : seen) face = -1;
+#endif
 bool sky = false, listed = true;
 auto is_listed = [&](int face) {
+#ifdef __CUDA_ARCH__
     for (int entry = 0; entry < seen_count; ++entry)
         if (seen[entry] == face) return true;
     return false;
+#else // all of them: a few vector instructions
+    int found = 0;
+    for (const int other : seen) found |= other == face;
+    return found != 0;
+#endif
 };
 auto list_face = [&](int face, int part) {
     listed &= seen_count < MOST;

@@ -12,6 +12,8 @@ for (int lane = 0; lane < LANES; ++lane)
 const int upper = wp::max(wp::min(top - 1, height - 6), 0), leftmost = wp::max(wp::min(left - 1, width - 6), 0);
 int other_surface = 0;
 const int surface_here = scene.face_surface.data[wp::max(own[0], 0)];
+for (int y = 0; y < 6; ++y) // the same place at the next instant, which this core renders soon
+    __builtin_prefetch(wp::address(faces, instant, wp::min(upper + y, height - 1), leftmost) + (size_t)height * width);
 for (int y = 0; y < 6; ++y)
     for (int x = 0; x < 6; ++x) {
         const int part = *wp::address(faces, instant, wp::min(upper + y, height - 1), wp::min(leftmost + x, width - 1));
@@ -22,27 +24,19 @@ const wp::vec3 origin(position[0][0], position[1][0], position[2][0]);
 alignas(64) float shift[3][POSES]; // of the positions from `origin`
 for (int lane = 0; lane < POSES; ++lane)
     for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[axis][lane] - origin[axis];
-#include "transpose_quads.cuh"
+#include "aim_rays.cuh"
 alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
+const bool all = columns == 4 && rows == 4;
 auto turn_rays = [&](int term) {
-    Quads quads[4];
-    const wp::vec4* const pixels = wp::address(rays, term, first_pixel);
-    if (columns == 4 && rows == 4)
-        for (int y = 0; y < 4; ++y) __builtin_memcpy(&quads[y], pixels + y * width, sizeof(Quads));
-    else
-        for (int lane = 0; lane < LANES; ++lane) {
-            const wp::vec4& pixel = pixels[lane % 4 < columns && lane / 4 < rows ? (lane / 4) * width + lane % 4 : 0];
-            for (int axis = 0; axis < 4; ++axis) quads[lane / 4][lane % 4 * 4 + axis] = pixel[axis];
-        }
-    transpose(quads, {ray[term][0], ray[term][1], ray[term][2], ray[term][3]});
-    for (int lane = 0; lane < LANES; ++lane) {
-        const wp::vec3 turned = turn(lane, ray[term][0][lane], ray[term][1][lane], ray[term][2][lane]);
-        for (int axis = 0; axis < 3; ++axis) ray[term][axis][lane] = turned[axis];
-    }
+    const wp::vec4* const aimed = wp::address(rays, term, first_pixel);
+    auto ray_of = [&](int lane) {
+        return all || (lane % 4 < columns && lane / 4 < rows) ? aimed + lane / 4 * width + lane % 4 : aimed;
+    };
+    aim_rays(ray_of, ray[term]);
 };
 turn_rays(0);
 auto footprint_width = [](float points_shown) { // as in `coverage.py`
-    return 0.01f * SHARPNESS * wp::sqrt(points_shown / SAMPLES);
+    return 0.01f * SHARPNESS * __builtin_elementwise_sqrt(points_shown / SAMPLES);
 };
 constexpr int PAIRS_MAX = LANES * SAMPLES; // of a pixel and a surface that it shows
 alignas(64) float direction[3][PAIRS_MAX], spread_of[PAIRS_MAX], share[PAIRS_MAX], total[3][LANES] = {};
@@ -76,22 +70,30 @@ if (!other_surface) {
             for (int channel = 0; channel < 3; ++channel)
                 total[channel][lane] = (1.0f - whole[lane] * weight[lane]) * scene.sky[channel];
     }
-    for (int layer = 0; layer < layer_count; ++layer)
+    for (int layer = 0; layer < layer_count; ++layer) {
+        alignas(64) float middles[3][LANES], spreads[LANES], shares[LANES];
+        alignas(64) int shows[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
-            if (number[layer][lane] == 0.0f) continue;
-            wp::vec3 toward;
             for (int axis = 0; axis < 3; ++axis)
-                toward[axis] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
-                               + middle[1][layer][lane] * ray[2][axis][lane];
+                middles[axis][lane] = ray[0][axis][lane] + middle[0][layer][lane] * ray[1][axis][lane]
+                                      + middle[1][layer][lane] * ray[2][axis][lane];
+            spreads[lane] = footprint_width(number[layer][lane]) * ray[0][3][lane];
+            shares[lane] = number[layer][lane] * weight[lane];
+            shows[lane] = number[layer][lane] != 0.0f;
+        }
+        for (unsigned rest = lanes_where(shows); rest; rest &= rest - 1) {
+            const int lane = lowest_of(rest);
             const int pose = TIMED ? lane : 0;
             const wp::vec3 from(position[0][pose], position[1][pose], position[2][pose]);
+            const wp::vec3 toward(middles[0][lane], middles[1][lane], middles[2][lane]);
             faces_of[pair_count] = part_of(layer, own[lane], from, toward);
             owner[pair_count] = lane;
-            spread_of[pair_count] = footprint_width(number[layer][lane]) * ray[0][3][lane];
-            share[pair_count] = number[layer][lane] * weight[lane];
+            spread_of[pair_count] = spreads[lane];
+            share[pair_count] = shares[lane];
             for (int axis = 0; axis < 3; ++axis) direction[axis][pair_count] = toward[axis];
             ++pair_count;
         }
+    }
     for (int pair = pair_count; pair % N != 0; ++pair) {
         faces_of[pair] = faces_of[pair_count - 1];
         owner[pair] = owner[pair_count - 1];

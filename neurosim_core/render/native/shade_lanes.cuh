@@ -108,6 +108,7 @@ if (sampled) {
             alignas(64) float blend_x[N], blend_y[N];
             alignas(64) int origin[N], width[N], height[N], place[4][N];
             alignas(64) uint32_t code[4][N];
+            int wraps = 0;
             for (int lane = 0; lane < N; ++lane) {
                 const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
                 const wp::vec3i& level = scene.levels.data[index];
@@ -127,6 +128,7 @@ if (sampled) {
                 blend_y[lane] = row - row_floor;
                 int left = (int)(column_floor);
                 int top = (int)(row_floor);
+                wraps |= left < 0 || left + 1 >= width[lane];
                 const int right = left + 1 < width[lane] ? left + 1 : 0;
                 const int bottom = top + 1 < height[lane] ? top + 1 : 0;
                 left = left < 0 ? width[lane] - 1 : left;
@@ -138,8 +140,21 @@ if (sampled) {
                 place[2][lane] = lower + left;
                 place[3][lane] = lower + right;
             }
-            for (int corner = 0; corner < 4; ++corner)
-                for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
+#ifndef __CUDA_ARCH__
+            if (!wraps) // both texels of a row by one load
+                for (int corner = 0; corner < 4; corner += 2) {
+                    alignas(64) uint64_t both[N];
+                    for (int lane = 0; lane < N; ++lane)
+                        __builtin_memcpy(&both[lane], scene.texels.data + place[corner][lane], sizeof(uint64_t));
+                    for (int lane = 0; lane < N; ++lane) {
+                        code[corner][lane] = (uint32_t)both[lane];
+                        code[corner + 1][lane] = (uint32_t)(both[lane] >> 32);
+                    }
+                }
+            else
+#endif
+                for (int corner = 0; corner < 4; ++corner)
+                    for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
             for (int lane = 0; lane < N; ++lane) {
                 for (int channel = 0; channel < 3; ++channel) {
                     float texel[4];
