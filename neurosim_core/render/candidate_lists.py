@@ -67,7 +67,7 @@ def choose_candidate_lists(
 
     Args:
         requested: `RenderConfig.candidate_lists`.
-        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `warp_renderer.ray_layers` gives them.
+        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `ray_layers` gives them.
         instant_count: The most instants of a launch, of one world.
         face_count: Triangles of the scene.
         is_cuda: Whether the device is CUDA.

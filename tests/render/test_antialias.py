@@ -8,10 +8,10 @@ import trimesh
 from render_scenes import DARK, LOOK_DOWN, UNSHADOWED, box, plane, render, scene_of
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.render.antialias import first_rays, ray_layers
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS, RADIANCE
+from neurosim_core.render.ray_layers import first_rays, ray_layers
 from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.scene import Ambient, Material, Texture
 
