@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from cortex.pub_socket import PubSocket
 
 PRIVATE_BYTES = 64 << 20
-"""Most bytes of bodies that wait to be sent through lossy sockets, and through strict ones."""
+"""Most bytes of bodies that wait to be sent through lossy sockets."""
+STRICT_BYTES = 8 << 20
+"""Most that wait for strict ones, which hold up the publisher then: few enough to be sent from the cache."""
 FREE_MAX = 16
 """Memory of so many sent bodies is kept for those that follow: of `PRIVATE_BYTES` or four of them at most."""
 
@@ -53,7 +55,8 @@ class LargeSender:
     def has_room(self, pub_socket: PubSocket, size: int) -> bool:
         """Whether so many bytes more may wait."""
         self.prune()
-        return self.waiting_bytes[pub_socket.strict] + size <= max(PRIVATE_BYTES, 4 * size)
+        most = max(STRICT_BYTES, 2 * size) if pub_socket.strict else max(PRIVATE_BYTES, 4 * size)
+        return self.waiting_bytes[pub_socket.strict] + size <= most
 
     def send(self, pub_socket: PubSocket, body: memoryview) -> None:
         """Send the body that follows a header; nobody writes there any more. Who took the header gets it."""

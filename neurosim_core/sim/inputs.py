@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,no-untyped-call"
-"""What users hand to many worlds: commands and seeds, from the host or on the device."""
+"""What users hand to many worlds: commands, seeds and masks, from the host or on the device."""
 
 from __future__ import annotations
 
@@ -90,3 +90,29 @@ def check_rows(rows: Any, out: Any, name: str) -> None:
         raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
     if rows.dtype not in (wp.float32, wp.float64):
         raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
+
+
+def checked_mask(mask: Any, count: int, device: Any) -> Any:
+    """Return a mask of the right shape and type: an array of the device, or int32 on the host."""
+    given = as_device_array(mask, device)
+    kinds: tuple[Any, ...] = (wp.bool, wp.uint8, wp.int32)
+    if given is None:
+        given = np.asarray(mask)
+        kinds = (np.bool_, np.uint8, np.int32)
+    if given.shape != (count,) or given.dtype not in kinds:
+        raise ValueError(
+            f"mask must be bool, uint8 or int32 of shape [{count}], "
+            f"got {getattr(given.dtype, '__name__', given.dtype)} of shape {list(given.shape)}"
+        )
+    return (given != 0).astype(np.int32) if isinstance(given, np.ndarray) else given
+
+
+def checked_seeds(seed: Any, count: int, device: Any) -> Any:
+    """Return seeds of all worlds: an array of the device."""
+    if not isinstance(seed, wp.array):
+        return wp.array(np.array(make_seeds(seed, count), dtype=np.uint64), dtype=wp.uint64, device=device)
+    if seed.dtype != wp.uint64 or seed.shape != (count,):
+        raise ValueError(
+            f"seed must be uint64 of shape [{count}], got {seed.dtype.__name__} of shape {list(seed.shape)}"
+        )
+    return as_device_array(seed, device)

@@ -24,7 +24,7 @@ from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.carrier import Carrier
-from neurosim_core.sim.inputs import as_device_array, check_rows, make_seeds
+from neurosim_core.sim.inputs import as_device_array, check_rows, checked_mask, checked_seeds, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples
@@ -253,8 +253,8 @@ class Simulation:
             raise ValueError(f"path.kind poses says where an episode starts: give no {names}")
         if mask is not None:
             self._check_partial()
-        seeds = None if seed is None else self._checked_seeds(seed)
-        chosen = None if mask is None else self._checked_mask(mask)
+        seeds = None if seed is None else checked_seeds(seed, self.count, self.device)
+        chosen = None if mask is None else checked_mask(mask, self.count, self.device)
         start = self._checked_start(**given)
         self._take_mask(chosen)  # all is checked: nothing is half done
         if seeds is not None:
@@ -397,20 +397,6 @@ class Simulation:
         check_rows(rows, out, name)
         wp.launch(take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
 
-    def _checked_mask(self, mask: Any) -> Any:
-        """Return a mask of the right shape and type: an array of the device, or int32 on the host."""
-        given = as_device_array(mask, self.device)
-        kinds: tuple[Any, ...] = (wp.bool, wp.uint8, wp.int32)
-        if given is None:
-            given = np.asarray(mask)
-            kinds = (np.bool_, np.uint8, np.int32)
-        if given.shape != (self.count,) or given.dtype not in kinds:
-            raise ValueError(
-                f"mask must be bool, uint8 or int32 of shape [{self.count}], "
-                f"got {getattr(given.dtype, '__name__', given.dtype)} of shape {list(given.shape)}"
-            )
-        return (given != 0).astype(np.int32) if isinstance(given, np.ndarray) else given
-
     def _take_mask(self, mask: Any) -> None:
         if mask is None:
             self._mask.fill_(1)
@@ -461,18 +447,6 @@ class Simulation:
                 f"together {when}, and it is {self._now_ns} ns: give all sensors rates that are multiples of "
                 f"control.rate_hz = {self._model.config.control.rate_hz:g}, or reset some worlds only then"
             )
-
-    def _checked_seeds(self, seed: Any) -> Any:
-        """Return seeds of all worlds: an array of the device."""
-        if not isinstance(seed, wp.array):
-            seeds = np.array(make_seeds(seed, self.count), dtype=np.uint64)
-            return wp.array(seeds, dtype=wp.uint64, device=self.device)
-        if seed.dtype != wp.uint64 or seed.shape != (self.count,):
-            raise ValueError(
-                f"seed must be uint64 of shape [{self.count}], "
-                f"got {seed.dtype.__name__} of shape {list(seed.shape)}"
-            )
-        return as_device_array(seed, self.device)
 
     def _reseed(self, seeds: Any) -> None:
         """Give the worlds of the mask other seeds."""
