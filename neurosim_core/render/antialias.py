@@ -24,7 +24,7 @@ Reference: Akeley (1993), RealityEngine graphics (multisampling); Aila, Laine (2
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from functools import cache
 from typing import Any
 
@@ -35,7 +35,6 @@ from numpy.typing import NDArray
 from neurosim_core.native_code import read_native
 from neurosim_core.render.antialias_groups import even_thread_count, group_kernels, make_lists
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.camera import Lens
 from neurosim_core.render.coverage import (
     APART,
     FACE_COUNT_MAX,
@@ -48,7 +47,6 @@ from neurosim_core.render.coverage import (
 )
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.lighting import spread_order
 from neurosim_core.render.outputs import RADIANCE, RenderOutputs, allocated_radiance_writer
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
@@ -57,71 +55,9 @@ from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader, surface_shader
 from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
 
-_CELLS = 4
 _SIDE = 4
 _LANES = _SIDE * _SIDE
 _QUARTER = 0x33  # bits of 2 x 2 of them
-
-
-def _rays_through(
-    lens: Lens, points: Iterable[Any], sample_count: int, fill_factor: float
-) -> Iterator[NDArray[np.float32]]:
-    """Yield rays through points of the sensitive area of each pixel, shape [H, W, 4]."""
-    spread = lens.ray_spread()[..., None] * np.float32(np.sqrt(fill_factor / sample_count))
-    for point in points:
-        column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
-        yield np.concatenate([lens.ray_table((column, row)), spread], axis=-1)
-
-
-def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return rays through the centres of pixels and, for several samples, through points spread over them.
-
-    The points are a lattice: along rows and along columns each n-th of a pixel has one of the n.
-
-    Args:
-        lens: Rays of the pixels.
-        sample_count: n.
-        fill_factor: Share of the pixel's area, around its centre, that the points are spread over.
-
-    Returns:
-        Direction in C and spread [rad], shape [1 or 1 + n, H * W, 4].
-    """
-    points = [(0.5, 0.5)]
-    if sample_count > 1:
-        columns, rows = np.arange(sample_count), spread_order(sample_count)
-        points += list(zip((columns + 0.5) / sample_count, (rows + 0.5) / sample_count, strict=True))
-    layers = np.stack(list(_rays_through(lens, points, sample_count, fill_factor)))
-    return layers.reshape(len(points), -1, 4)
-
-
-def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return the rays of the first pass, shape [H * W, 4].
-
-    They go through the centres of 4 x 4 cells of the pixels. Four adjacent rows of a column use all columns
-    of cells, and four adjacent columns of a row use all rows of cells.
-    """
-    pixels = [(row, col) for row in range(_CELLS) for col in range(_CELLS)]  # the others repeat these
-    cells = [
-        ((row + 2 * (col & 1) + (col >> 1)) % _CELLS, (col + 2 * (row & 1) + (row >> 1)) % _CELLS)
-        for row, col in pixels
-    ]
-    rays = np.empty((lens.height, lens.width, 4), dtype=np.float32)
-    points = (np.array(cells) + 0.5) / _CELLS
-    for (row, col), through in zip(pixels, _rays_through(lens, points, 1, fill_factor), strict=True):
-        rays[row::_CELLS, col::_CELLS] = through[row::_CELLS, col::_CELLS]
-    return rays.reshape(-1, 4)
-
-
-def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return, of each pixel, the ray through its centre and its change across columns and rows.
-
-    Returns:
-        Direction in C and spread [rad]; difference of the directions at the right and the left border of the
-        sensitive area, and of those at its lower and upper border; shape [3, H * W, 4].
-    """
-    points = ((0.5, 0.5), (1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
-    center, right, left, lower, upper = _rays_through(lens, points, 1, fill_factor)
-    return np.stack([center, right - left, lower - upper]).reshape(3, -1, 4)
 
 
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))

@@ -40,13 +40,15 @@ from neurosim_core.render.tile_bounds import looks_forward, tile_bounds
 
 _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
-_AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 3.2e-3))
+_AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 6.0e-3))
 """Least number of instants, and largest pixel [rad] for which lists pay: with fewer instants, or with fewer
 tiles of larger pixels, the search takes as long as it saves. Measured on an H200, 240x180 to 1280x720, in a
 house of 145,844 triangles and in halls of 20,000 to 2 million."""
-_AUTO_FACES_MAX = 2.2
+_AUTO_FACES_MAX = 7.0
 """Largest product of the number of triangles, as cut for the light, and the solid angle of a pixel [sr] for
-which lists pay: they hold about 50 triangles then."""
+which lists pay. In that house it is 6.6 at 346x260, where a frame's first pass takes 11.7 us with lists and
+13.1 without, and with each triangle cut into four 5.6 at 640x480 (24 and 39 us) and 19 at 346x260 (14.3 and
+13.3)."""
 _UNRESOLVED_SHARE = 8
 """One in so many pixels may be unresolved; if there are more, the fallback kernel renders all pixels."""
 _THREADS_PER_MULTIPROCESSOR = 1280
@@ -65,7 +67,7 @@ def choose_candidate_lists(
 
     Args:
         requested: `RenderConfig.candidate_lists`.
-        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `warp_renderer.ray_layers` gives them.
+        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `ray_layers` gives them.
         instant_count: The most instants of a launch, of one world.
         face_count: Triangles of the scene.
         is_cuda: Whether the device is CUDA.

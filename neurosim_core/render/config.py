@@ -53,9 +53,9 @@ class RenderConfig(Settings):
     candidate_lists: CandidateListConfig | Literal["auto"] | None = "auto"
     """The rays of a tile of pixels share one search of the tree over several instants: the same pictures and
     events to the last bit, sooner. `auto`: lists are used on CUDA, where a launch has 8 instants or more of
-    pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of 3.2 mrad, the lens
+    pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of 6 mrad, the lens
     looks forward, and lists stay short: the square of a pixel's width [rad] times the triangles of the scene,
-    as cut for baked light, is at most 2.2. null: each ray traverses the tree."""
+    as cut for baked light, is at most 7. null: each ray traverses the tree."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

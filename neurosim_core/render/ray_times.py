@@ -30,7 +30,7 @@ class RayTimes(NamedTuple):
     offsets_ns: NDArray[np.int64]
     """From the stamp [ns], <= 0, shape [J]."""
     instant: NDArray[np.int32]
-    """Index into `offsets_ns`, shape [layer, H * W]; the layers are those of `antialias.ray_layers`."""
+    """Index into `offsets_ns`, shape [layer, H * W]; the layers are those of `ray_layers`."""
     sample_count: int
     """Rays per pixel whose mean is the radiance; with more than one, layer 0 is for geometry alone."""
 

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.antialias import Antialiasing, first_rays, pixel_rays, ray_layers
+from neurosim_core.render.antialias import Antialiasing
 from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import (
     make_body_data,
@@ -24,6 +24,7 @@ from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, make_render_outputs, requested_outputs
+from neurosim_core.render.ray_layers import first_rays, pixel_rays, ray_layers
 from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists

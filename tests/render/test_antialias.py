@@ -8,10 +8,11 @@ import trimesh
 from render_scenes import DARK, LOOK_DOWN, UNSHADOWED, box, plane, render, scene_of
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.render.antialias import first_rays, ray_layers
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS, RADIANCE
+from neurosim_core.render.ray_layers import first_rays, ray_layers
+from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.scene import Ambient, Material, Texture
 
 LENS = PinholeConfig(width=33, height=18, fx=32.0, fy=32.0, cx=16.5, cy=9.0)
@@ -188,6 +189,26 @@ def test_threads_and_launches_change_nothing():
     one, two = (radiance(scene, offsets, thread_count=count) for count in (1, 3))
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one[3:4], radiance(scene, offsets[3:4]))
+
+
+def test_launches_change_nothing_where_faces_are_many(device):
+    """Blocks that are rendered by rays: on CUDA 32 instants share candidate lists, and one has none."""
+    lens = PinholeConfig(width=45, height=29, fx=400.0, fy=400.0, cx=22.5, cy=14.5)
+    rng = np.random.default_rng(0)
+    corners = rng.uniform([-0.2, -0.15, 0.0], [0.2, 0.15, 0.2], (4000, 1, 3)) + 0.01 * rng.normal(
+        size=(4000, 3, 3)
+    )
+    crumbs = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(12_000).reshape(-1, 3), process=False)
+    scene = scene_of(crumbs, plane(4.0), materials=(GREY, WHITE), part_material=(0, 1))
+    poses = [((1e-3 * k, 5e-4 * k, 3.0), LOOK_DOWN) for k in range(32)]
+    arrays = upload_scene(scene, ADAPTIVE, device)
+    seen = render(arrays, lens, poses, outputs=("log_radiance",), device=device)["log_radiance"]
+    assert len(np.unique(seen[0])) > 20
+    for k in (0, 13, 31):
+        alone = render(arrays, lens, poses[k : k + 1], outputs=("log_radiance",), device=device)[
+            "log_radiance"
+        ]
+        np.testing.assert_array_equal(alone[0], seen[k])
 
 
 def test_first_rays():
