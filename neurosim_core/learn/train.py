@@ -279,7 +279,7 @@ def default_config(
     if not cuda:
         few: dict[str, Any] = {
             "worlds": 64,
-            "iterations": 150,
+            "iterations": 200,
             "updates": 8,
             "replay": 20,
             "learning_rate": 2e-3,
@@ -290,7 +290,7 @@ def default_config(
             "pixels": 24,
             "rate_hz": found.rate_on_cpu_hz,
             "randomise": "tests",
-            "block": 75,
+            "block": 100,
         }
         return dataclasses.replace(config, teacher=small[0], student=small[1], **steps)
     many = {"worlds": 1024, "iterations": 82, "replay": 4, "updates": 26, "batch": 160}
