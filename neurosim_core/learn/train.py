@@ -282,16 +282,20 @@ def default_config(
     if not cuda:
         few: dict[str, Any] = {
             "worlds": 64,
-            "iterations": 150,
+            "iterations": 200,
             "updates": 8,
-            "replay": 10,
+            "replay": 20,
             "learning_rate": 2e-3,
         }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
-        return dataclasses.replace(
-            config, teacher=small[0], student=small[1], pixels=24, randomise="tests", block=75
-        )
+        steps: dict[str, Any] = {
+            "pixels": 24,
+            "rate_hz": found.rate_on_cpu_hz,
+            "randomise": "tests",
+            "block": 100,
+        }
+        return dataclasses.replace(config, teacher=small[0], student=small[1], **steps)
     many = {"worlds": 1024, "iterations": 82, "replay": 4, "updates": 26, "batch": 160}
     return dataclasses.replace(
         config,

@@ -299,6 +299,8 @@ def test_a_training_may_have_longer_steps(tmp_path, hall):
     assert (card["rate_hz"], card["surface"]["tau_s"]) == (25.0, env.task.surface.tau_s)
     assert read_config(tmp_path).make_task().rate_hz == 25.0
     assert small().make_task().rate_hz == Hover.rate_hz
+    assert default_config("hover", device="cpu").make_task().rate_hz == 25.0
+    assert default_config("throw-recover", device="cpu").make_task().rate_hz == 50.0
 
 
 def test_a_block_of_one_iteration_learns(tmp_path, hall):

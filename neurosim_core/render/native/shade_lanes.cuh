@@ -100,19 +100,23 @@ if (sampled) {
         mixed |= blend[lane] > 0.0f;
     }
     alignas(64) float color[2][3][N], mean[3][N] = {};
+    constexpr int KEPT = N > 1 ? 2 : 1; // levels of packets are read once for both lookups
+    alignas(64) int origins[KEPT][N], widths[KEPT][N], heights[KEPT][N];
     for (int tap = 0; tap <= twice; ++tap) {
         for (int coarser = 0; coarser <= mixed; ++coarser) {
             alignas(64) float blend_x[N], blend_y[N];
-            alignas(64) int origin[N], width[N], height[N], place[4][N];
+            auto &origin = origins[coarser % KEPT], &width = widths[coarser % KEPT], &height = heights[coarser % KEPT];
+            alignas(64) int place[4][N];
             alignas(64) uint32_t code[4][N];
             int wraps = 0;
-            for (int lane = 0; lane < N; ++lane) {
-                const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
-                const wp::vec3i& level = scene.levels.data[index];
-                origin[lane] = level[0];
-                width[lane] = level[1];
-                height[lane] = level[2];
-            }
+            if (KEPT == 1 || tap == 0)
+                for (int lane = 0; lane < N; ++lane) {
+                    const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
+                    const wp::vec3i& level = scene.levels.data[index];
+                    origin[lane] = level[0];
+                    width[lane] = level[1];
+                    height[lane] = level[2];
+                }
             for (int lane = 0; lane < N; ++lane) {
                 const float along = tap ? x[lane] - away[0][lane] : x[lane] + away[0][lane];
                 const float up = tap ? y[lane] - away[1][lane] : y[lane] + away[1][lane];
