@@ -63,8 +63,9 @@ class DenseConfig:
     """Windows that are kept to be seen again; of more, the oldest go."""
     reuse: float = 4.0
     """Worlds fly on when their windows have been seen so often, on average."""
-    renders: int | None = None
-    """Of the event camera in a window, of worlds; None: as in other flights, ten in 50 ms."""
+    renders: int | None = 2
+    """Of the event camera in a window, of worlds; None: as in other flights, ten in 50 ms. From two, depth is
+    learned as well in the same time (docs/data.md)."""
     threshold_spread: float = 0.25
     """Each world draws its thresholds up to this share above the nominal ones, or below, in each flight."""
     size_px: int = 48

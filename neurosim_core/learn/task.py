@@ -81,6 +81,8 @@ class Task:
 
     rate_hz: float = 50.0
     """Steps a second."""
+    rate_on_cpu_hz: float | None = None
+    """The same in trainings on a CPU, where a render is what a step costs; None: no other."""
     episode_s: float = 6.0
     """When an episode is cut (truncated) [s]."""
     camera: Mapping[str, Any] = {"width": 24, "height": 24, "horizontal_fov_rad": 1.6}

@@ -222,8 +222,8 @@ def test_growing_while_messages_wait(node):
 
 def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
     """Its body lies in a slot already: that ring is kept, and what the newcomer needs is made for the next."""
-    size = 500_000
-    publisher, subscriber = connected(node, Scan, reliable(1, 60.0), expected_bytes=5 * size, max_wait_s=60.0)
+    size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
+    publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
     ring, count, results = publisher._fanout.ring._ring, 0, []
     while ring.patience(64) < 0:  # less than a frame that names a slot would find

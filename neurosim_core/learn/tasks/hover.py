@@ -27,6 +27,7 @@ class Hover(Task):
     position nor velocity. The teacher and the critic see the velocity.
     """
 
+    rate_on_cpu_hz: float | None = 25.0
     episode_s = 5.0
     start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))

@@ -21,7 +21,7 @@ class HoverPaper(Hover):
     Thrust spans 0 to twice the hover thrust; rates are 7, 7 and 5 rad/s; an episode lasts 15 s of 100 steps.
     """
 
-    rate_hz = 100.0
+    rate_hz, rate_on_cpu_hz = 100.0, None
     episode_s = 15.0
     start = StartConfig(clearance_m=0.7, speed_m_s=(0.0, 2.0), tilt_max_rad=0.2, rate_max_rad_s=0.5)
     randomisation, training = NO_RANDOMISATION, None

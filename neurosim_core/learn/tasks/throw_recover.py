@@ -26,6 +26,7 @@ class ThrowRecover(Hover):
     What is seen, and when it has succeeded, is as in `hover`. It takes height to turn over: halls are high.
     """
 
+    rate_on_cpu_hz = None
     episode_s = 5.0
     start = StartConfig(clearance_m=3.0, speed_m_s=(0.0, 3.0), tilt_max_rad=math.pi, rate_max_rad_s=6.0)
     training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 2.0))

@@ -1,7 +1,8 @@
 // Finds what SAMPLES points of LANES pixels show of the faces in `seen`, and of their neighbours beyond edges that cross
 // the pixels. A pixel's directions are `ray`[0] + x `ray`[1] + y `ray`[2], each [3][LANES], with x and y in `points`.
-// With TIMED each is seen from a position of its own, `shift` [3][LANES] away from `origin`. Faces of one surface are taken together. For each of `layer_count` surfaces `number` [LANES] is how many points show it,
-// and `middle` [2][LANES] their mean. Where the first rays hit one surface only, all points show it.
+// With TIMED each is seen from a position of its own, `shift` [3][LANES] away from `origin`. Faces of one surface are taken
+// together. For each of `layer_count` surfaces `number` [LANES] is how many points show it, and `middle` [2][LANES] their mean.
+// Where the first rays hit one surface only, all points show it.
 constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon
 #include "edge_functions.cuh"
 alignas(64) float number[MOST][LANES], middle[2][MOST][LANES];
@@ -126,8 +127,12 @@ if (even) {
             for (int lane = 0; lane < LANES; ++lane) any |= contested[lane] = shown[other][lane] & inside[lane];
             if (!any) continue;
             auto difference = [&](int axis, int lane) {
-                const float own = TIMED ? distance[other][lane] * plane[touching][axis] : plane[touching][axis];
-                return own - (TIMED ? NEARER * distance[touching][lane] : NEARER) * plane[other][axis];
+                if constexpr (TIMED) { // distances to planes that the camera crosses are negative
+                    const float own = distance[touching][lane], others = distance[other][lane];
+                    return __builtin_copysignf(others, own) * plane[touching][axis]
+                           - NEARER * __builtin_copysignf(own, others) * plane[other][axis];
+                }
+                return plane[touching][axis] - NEARER * plane[other][axis];
             };
             for (int term = 0; term < 3; ++term)
                 for (int lane = 0; lane < LANES; ++lane)

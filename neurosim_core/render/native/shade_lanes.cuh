@@ -3,7 +3,7 @@
 constexpr float COSINE_MIN = 0.05f;
 constexpr float TEXEL_UNIT[3] = {1.0f / (2047 * 2047), 1.0f / (2047 * 2047), 1.0f / (1023 * 1023)}; // as in `materials.py`
 alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
-alignas(64) float light[3][3][N], emitted[3][N];
+alignas(64) float lit[4][N], emitted[3][N];
 alignas(64) int face[N], material[N];
 for (int lane = 0; lane < N; ++lane) {
     const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
@@ -35,19 +35,16 @@ for (int lane = 0; lane < different; ++lane) {
     blue[lane] = base[2];
     for (int channel = 0; channel < 3; ++channel)
         emitted[channel][lane] = EMISSIVE ? scene.emission.data[material[lane]][channel] : 0.0f;
-    const wp::vec3* corner = scene.corner_light.data
-                             + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0)
-                             + 3 * (size_t)face[lane];
-    for (int tip = 0; tip < 3; ++tip)
-        for (int channel = 0; channel < 3; ++channel) light[channel][tip][lane] = corner[tip][channel];
 }
+auto light_of = [&](int lane) { // of the corners of the face, by channel
+    return (const float*)(scene.corner_light.data + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0)
+                          + 3 * (size_t)face[lane]);
+};
 if (different == 1) {
     repeat(material);
     repeat(red);
     repeat(green);
     repeat(blue);
-    for (int tip = 0; tip < 3; ++tip)
-        for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
     for (int channel = 0; channel < 3; ++channel) repeat(emitted[channel]);
 }
 alignas(64) int first[N], level_count[N];
@@ -103,19 +100,23 @@ if (sampled) {
         mixed |= blend[lane] > 0.0f;
     }
     alignas(64) float color[2][3][N], mean[3][N] = {};
+    constexpr int KEPT = N > 1 ? 2 : 1; // levels of packets are read once for both lookups
+    alignas(64) int origins[KEPT][N], widths[KEPT][N], heights[KEPT][N];
     for (int tap = 0; tap <= twice; ++tap) {
         for (int coarser = 0; coarser <= mixed; ++coarser) {
             alignas(64) float blend_x[N], blend_y[N];
-            alignas(64) int origin[N], width[N], height[N], place[4][N];
+            auto &origin = origins[coarser % KEPT], &width = widths[coarser % KEPT], &height = heights[coarser % KEPT];
+            alignas(64) int place[4][N];
             alignas(64) uint32_t code[4][N];
             int wraps = 0;
-            for (int lane = 0; lane < N; ++lane) {
-                const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
-                const wp::vec3i& level = scene.levels.data[index];
-                origin[lane] = level[0];
-                width[lane] = level[1];
-                height[lane] = level[2];
-            }
+            if (KEPT == 1 || tap == 0)
+                for (int lane = 0; lane < N; ++lane) {
+                    const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
+                    const wp::vec3i& level = scene.levels.data[index];
+                    origin[lane] = level[0];
+                    width[lane] = level[1];
+                    height[lane] = level[2];
+                }
             for (int lane = 0; lane < N; ++lane) {
                 const float along = tap ? x[lane] - away[0][lane] : x[lane] + away[0][lane];
                 const float up = tap ? y[lane] - away[1][lane] : y[lane] + away[1][lane];
@@ -193,12 +194,32 @@ if constexpr (LIGHT_WITHIN) // no light is extrapolated beyond the face
         vs[lane] = wp::clamp(vs[lane], 0.0f, 1.0f - us[lane]);
         w[lane] = 1.0f - us[lane] - vs[lane];
     }
+if (different == 1) {
+    const float* const corner = light_of(0);
+    for (int channel = 0; channel < 3; ++channel)
+        for (int lane = 0; lane < N; ++lane)
+            lit[channel][lane] = us[lane] * corner[channel] + vs[lane] * corner[3 + channel] + w[lane] * corner[6 + channel];
+}
+#ifndef __CUDA_ARCH__
+else {
+#include "transpose_quads.cuh"
+    for (int begin = 0; begin < N; begin += 16) {
+        auto quad_of = [&](int place) {
+            const int lane = begin + place;
+            const float* const corner = light_of(lane);
+            Quad tip[3];
+            for (int k = 0; k < 3; ++k) __builtin_memcpy(&tip[k], corner + (k < 2 ? 3 * k : 5), sizeof(Quad)); // within the corners
+            return us[lane] * tip[0] + vs[lane] * tip[1] + w[lane] * tip[2].yzww;
+        };
+        float* const rows[4] = {lit[0] + begin, lit[1] + begin, lit[2] + begin, lit[3] + begin};
+        transpose_quads(quad_of, rows);
+    }
+}
+#endif
 for (int channel = 0; channel < 3; ++channel) {
     const float* albedo = channel == 0 ? red : channel == 1 ? green : blue;
     for (int lane = 0; lane < N; ++lane) {
-        const float lit = us[lane] * light[channel][0][lane] + vs[lane] * light[channel][1][lane]
-                          + w[lane] * light[channel][2][lane];
-        const float lit_and_own = albedo[lane] * lit + emitted[channel][lane];
+        const float lit_and_own = albedo[lane] * lit[channel][lane] + emitted[channel][lane];
         radiance[channel][lane] = faces[lane] < 0 ? scene.sky[channel] : lit_and_own;
     }
 }
