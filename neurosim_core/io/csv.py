@@ -1,8 +1,8 @@
 """Events as text, one a line: `t,x,y,p`, t in whole microseconds.
 
 Other files are read too: columns separated by commas, blanks or semicolons; in the order of a header such as
-`x,y,polarity,timestamp` or `t [us], x, y, p`, else t, x, y, p; times that are not whole are seconds; polarity
-may be -1 or 1; a first line `WIDTH HEIGHT`, or `%geometry:WIDTH,HEIGHT`, tells the sensor.
+`x,y,polarity,timestamp` or `t [ns], x, y, p`, else t, x, y, p; without a unit, times that are not whole are
+seconds; polarity may be -1 or 1; a first line `WIDTH HEIGHT`, or `%geometry:WIDTH,HEIGHT`, tells the sensor.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
+from neurosim_core.io.event_file import EventFileError, are_seconds, events_of, split_blocks
 from neurosim_core.packets import EventArrays
 
 _BLOCK_LINES = 200_000
@@ -27,7 +27,8 @@ _NAMES = {
     **dict.fromkeys(("p", "polarity", "on", "pol"), "p"),
 }
 _HEADER_LINES_MAX = 100
-_UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
+_UNIT = re.compile(r"\[([^]]*)\]|\(([^)]*)\)")
+_UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "\N{MICRO SIGN}s": 1.0, "ns": 1e-3}
 
 
 class CsvSource:
@@ -39,6 +40,7 @@ class CsvSource:
         self._columns: tuple[str, ...] = ("t", "x", "y", "p")
         self._skip, self._delimiter = 0, ","
         self._kind: type = np.int64  # read twice as fast as others
+        self._unit_us: float | None = None
         self.size = self._read_header()
 
     def close(self) -> None:
@@ -54,11 +56,14 @@ class CsvSource:
                     size = int(geometry[1]), int(geometry[2])
                 elif len(words) >= 4 and {_NAMES.get(word.lower()) for word in words} >= {"t", "x", "y", "p"}:
                     self._columns = tuple(_NAMES.get(word.lower(), "") for word in words)
+                    units = (_UNITS_US.get("".join(unit).strip()) for unit in _UNIT.findall(text))
+                    self._unit_us = next((unit for unit in units if unit is not None), None)
                 elif len(words) == 2 and all(word.isdigit() for word in words) and not text.startswith("%"):
                     size = int(words[0]), int(words[1])
                 elif text and text[0] not in "%#":
                     self._delimiter = next((mark for mark in ",;" if mark in text), "")
-                    self._kind = np.float64 if re.search(r"[.eE]", text) else np.int64
+                    first = [text, *islice(file, _HEADER_LINES_MAX)]  # of the numbers of one all may be whole
+                    self._kind = np.float64 if re.search(r"[.eE]", "".join(first)) else np.int64
                     try:
                         events_of(0, *self._load([text])[0, 1:])
                     except (ValueError, IndexError):
@@ -69,16 +74,18 @@ class CsvSource:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        number, in_seconds = self._skip, None
+        number, unit_us = self._skip, self._unit_us
         with self._open() as file:
             lines = islice(file, self._skip, None)
             while chunk := list(islice(lines, _BLOCK_LINES)):
                 t, *rest = self._rows(chunk, number).T
                 number += len(chunk)
                 if len(t):
-                    in_seconds = bool((t % 1.0).any()) if in_seconds is None else in_seconds
+                    if unit_us is None:
+                        unit_us = 1e6 if are_seconds(t) else 1.0
                     try:
-                        events = events_of(np.rint(t * 1e6) if in_seconds else t, *rest)
+                        whole = unit_us == 1.0 and self._unit_us is None
+                        events = events_of(t if whole else np.rint(t * unit_us), *rest)
                     except ValueError as error:
                         raise EventFileError(f"{self._path}, before line {number}: {error}") from None
                     yield events
@@ -109,6 +116,7 @@ class CsvSource:
         place = [self._columns.index(name) for name in ("t", "x", "y", "p")]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a chunk without data
+            warnings.simplefilter("error", DeprecationWarning)  # older NumPy reads 0.5 as the integer 0
             rows: NDArray[np.float64] = np.loadtxt(
                 chunk,
                 self._kind,

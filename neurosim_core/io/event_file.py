@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, join_events
 
@@ -301,6 +301,11 @@ def events_of(t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike) -> 
         if not np.can_cast(values.dtype, kind) and (columns[-1] != values).any():
             raise ValueError(f"an event has {name} = {values[np.argmax(columns[-1] != values)]}")
     return EventArrays(*columns)
+
+
+def are_seconds(t: NDArray[Any]) -> bool:
+    """Whether the first times of a file are seconds, if it does not say: those of microseconds are whole."""
+    return t.dtype.kind == "f" and bool((t % 1.0).any())
 
 
 def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:

@@ -2,7 +2,7 @@
 
 The group `events`, or `sensors/NAME/events` of a recording, holds t [us], x, y and p; `t_offset` beside it is
 added to t. Files of other names are read, too: ts, xs, ys and ps; records instead of columns; those of M3ED
-(`prophesee/left`) and Prophesee (`CD/events`). Times that are floating-point numbers are seconds.
+(`prophesee/left`) and Prophesee (`CD/events`). Times that are not whole are seconds.
 
 Reference: Gehrig et al. (2021), DSEC, https://dsec.ifi.uzh.ch/data-format.
 """
@@ -23,6 +23,7 @@ from neurosim_core.io.event_file import (
     PACKET_US,
     EventFileError,
     PacketCutter,
+    are_seconds,
     events_of,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
@@ -118,6 +119,7 @@ class Hdf5Source:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
+        in_seconds = None
         for begin in range(0, self._count, BLOCK_EVENTS):
             end = min(begin + BLOCK_EVENTS, self._count)
             with damage_of(self._path):
@@ -128,7 +130,8 @@ class Hdf5Source:
                     t, x, y, p = (read_rows(self._events[name], begin, end) for name in self._names)
                 if len(t) != end - begin:
                     raise EventFileError(f"{self._path}: fewer events than its index says")
-                t = np.rint(t * 1e6) if t.dtype.kind == "f" else t
+                in_seconds = are_seconds(t) if in_seconds is None else in_seconds
+                t = np.rint(t * 1e6) if in_seconds else t
                 block = events_of(t + np.int64(self._offset_us), x, y, p)
             yield block
 

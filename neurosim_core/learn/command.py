@@ -231,7 +231,7 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
     config = DenseConfig(
         task=task, device=device, seed=arguments.seed, minutes=arguments.minutes, size_px=arguments.size,
         backbone=arguments.backbone, fly_device=arguments.fly_device,
-        batch=8 if device == "cpu" else 16,  # a GPU takes hardly longer for twice as many
+        batch=8 if device == "cpu" else 16,  # what docs/data.md was measured with
     )  # fmt: skip
     folder = arguments.out or Path("runs") / task
     source = {

@@ -97,7 +97,7 @@ class Dagger:
         self._flown = 0
 
     def iterate(self, done: float) -> dict[str, float]:
-        """Fly some steps and learn from them; on a CPU learn meanwhile from what was flown before.
+        """Fly some steps and learn from them; on a CPU learn meanwhile, from those before if there are any.
 
         Args:
             done: Share of the training that lies behind.
@@ -109,11 +109,12 @@ class Dagger:
         rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0)))
         lead = 1.0 - (1.0 - config.lead_last) * min(done / max(config.lead, 1e-9), 1.0)
         lead = max(lead, 1e-9)
-        if self._learner is None:
+        if self._actor is not self.policy:
+            self._actor.load_state_dict(self.policy.state_dict())
+        if self._learner is None or self._flown == 0:
             with torch.no_grad():
                 log = self._fly(lead=lead)
             return log | self._learn(rate, self._draw_stretches(config.replay))
-        self._actor.load_state_dict(self.policy.state_dict())
         learning = self._learner.submit(self._learn, rate, self._draw_stretches(config.replay - 1))
         with torch.no_grad():
             log = self._fly(lead=lead)
@@ -197,10 +198,8 @@ class Dagger:
         self._memory.copy_(memory)
 
     def _draw_stretches(self, iterations: int) -> torch.Tensor:
-        """Return numbers of stretches from so many of the last iterations, [updates, batch]; [0] at first."""
+        """Return numbers of stretches from so many of the last iterations, [updates, batch]."""
         config, worlds, device = self.config, self.env.num_envs, self.env.device
-        if self._flown == 0:
-            return torch.zeros(0, device=device)
         count, shape = min(self._flown, iterations) * worlds, (config.updates, config.batch)
         back = torch.randint(count, shape, generator=self._generator, device=device)
         return (self._flown * worlds - 1 - back) % (config.replay * worlds)

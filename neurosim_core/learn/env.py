@@ -144,6 +144,7 @@ class Env:
                 height=task.camera["height"],
                 step_s=1.0 / task.rate_hz,
                 device=str(wp_device),
+                keep_ended=True,
             )
         self.episode_steps = round(task.episode_s * task.rate_hz)
         self.episode_length = torch.zeros(worlds, dtype=torch.int32, device=self.device)
@@ -162,7 +163,6 @@ class Env:
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
         self._thrown = torch.zeros((worlds, len(task.bodies), 6), dtype=torch.float64, device=self.device)
         self._status: torch.Tensor | None = None
-        self._last_surface: torch.Tensor | None = None
         self._started = False
 
     @property
@@ -250,8 +250,11 @@ class Env:
             info["dropped"] = wp.to_torch(observation.events[CAMERA].dropped)
         if self.device.type == "cpu" and not self._mask.any():
             return final, reward, terminated, truncated, info
-        if "events" in final:
-            final["events"] = self._keep(final["events"])
+        if self._surface is not None and "events" in final:
+            if final["events"] is view.surface:
+                final["events"] = wp.to_torch(self._surface.ended)
+            else:  # a task's own, perhaps a part of them
+                final["events"] = final["events"].clone()
         self._begin(everywhere=False)
         return self._observations(), reward, terminated, truncated, info
 
@@ -297,17 +300,6 @@ class Env:
         self._thrown = torch.where(self._mask[:, None, None], thrown, self._thrown)
         rows = (self._thrown[..., :3].contiguous(), self._thrown[..., 3:].contiguous())
         self.sim.throw_bodies(*(wp.from_torch(each, dtype=wp.vec3d) for each in rows))
-
-    def _keep(self, surface: torch.Tensor) -> torch.Tensor:
-        """Return the surfaces where episodes have ended, in memory that the next such step overwrites."""
-        if self._last_surface is None:
-            self._last_surface = torch.zeros_like(surface)
-        if self.device.type == "cpu":
-            self._last_surface[self._mask] = surface[self._mask]
-        else:  # which rows they are is known to the device only
-            mask = self._mask[:, None, None, None]
-            torch.where(mask, surface, self._last_surface, out=self._last_surface)
-        return self._last_surface
 
     def _delayed(self, command: torch.Tensor) -> torch.Tensor:
         """Return the commands that take effect now: each episode has a latency and a factor of thrust."""

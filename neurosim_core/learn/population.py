@@ -27,7 +27,7 @@ def train_population(
     """Train with each of several settings, as many side by side as the cluster has GPUs, or cores, for.
 
     Runs come back from the machines where they were trained, with checkpoints, policies and logs. One that
-    fails does not end the others.
+    fails does not end the others. Where the cluster is too small for one, that is said: it may grow.
 
     Args:
         folder: Of the runs: each in a folder there, of its name.
@@ -38,9 +38,11 @@ def train_population(
         say: Told what comes of each.
 
     Raises:
-        ValueError: The folder holds one of the runs.
+        ValueError: The folder holds one of the runs, or there are no settings or no workers.
         RuntimeError: A training failed.
     """
+    if not configs or workers < 1:
+        raise ValueError(f"needs 1 training and 1 worker at least, got {len(configs)} and {workers}")
     held = [name for name in configs if (folder / name / "checkpoint.pt").exists()]
     if held:
         raise ValueError(f"{folder} holds the runs {', '.join(held)}: choose another folder")
@@ -49,6 +51,8 @@ def train_population(
         left: dict[Any, str] = {}
         groups = {}
         for name, config in configs.items():
+            if lacking := _lacking(ray, config, workers):
+                say(f"{name} waits: the cluster has {lacking}")
             groups[name], trainings = _begin(ray, name, config, workers)
             left |= dict.fromkeys(trainings, name)
         while left:
@@ -72,14 +76,28 @@ def train_population(
         raise RuntimeError(f"these trainings failed: {', '.join(failures)}; what was printed says why")
 
 
+def _needs(config: TrainConfig) -> dict[str, int]:
+    """Return what a worker needs, by Ray's names."""
+    return {"CPU": 1, **({"GPU": 1} if is_for_cuda(config.device) else {})}
+
+
+def _lacking(ray: Any, config: TrainConfig, workers: int) -> str:
+    """Return what the cluster as it is has too few of for a training, and how many."""
+    there = ray.cluster_resources()
+    return ", ".join(
+        f"{there.get(name, 0):g} of {workers * count} {name}s"
+        for name, count in _needs(config).items()
+        if there.get(name, 0) < workers * count
+    )
+
+
 def _begin(ray: Any, name: str, config: TrainConfig, workers: int) -> tuple[Any, list[Any]]:
     """Return what is reserved for a training, all of it or nothing, and what its workers will return."""
     cuda = is_for_cuda(config.device)
     config = dataclasses.replace(config, device="cuda:0" if cuda else "cpu")
-    needs = {"num_cpus": 1, "num_gpus": int(cuda)}
-    group = ray.util.placement_group([{"CPU": 1, **({"GPU": 1} if cuda else {})}] * workers)
+    group = ray.util.placement_group([_needs(config)] * workers)
     placed = ray.util.scheduling_strategies.PlacementGroupSchedulingStrategy(group)
-    worker = ray.remote(_Worker).options(**needs, scheduling_strategy=placed)
+    worker = ray.remote(_Worker).options(num_cpus=1, num_gpus=int(cuda), scheduling_strategy=placed)
     started = [worker.remote() for _ in range(workers)]
     meeting = started[0].free_port.remote()
     return group, [

@@ -220,16 +220,18 @@ def _add_voxels(
 def _show_sums(
     # Model:
     decay: wp.array[wp.float32],
+    stride: int,
     # In/out:
     sums: wp.array2d[wp.int32],
     surface: wp.array2d[wp.float32],
 ) -> None:
-    plane, pixel = wp.tid()  # two axes: with four, CUDA spends more on indices than on sums
-    added = sums[plane, pixel]
-    if added != 0:
-        sums[plane, pixel] = 0
-    before = surface[plane, pixel] * decay[plane % decay.shape[0]]
-    surface[plane, pixel] = before + wp.float32(added) / _ONE
+    plane, lane = wp.tid()  # two axes: with four, CUDA spends more on indices than on sums
+    share = decay[plane % decay.shape[0]]
+    for pixel in range(lane, sums.shape[1], stride):
+        added = sums[plane, pixel]
+        if added != 0:
+            sums[plane, pixel] = 0
+        surface[plane, pixel] = surface[plane, pixel] * share + wp.float32(added) / _ONE
 
 
 @wp.kernel
@@ -237,9 +239,11 @@ def _forget(
     # In:
     mask: wp.array[wp.int32],
     stride: int,
-    # Out:
+    # In/out:
     last_us: wp.array4d[wp.int64],
     surface: wp.array4d[wp.float32],
+    # Out:
+    ended_out: wp.array4d[wp.float32],
 ) -> None:
     world, lane = wp.tid()
     if mask[world] == 0:
@@ -251,6 +255,8 @@ def _forget(
         channel = place / size
         row = place % size / columns
         column = place % columns
+        if world < ended_out.shape[0]:
+            ended_out[world, channel, row, column] = surface[world, channel, row, column]
         surface[world, channel, row, column] = 0.0
         if channel < last_us.shape[1]:
             last_us[world, channel, row, column] = _NEVER_US
@@ -267,13 +273,23 @@ class EventSurface:
         height: Of the sensor [px].
         step_s: How long a step is [s].
         device: Where they are.
+        keep_ended: Keep what `forget` clears.
 
     Attributes:
         array: The surfaces, float32, shape [N, channel, H, W]; overwritten by `update` and `forget`.
+        ended: What each showed when it was cleared last, likewise; empty if it is not kept.
     """
 
     def __init__(
-        self, config: SurfaceConfig, *, world_count: int, width: int, height: int, step_s: float, device: str
+        self,
+        config: SurfaceConfig,
+        *,
+        world_count: int,
+        width: int,
+        height: int,
+        step_s: float,
+        device: str,
+        keep_ended: bool = False,
     ) -> None:
         self.config = config
         self._device = wp.get_device(device)
@@ -281,6 +297,7 @@ class EventSurface:
         self._lanes = _THREADS_ON_CUDA if self._device.is_cuda else 1
         shape = (world_count, config.channel_count, height, width)
         self.array: Any = wp.zeros(shape, dtype=wp.float32, device=device)
+        self.ended: Any = wp.zeros(shape if keep_ended else (0, 0, 0, 0), dtype=wp.float32, device=device)
         tau_us = [1e6 * tau for tau in getattr(config, "tau_s", ())]
         self._tau_us: Any = wp.array(tau_us, dtype=wp.float32, device=device)
         decays = [0.0] * config.channel_count
@@ -325,12 +342,13 @@ class EventSurface:
             return
         planes = (self.array.shape[0] * self.array.shape[1], self.array.shape[2] * self.array.shape[3])
         flat = [self._sums.reshape(planes), self.array.reshape(planes)]
-        self._launch(_show_sums, planes, [self._decay], flat)
+        stride = -(-planes[1] // 4) if self._device.is_cuda else 1
+        self._launch(_show_sums, (planes[0], stride), [self._decay, stride], flat)
 
     def forget(self, mask: Any) -> None:
         """Clear the surfaces of worlds that begin anew; `mask` is a device array of int32, shape [N]."""
         dim = (self.array.shape[0], self._lanes)
-        self._launch(_forget, dim, [mask, self._lanes], [self._last, self.array])
+        self._launch(_forget, dim, [mask, self._lanes], [self._last, self.array, self.ended])
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

@@ -14,7 +14,7 @@ import json
 import os
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -170,8 +170,11 @@ class Training:
 
         Raises:
             FileNotFoundError: There is none.
+            ValueError: It is of another version.
         """
-        state = torch.load(self.folder / "checkpoint.pt", map_location=self.env.device, weights_only=True)
+        file = self.folder / "checkpoint.pt"
+        state = torch.load(file, map_location=self.env.device, weights_only=True)
+        _check_layers(file, state, self.student)
         for stage, trainer in self._trainers.items():
             trainer.descent.load_state_dict(state[stage])
         self._generator.set_state(state["generator"].cpu())
@@ -325,15 +328,27 @@ def load_student(folder: Path, device: torch.device) -> EventPolicy:
     """Return the student of a run.
 
     Raises:
-        ValueError: The run has no checkpoint.
+        ValueError: The run has no checkpoint, or one of another version.
     """
     file = folder / "checkpoint.pt"
     if not file.is_file():
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
     state = torch.load(file, map_location=device, weights_only=True)
     policy = EventPolicy(**state["shape"]).to(device)
+    _check_layers(file, state, policy)
     policy.load_state_dict(state["weights"])
     return policy
+
+
+def _check_layers(file: Path, state: Mapping[str, Any], policy: EventPolicy) -> None:
+    shapes = [
+        {name: value.shape for name, value in weights.items()}
+        for weights in (state["weights"], policy.state_dict())
+    ]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"{file} is of another version, whose networks have other layers: train again, or use that one"
+        )
 
 
 def evaluate_run(

@@ -195,6 +195,21 @@ def test_texts_of_other_programs(text, tmp_path):
     assert [column.tolist() for column in found] == [[1, 2_000_003], [3, 4], [5, 6], [0, 1]]
 
 
+@pytest.mark.parametrize(
+    ("text", "t"),
+    [
+        ("0 3 5 0\n0.00001 4 6 1\n", [0, 10]),  # as `%g` writes them: the first number is whole
+        ("t [ns],x,y,p\n1000,3,5,0\n2000,4,6,1\n", [1, 2]),
+        ("time (ms); x; y; p\n1.5; 3; 5; 0\n2; 4; 6; 1\n", [1500, 2000]),
+        ("t [s],x,y,p\n1,3,5,0\n2,4,6,1\n", [1_000_000, 2_000_000]),
+        ("t [us],x,y,p\n1.7,3,5,0\n2.0,4,6,1\n", [2, 2]),
+    ],
+)
+def test_units_of_times_in_texts(text, t, tmp_path):
+    (tmp_path / "events.csv").write_text(text)
+    assert [column.tolist() for column in read(tmp_path / "events.csv")] == [t, [3, 4], [5, 6], [0, 1]]
+
+
 def test_a_text_that_was_cut_off(tmp_path):
     """A number may be cut, and still be one: what ends with it is left out, and said."""
     path, order = tmp_path / "events.csv", "x,y,p,t\n3,5,0,10\n"
@@ -260,6 +275,15 @@ def test_hdf5_of_other_programs(layout, tmp_path):
             for name, column in zip(names.split(","), (t, events.x, events.y, signs), strict=True):
                 file[f"{group}/{name}"] = column
     assert same(read(path), events)
+
+
+def test_hdf5_of_whole_times(tmp_path):
+    """Microseconds, as in texts, though they are floating-point numbers."""
+    path = tmp_path / "events.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in (("t", [1.0, 2_000_003.0]), ("x", [3, 4]), ("y", [5, 6]), ("p", [0, 1])):
+            file[f"events/{name}"] = np.array(values)
+    assert read(path).t.tolist() == [1, 2_000_003]
 
 
 def test_hdf5_that_tells_nothing(tmp_path):

@@ -72,8 +72,16 @@ def test_nothing_of_a_world_depends_on_its_neighbours(make):
     assert torch.equal(own[:, :, 0], flags[:, :, 1])
 
 
-def test_an_episode_that_is_cut_begins_anew_in_the_same_step(make):
-    env = make(worlds=2)
+class Fewer(Brief):
+    """It shows a part of the surfaces."""
+
+    def observe(self, view):
+        return super().observe(view) | {"events": view.surface[:, 1:]}
+
+
+@pytest.mark.parametrize("task", [Brief, Fewer])
+def test_an_episode_that_is_cut_begins_anew_in_the_same_step(make, task):
+    env = make(worlds=2, task=task())
     observations, _ = env.reset(seed=0)
     assert env.episode_steps == 10
     for step in range(10):

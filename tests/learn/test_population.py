@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from processes import ROOT
@@ -18,7 +19,7 @@ pytest.importorskip("onnx", reason="needs the extra learn")
 pytest.importorskip("tensorboard", reason="needs the extra learn")
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.population import train_population  # noqa: E402
+from neurosim_core.learn.population import _lacking, train_population  # noqa: E402
 from neurosim_core.learn.ppo import PpoConfig  # noqa: E402
 from neurosim_core.learn.train import TrainConfig, train  # noqa: E402
 
@@ -84,3 +85,14 @@ def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path):
     )
     assert both == other
     assert both != alone
+
+
+def test_a_cluster_that_is_too_small_is_told(tmp_path):
+    """It may grow: Ray waits until it has."""
+    ray = SimpleNamespace(cluster_resources=lambda: {"CPU": 2.0})
+    assert _lacking(ray, CONFIG, 2) == ""
+    assert _lacking(ray, CONFIG, 3) == "2 of 3 CPUs"
+    assert _lacking(ray, dataclasses.replace(CONFIG, device="cuda:0"), 1) == "0 of 1 GPUs"
+    for configs, workers in (({"a": CONFIG}, 0), ({}, 1)):
+        with pytest.raises(ValueError, match="1 training and 1 worker at least"):
+            train_population(tmp_path, configs, workers=workers)

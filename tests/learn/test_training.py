@@ -303,6 +303,25 @@ def test_a_training_may_have_longer_steps(tmp_path, hall):
     assert default_config("throw-recover", device="cpu").make_task().rate_hz == 50.0
 
 
+def test_a_block_of_one_iteration_learns(tmp_path, hall):
+    """A CPU learns from iterations before: where there is none, from the first after it has flown."""
+    training = Training(tmp_path, small(block=1), models=[hall])
+    before = [parameter.clone() for parameter in training.student.parameters()]
+    training.run(until=(0, 1))
+    after = training.student.parameters()
+    assert not any(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_runs_of_another_version_are_refused(tmp_path, hall):
+    training = run(tmp_path, hall)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    state["weights"]["motion.weight"] = torch.zeros(3, 44)
+    torch.save(state, tmp_path / "checkpoint.pt")
+    for read in (training.resume, lambda: load_student(tmp_path, torch.device("cpu"))):
+        with pytest.raises(ValueError, match="of another version"):
+            read()
+
+
 def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):
     training = Training(tmp_path, small(randomise="none"), models=[hall])
     assert training.env.randomisation == NO_RANDOMISATION
