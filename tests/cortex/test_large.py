@@ -221,7 +221,7 @@ def test_growing_while_messages_wait(node):
 
 
 def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
-    """Its body lies in a slot already: that ring is kept, and what the newcomer needs is made for the next."""
+    """Its body lies in a slot: that ring is kept, and more slots are made for the next message."""
     size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
     publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
