@@ -81,6 +81,7 @@ def upload_scene(
     )
     materials = (*scene.materials, *joined.materials)
     light: NDArray[np.float32] | None = None
+    wp.zeros(1, device=device)  # Warp makes a device's streams at its first use, which must be in one thread
     with ThreadPoolExecutor(max_workers=3) as aside:
         packing = aside.submit(pack_textures, materials)
         connecting = aside.submit(connect_faces, scene) if config.samples_per_pixel == "adaptive" else None

@@ -213,7 +213,8 @@ for (Entries rest = reaching; rest; rest &= rest - 1) { // which of several show
         if (__float_as_int(against.w) != __float_as_int(own.w)) {
             // distances to planes that the camera crosses are negative
             const float own_distance = distance(own), other_distance = distance(against);
-            const float other_share = NEARER * copysignf(own_distance, other_distance), share = copysignf(other_distance, own_distance);
+            const float other_share = NEARER * copysignf(own_distance, other_distance);
+            const float share = copysignf(other_distance, own_distance);
             const Quad behind = {fmaf(other_share, against.x, -share * own.x), fmaf(other_share, against.y, -share * own.y),
                                  fmaf(other_share, against.z, -share * own.z), 0.0f};
             const float middle = along(behind, center), slope_x = along(behind, across), slope_y = along(behind, down);
