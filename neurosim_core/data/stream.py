@@ -324,7 +324,7 @@ def _is_other_text(path: Path) -> bool:
         try:
             CsvSource(path)
         except EventFileError as error:
-            _log.info("%s; it is left out", error)
+            _log.warning("%s; it is left out", error)
             return True
     return False
 

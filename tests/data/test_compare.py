@@ -76,7 +76,7 @@ def test_the_page(tmp_path, capsys):
     assert (picture < 200).mean() > 0.02  # it is not empty
 
 
-def test_files_with_hardly_any_events(tmp_path):
+def test_files_with_hardly_any_events(tmp_path, caplog):
     """The smallest sensor that has their pixels has no frequencies to speak of."""
     pytest.importorskip("matplotlib")
     for name, text in (("none.csv", "t,x,y,p\n"), ("one.csv", "t,x,y,p\n5,0,0,1\n")):
@@ -87,3 +87,4 @@ def test_files_with_hardly_any_events(tmp_path):
     (tmp_path / "times.txt").write_text("1\n2\n")
     assert cli.main(["compare", str(tmp_path), "--out", str(tmp_path / "page.png")]) == 0
     assert measure_events(tmp_path / "one.csv").event_count == 1
+    assert caplog.text.count("it is left out") == 3
