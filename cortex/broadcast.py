@@ -184,7 +184,8 @@ class Broadcast:
             reader.member = self._ring.add(*hello, request.strict, request.timeout_ms, sequence)
             self._readers[reader.member] = reader
             self.sends = {self._ring.send: self.send}
-            if self._expected_bytes:
+            # a message that waits may lie in a slot of this ring: then `acquire` makes them for the next
+            if self._expected_bytes and not self._back_pressure.is_waiting:
                 self._provide(self._expected_bytes, exact=True)
 
     def dismiss(self, reader: Reader) -> None:

@@ -220,6 +220,31 @@ def test_growing_while_messages_wait(node):
     assert subscriber.counters.lost == 0
 
 
+def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
+    """Its body lies in a slot: that ring is kept, and more slots are made for the next message."""
+    size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
+    publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
+    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
+    ring, count, results = publisher._fanout.ring._ring, 0, []
+    while ring.patience(64) < 0:  # less than a frame that names a slot would find
+        publisher.publish(scan(1, 3_000 if ring.patience(13_000) < 0 else 1))
+        count += 1
+    slots = ring.slots
+    thread = threading.Thread(target=lambda: results.append(publisher.publish(scan(2, size))))
+    thread.start()
+    wait_for(lambda: publisher._back_pressure.is_waiting)
+    other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
+    assert other.wait_for_publisher(timeout_s=SOON_S)
+    for _ in range(count):
+        assert subscriber.recv(SOON_S).stamp_ns == 1
+    assert subscriber.recv(SOON_S) == scan(2, size)
+    thread.join(SOON_S)
+    assert results == [True]
+    assert publisher.publish(scan(3, size))
+    assert other.recv(SOON_S) in (scan(2, size), scan(3, size))
+    assert ring.slots > slots
+
+
 def test_memory_stays_flat(node):
     """Thousands of messages, large ones among them, on both sides of one process."""
 
