@@ -312,7 +312,8 @@ def events_of(t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike) -> 
 
 def are_seconds(t: NDArray[Any]) -> bool:
     """Whether the first times of a file are seconds, if it does not say: those of microseconds are whole."""
-    return t.dtype.kind == "f" and bool((t % 1.0).any())
+    with np.errstate(invalid="ignore"):  # what is infinite is refused later
+        return t.dtype.kind == "f" and bool((t % 1.0).any())
 
 
 def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:
