@@ -106,9 +106,16 @@ class EventReader:
         checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
         held = NO_EVENTS
         for events in self._source.read():
-            if len(held.t) and len(events.t) and int(events.t.min()) < int(held.t.max()):
+            if not len(events.t):
+                continue
+            settled_us = int(events.t.max()) - _DISORDER_MAX_US  # no event of later blocks is before it
+            first_us = int(events.t.min())
+            if len(held.t) < BLOCK_EVENTS:
+                first_us = min(first_us, settled_us)
+            if len(held.t) and int(held.t.max()) > first_us:
                 both = checker.sort(join_events([held, events]))
-                held, events = both.rows(slice(len(held.t))), both.rows(slice(len(held.t), None))
+                end = int(np.searchsorted(both.t, settled_us, "right"))
+                held, events = both.rows(slice(end)), both.rows(slice(end, None))
             if len(held.t):
                 yield checker.check(held)
             held = events
@@ -305,7 +312,8 @@ def events_of(t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike) -> 
 
 def are_seconds(t: NDArray[Any]) -> bool:
     """Whether the first times of a file are seconds, if it does not say: those of microseconds are whole."""
-    return t.dtype.kind == "f" and bool((t % 1.0).any())
+    with np.errstate(invalid="ignore"):  # what is infinite is refused later
+        return t.dtype.kind == "f" and bool((t % 1.0).any())
 
 
 def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:

@@ -108,7 +108,10 @@ class Hdf5Source:
                 "recordings of Neurosim, DSEC, MVSEC, M3ED, Prophesee"
             )
         is_table = hasattr(self._events, "dtype")
-        counts = {len(self._events)} if is_table else {len(self._events[name]) for name in self._names}
+        columns = [self._events] if is_table else [self._events[name] for name in self._names]
+        if any(getattr(column, "ndim", 0) != 1 for column in columns):
+            raise EventFileError(f"{self._path}: events/t, x, y and p must be arrays of one axis")
+        counts = {len(column) for column in columns}
         self._count = min(counts)
         if "packet_count" in self._group:
             packets = int(self._group["packet_count"][()])

@@ -2,7 +2,8 @@
 
 In lockstep the engine acquires memory for a picture before it renders, the device copies the picture there,
 and to publish it copies nothing more. The memory of the topic is pinned for that. One picture of a topic at a
-time. On an H200 a picture of 640x480 follows its command after 0.44 ms, and after 0.53 ms where it is copied.
+time. On an H200 an antialiased picture of 640x480 follows its command after 0.44 ms, and after 0.53 ms where
+it is copied (`neurosim bench closed-loop --renderer warp --device cuda:0`).
 """
 
 from __future__ import annotations

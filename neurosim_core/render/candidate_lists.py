@@ -43,7 +43,7 @@ _INDEX_MAX = 2**31 - 1
 _AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 6.0e-3))
 """Least number of instants, and largest pixel [rad] for which lists pay: with fewer instants, or with fewer
 tiles of larger pixels, the search takes as long as it saves. Measured on an H200, 240x180 to 1280x720, in a
-house of 145,844 triangles and in halls of 20,000 to 2 million."""
+house of 145,844 triangles, and with tests of a third more time in halls of 20,000 to 2 million."""
 _AUTO_FACES_MAX = 7.0
 """Largest product of the number of triangles, as cut for the light, and the solid angle of a pixel [sr] for
 which lists pay. In that house it is 6.6 at 346x260, where a frame's first pass takes 11.7 us with lists and

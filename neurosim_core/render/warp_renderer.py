@@ -215,12 +215,14 @@ class WarpRenderer:
             image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
             instant_count: How many of the K instants of each world are rendered.
             bodies: Where bodies are at each of these poses; not needed without bodies.
-            active: With several worlds: 1 where a world is rendered, int32, shape [N].
+            active: With several worlds, which need it: 1 where a world is rendered, int32, shape [N].
 
         Raises:
-            ValueError: The scene has bodies and there are no poses of them.
+            ValueError: The scene has bodies and there are no poses of them, or no `active` of several worlds.
         """
         count = self._worlds.count
+        if count > 1 and active is None:
+            raise ValueError(f"render() of {count} worlds needs `active`: 1 where a world is rendered")
         pose_count = instant_count if count == 1 else count * self._stride
         if self._arrays.bodies is not None:
             if bodies is None:

@@ -220,9 +220,10 @@ def test_a_text_that_was_cut_off(tmp_path):
         assert "cut off" in reader.notes[0]
 
 
-def test_events_slightly_out_of_order(tmp_path, monkeypatch):
-    """Within blocks and across their ends; by more than 10 ms it is damage."""
-    monkeypatch.setattr("neurosim_core.io.csv._BLOCK_LINES", 50)
+@pytest.mark.parametrize("lines", [50, 3, 1])
+def test_events_slightly_out_of_order(lines, tmp_path, monkeypatch):
+    """Within blocks and across their ends, which may be shorter than 10 ms; by more it is damage."""
+    monkeypatch.setattr("neurosim_core.io.csv._BLOCK_LINES", lines)
     events, rng = draw(1000, span_us=1_000_000), np.random.default_rng(1)
     order = np.argsort(events.t + rng.integers(-4000, 4000, 1000), kind="stable")
     path = tmp_path / "events.csv"
@@ -288,12 +289,23 @@ def test_hdf5_of_whole_times(tmp_path):
 
 def test_hdf5_that_tells_nothing(tmp_path):
     path = tmp_path / "events.h5"
+
+    def write(group, name, value) -> None:
+        if not isinstance(value, dict):
+            group[name] = value
+            return
+        inner = group.create_group(name)
+        for part in value.items():
+            write(inner, *part)
+
     for name, value, words in (
         ("events", np.zeros((9, 4)), "has no events/t"),
         ("other", 1, "has no events/t"),
+        ("events", dict.fromkeys("txyp", np.zeros((9, 1))), "must be arrays of one axis"),
+        ("events", {name: {} for name in "txyp"}, "must be arrays of one axis"),
     ):
         with h5py.File(path, "w") as file:
-            file[name] = value
+            write(file, name, value)
         with pytest.raises(EventFileError, match=words):
             open_events(path)
     with h5py.File(path, "w") as file:

@@ -20,7 +20,7 @@ from neurosim_core.render.pyrender_renderer import PyrenderError
 from neurosim_core.render.raycast import raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.renderer import make_renderer, upload_scene
-from neurosim_core.render.warp_renderer import WarpRenderer
+from neurosim_core.render.warp_renderer import RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import (
     BodyConfig,
     MotionConfig,
@@ -379,5 +379,14 @@ def test_what_is_wrong_is_said():
     q = wp.zeros(1, dtype=wp.quat, device="cpu")
     with pytest.raises(ValueError, match=r"bodies move in this scene \(ball\): render\(\) needs their poses"):
         renderer.render(p, q, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
+    several = WarpRenderer(
+        upload_scene(wall(), UNSHADOWED, device="cpu"),
+        LENS,
+        outputs={"depth"},
+        instant_count=1,
+        worlds=RenderWorlds(count=2),
+    )
+    with pytest.raises(ValueError, match=r"render\(\) of 2 worlds needs `active`"):
+        several.render(p, q, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
     with pytest.raises(ValueError, match="the renderer 'synthetic' sees no bodies, and there are some: ball"):
         upload_scene(wall(), UNSHADOWED, device="cpu", renderer="synthetic", bodies=bodies)
