@@ -52,6 +52,10 @@ class LargeSender:
         if len(self._free) < FREE_MAX and kept <= max(PRIVATE_BYTES, 4 * len(memory)):
             self._free.append(memory)
 
+    def forget(self) -> None:
+        """Give back the memory of bodies that were sent; those that follow get new memory."""
+        self._free.clear()
+
     def has_room(self, pub_socket: PubSocket, size: int) -> bool:
         """Whether so many bytes more may wait."""
         self.prune()

@@ -338,6 +338,15 @@ def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
     assert tracemalloc.get_traced_memory()[1] / message.ranges.nbytes < 1.5
     tracemalloc.stop()
     assert subscriber.recv(SOON_S) == message
+    del draft
+    wait_for(lambda: publisher._fanout.large._free, SOON_S)
+
+    def is_given_back(after_s):
+        publisher.tick(time.monotonic_ns() + int(1e9 * after_s))
+        return not publisher._fanout.large._free
+
+    assert not is_given_back(after_s=1.0)
+    wait_for(lambda: is_given_back(after_s=11.0))
 
 
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
