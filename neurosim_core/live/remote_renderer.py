@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import secrets
 import threading
+import weakref
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -227,7 +228,7 @@ class RemoteRendererConfig(RendererConfig):
             raise RemoteRendererError(
                 f"nobody renders on {self.topic} (waited {self.timeout_s:g} s): start the other process first"
             )
-        return RemoteScene(
+        connected = RemoteScene(
             config=config,
             settings=self,
             device=device,
@@ -236,6 +237,10 @@ class RemoteRendererConfig(RendererConfig):
             replies=replies,
             client=secrets.randbits(63),
         )
+        # In a thread of its own: one of the node may collect the garbage. At exit nodes end by themselves.
+        ending = threading.Thread(target=node.close, name=f"end of {node.name}", daemon=True)
+        weakref.finalize(connected, ending.start).atexit = False
+        return connected
 
     @staticmethod
     def make(scene: RemoteScene, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:

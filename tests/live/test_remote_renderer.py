@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from processes import wait_for
 
 import neurosim_core as ns
 from neurosim_core.live.remote_renderer import Frames, RemoteRendererConfig, RemoteRendererError, serve_frames
@@ -74,6 +76,20 @@ def test_linear_frames_become_log_radiance_pictures_and_depth():
     assert top == pytest.approx(np.log(1.01), abs=1e-6)  # both instants, luma 1 and the dark floor
     assert renderer.depth.numpy()[0] == pytest.approx(2.0)  # the picture is of the second
     assert renderer.rgb.numpy()[0, 0, 0].tolist() == [188, 188, 188]  # 0.5 in sRGB
+
+
+def test_the_connection_ends_with_the_scene():
+    """Nothing of it stays: neither its threads nor its memory shared with the renderer."""
+
+    def threads():
+        return [thread.name for thread in threading.enumerate() if "frames of /test/end" in thread.name]
+
+    with served("/test/end", wall) as settings:
+        renderer = rendered(opened(settings), ["depth"])
+        assert threads()
+        del renderer
+        gc.collect()
+        wait_for(lambda: not threads())
 
 
 def test_8_bit_frames_are_taken_with_a_warning(caplog):
