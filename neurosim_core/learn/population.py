@@ -49,29 +49,33 @@ def train_population(
     failures = []
     with cluster(address) as ray:
         left: dict[Any, str] = {}
-        groups = {}
-        for name, config in configs.items():
-            if lacking := _lacking(ray, config, workers):
-                say(f"{name} waits: the cluster has {lacking}")
-            groups[name], trainings = _begin(ray, name, config, workers)
-            left |= dict.fromkeys(trainings, name)
-        while left:
-            (done,), _ = ray.wait([*left], num_returns=1)
-            name = left.pop(done)
-            try:
-                files, found = ray.get(done)
-            except ray.exceptions.RayError as error:
-                failures.append(name)
-                say(f"{name} failed: {error}")
-                left = {training: other for training, other in left.items() if other != name}
-            else:
-                for file, content in files.items():
-                    (folder / name).mkdir(parents=True, exist_ok=True)
-                    (folder / name / file).write_bytes(content)
-                for tested, evaluation in found.items():
-                    say(f"{name}: unseen scenes, {tested}: {evaluation}")
-            if name not in left.values():
-                ray.util.remove_placement_group(groups.pop(name))  # ends its processes
+        groups: dict[str, Any] = {}
+        try:
+            for name, config in configs.items():
+                if lacking := _lacking(ray, config, workers):
+                    say(f"{name} waits: the cluster has {lacking}")
+                groups[name], trainings = _begin(ray, name, config, workers)
+                left |= dict.fromkeys(trainings, name)
+            while left:
+                (done,), _ = ray.wait([*left], num_returns=1)
+                name = left.pop(done)
+                try:
+                    files, found = ray.get(done)
+                except ray.exceptions.RayError as error:
+                    failures.append(name)
+                    say(f"{name} failed: {error}")
+                    left = {training: other for training, other in left.items() if other != name}
+                else:
+                    for file, content in files.items():
+                        (folder / name).mkdir(parents=True, exist_ok=True)
+                        (folder / name / file).write_bytes(content)
+                    for tested, evaluation in found.items():
+                        say(f"{name}: unseen scenes, {tested}: {evaluation}")
+                if name not in left.values():
+                    ray.util.remove_placement_group(groups.pop(name))  # ends its processes
+        finally:  # after an interruption, too: those of a process stay as long as it does
+            for group in groups.values():
+                ray.util.remove_placement_group(group)
     if failures:
         raise RuntimeError(f"these trainings failed: {', '.join(failures)}; what was printed says why")
 
