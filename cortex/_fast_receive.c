@@ -61,9 +61,7 @@ static int fast_count(FastReceive *fast, PyObject *link, int64_t expected, int64
 }
 
 /* The message of a frame; NULL without error if it is something else, or does not follow. */
-static PyObject *fast_read(FastReceive *fast, PyObject *link, PyObject *frame, int64_t now_ns) {
-    const int64_t expected = number_of(link, expected_name);
-    if (expected == -1 && PyErr_Occurred()) return NULL;
+static PyObject *fast_read(FastReceive *fast, PyObject *link, PyObject *frame, int64_t expected, int64_t now_ns) {
     int64_t publish_ns;
     PyObject *message = read_expected((const Coder *)fast->coder, frame, (uint64_t)expected, &publish_ns);
     if (message == NULL || fast_count(fast, link, expected, publish_ns, now_ns)) return message;
@@ -81,12 +79,13 @@ static int fast_is_open(const FastReceive *fast, int may_wait) {
 }
 
 /* The next message; NULL without error if there is none, or a frame that `other` gets. */
-static PyObject *fast_look(FastReceive *fast, PyObject *link, PyObject *receive, int may_wait, int64_t now_ns, PyObject **other) {
+static PyObject *fast_look(FastReceive *fast, PyObject *link, PyObject *receive, int may_wait, int64_t expected, int64_t now_ns,
+                           PyObject **other) {
     if (fast_is_open(fast, may_wait) <= 0) return NULL;
     PyObject *frame = take_frame(receive, fast->again, may_wait);
     fast->exhausted = frame == NULL;
     if (frame == NULL) return NULL;
-    PyObject *message = fast_read(fast, link, frame, now_ns);
+    PyObject *message = fast_read(fast, link, frame, expected, now_ns);
     if (message == NULL && !PyErr_Occurred()) *other = frame;
     else Py_DECREF(frame);
     return message;
@@ -95,7 +94,8 @@ static PyObject *fast_look(FastReceive *fast, PyObject *link, PyObject *receive,
 /* As `fast_look`, with the lock; a frame that is something else is handed on. */
 static PyObject *fast_look_locked(FastReceive *fast, PyObject *link, PyObject *receive, int may_wait, int64_t now_ns, PyObject *other) {
     PyObject *acquired = PyObject_CallNoArgs(fast->acquire), *message = NULL;
-    if (acquired != NULL && other == NULL) message = fast_look(fast, link, receive, may_wait, now_ns, &other);
+    const int64_t expected = acquired == NULL ? -1 : number_of(link, expected_name); /* others may have read meanwhile */
+    if (!PyErr_Occurred() && other == NULL) message = fast_look(fast, link, receive, may_wait, expected, now_ns, &other);
     if (acquired != NULL && other != NULL) {
         PyObject *arguments[3] = {NULL, link, other};
         Py_XDECREF(PyObject_Vectorcall(fast->accept, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL));
@@ -120,13 +120,14 @@ static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
     if (fast->link == NULL) return Py_NewRef(fast->nothing);
     PyObject *link = Py_NewRef(fast->link), *receive = PyObject_GetAttr(link, receive_name), *message = NULL, *other = NULL;
     int is_done = receive == NULL;
-    if (!is_done && may_look_unlocked(receive, may_wait) && fast_is_alone(fast)) {
+    const int64_t expected = is_done ? -1 : number_of(link, expected_name);
+    if (expected >= 0 && fast_is_alone(fast) && may_look_unlocked(receive, may_wait, (uint64_t)expected)) {
         const int collects = PyGC_Disable();
-        message = fast_look(fast, link, receive, 0, now_ns, &other);
+        message = fast_look(fast, link, receive, 0, expected, now_ns, &other);
         if (collects) PyGC_Enable();
         is_done = message != NULL || PyErr_Occurred() || (other == NULL && !may_wait);
     }
-    if (!is_done) message = fast_look_locked(fast, link, receive, may_wait, now_ns, other);
+    if (!is_done && !PyErr_Occurred()) message = fast_look_locked(fast, link, receive, may_wait, now_ns, other);
     Py_XDECREF(receive);
     Py_DECREF(link);
     return message != NULL || PyErr_Occurred() ? message : Py_NewRef(fast->nothing);

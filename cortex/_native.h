@@ -33,9 +33,10 @@ extern PyTypeObject SocketType;
    without the GIL, for as long as the socket's RCVTIMEO says. */
 PyObject *socket_take(PyObject *socket, int may_wait);
 
-/* Whether `receive` is one of ours, so that a look without waiting runs no Python code; if one would wait after it, also whether
-   there is something to be found: to look twice costs more than the lock. */
-int may_look_unlocked(PyObject *receive, int may_wait);
+/* Whether to look without the lock: `receive` is that of a ring, which runs no Python code, and what comes next is the message
+   that is expected, or nothing if one would not wait for it. Another frame is for Python code, before which somebody may get the
+   lock who already waits for it, and take what follows. */
+int may_look_unlocked(PyObject *receive, int may_wait, uint64_t expected);
 
 /* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);

@@ -267,12 +267,19 @@ static PyTypeObject RingReaderType = {
     .tp_getset = reader_properties,
 };
 
-int may_look_unlocked(PyObject *receive, int may_wait) {
-    PyObject *self = PyCFunction_CheckExact(receive) ? PyCFunction_GET_SELF(receive) : NULL;
-    if (self == NULL || !Py_IS_TYPE(self, &RingReaderType)) return self != NULL && Py_IS_TYPE(self, &SocketType) && !may_wait;
-    const RingReader *reader = (const RingReader *)self;
-    if (may_wait && (reader->ring.ring == NULL || !cortex_reader_has_more(&reader->ring))) return 0;
-    return may_look_unlocked(reader->receive, 0);
+int may_look_unlocked(PyObject *receive, int may_wait, uint64_t expected) {
+    RingReader *reader = PyCFunction_CheckExact(receive) ? (RingReader *)PyCFunction_GET_SELF(receive) : NULL;
+    if (reader == NULL || !Py_IS_TYPE(reader, &RingReaderType) || !reader->open || reader->ring.ring == NULL) return 0;
+    const uint8_t *frame;
+    uint64_t sequence;
+    const int64_t size = cortex_reader_peek(&reader->ring, &frame);
+    if (size == 0) {
+        PyObject *socket = PyCFunction_CheckExact(reader->receive) ? PyCFunction_GET_SELF(reader->receive) : NULL;
+        return !may_wait && socket != NULL && Py_IS_TYPE(socket, &SocketType);
+    }
+    if (size < HEADER_SIZE) return 0;
+    memcpy(&sequence, frame + HEAD_SIZE, sizeof sequence);
+    return sequence == expected;
 }
 
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait) {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+import time
 from collections import deque
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +18,7 @@ from cortex.codec import codec_of, coder_of
 from cortex.compiled import native
 from cortex.fast_receive import NOTHING, make_fast_receive
 from cortex.fast_send import make_fast_send
+from cortex.policy import reliable
 from cortex.receive_lock import ReceiveLock
 from cortex.stats import SubscriberCounters
 from cortex.wire import MESSAGE, REST, message_head
@@ -177,3 +180,34 @@ def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
     thread.join()
     assert got == [1]
     assert subscriber.counters.received == 2
+
+
+@pytest.mark.parametrize("size", [3, 50_000], ids=["small", "in a slot"])
+def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, monkeypatch, size):
+    """It gets the lock before it gets the GIL, while another thread finds a frame that takes more care."""
+    publisher = node.publisher("/gap", Scan)
+    subscriber = node.subscriber("/gap", Scan, policy=reliable(64))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
+    interval, got = sys.getswitchinterval(), []
+    for number in range(3):
+        publisher.publish(make(Scan, number, size))
+        subscriber.recv(SOON_S)
+    subscriber._links[0].expected -= 2  # as if two had been lost
+    for number in (3, 4):
+        publisher.publish(make(Scan, number, size))
+    thread = threading.Thread(target=lambda: got.append(subscriber.recv(SOON_S)))
+    sys.setswitchinterval(5.0)
+    try:
+        with subscriber._lock:
+            thread.start()
+            time.sleep(0.1)
+        until_s = time.monotonic() + 0.05
+        while time.monotonic() < until_s:
+            pass
+        got.append(subscriber.recv(SOON_S))
+    finally:
+        sys.setswitchinterval(interval)
+    thread.join()
+    assert sorted(message.stamp_ns for message in got) == [3, 4]
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (2, 0)

@@ -28,10 +28,6 @@ static inline void cortex_reader_skip(CortexReader *reader) {
     cortex_reader_move(reader, best <= reader->tail || best > head ? head : best);
 }
 
-static inline int cortex_reader_has_more(const CortexReader *reader) {
-    return reader->seen != reader->tail || __atomic_load_n(&reader->ring->head, __ATOMIC_RELAXED) != reader->tail;
-}
-
 /* The next frame where it lies, to be copied before `cortex_reader_finish`; 0 if there is none, -1 if none will come, see `state`. */
 static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **frame) {
     while (reader->state == CORTEX_SOUND) {
