@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import inspect
 import pkgutil
 import sys
 import tempfile
@@ -123,12 +124,19 @@ def build(module: wp.Module) -> tuple[str, float]:
     return module.name, time.perf_counter() - begin
 
 
+def is_on_cpu(kernel: wp.Kernel) -> bool:
+    """Return whether a kernel casts rays by Embree, as only CPUs do, in native code of their compiler."""
+    terms = inspect.getclosurevars(kernel.func).nonlocals.get("terms")
+    return isinstance(terms, RenderTerms) and bool(terms.embree)
+
+
 def main() -> int:
     """Build all modules of the package; return the exit status."""
     wp.config.log_level = wp.LOG_WARNING
     make_kernels()
-    kernels = (thing for thing in gc.get_objects() if isinstance(thing, wp.Kernel))
-    modules = {k.module.name: k.module for k in kernels if k.func.__module__.startswith("neurosim_core")}
+    kernels = [thing for thing in gc.get_objects() if isinstance(thing, wp.Kernel)]
+    ours = [kernel for kernel in kernels if kernel.func.__module__.startswith("neurosim_core")]
+    modules = {kernel.module.name: kernel.module for kernel in ours if not is_on_cpu(kernel)}
     failed = 0
     with ThreadPoolExecutor(2) as pool:
         longest_first = sorted(modules, key=lambda name: (".integrator." not in name, name))
