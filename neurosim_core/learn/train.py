@@ -282,7 +282,7 @@ def default_config(
     if not cuda:
         few: dict[str, Any] = {
             "worlds": 64,
-            "iterations": 200,
+            "iterations": 180,
             "updates": 8,
             "replay": 20,
             "learning_rate": 2e-3,
