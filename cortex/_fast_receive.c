@@ -106,14 +106,6 @@ static PyObject *fast_look_locked(FastReceive *fast, PyObject *link, PyObject *r
     return message;
 }
 
-/* Whether nobody has the lock: others need the GIL to take it. */
-static int fast_is_alone(const FastReceive *fast) {
-    PyObject *locked = PyObject_CallNoArgs(fast->locked);
-    if (locked == NULL) PyErr_Clear();
-    Py_XDECREF(locked);
-    return locked == Py_False;
-}
-
 /* The next message, or `nothing`; NULL with an error set. The time may have passed a little. The lock is not taken where it
    is free and no Python code runs, that of the garbage collector included. */
 static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
@@ -121,7 +113,7 @@ static PyObject *fast_take(FastReceive *fast, int may_wait, int64_t now_ns) {
     PyObject *link = Py_NewRef(fast->link), *receive = PyObject_GetAttr(link, receive_name), *message = NULL, *other = NULL;
     int is_done = receive == NULL;
     const int64_t expected = is_done ? -1 : number_of(link, expected_name);
-    if (expected >= 0 && fast_is_alone(fast) && may_look_unlocked(receive, may_wait, (uint64_t)expected)) {
+    if (expected >= 0 && is_free(fast->locked) && may_look_unlocked(receive, may_wait, (uint64_t)expected)) {
         const int collects = PyGC_Disable();
         message = fast_look(fast, link, receive, 0, expected, now_ns, &other);
         if (collects) PyGC_Enable();

@@ -98,10 +98,7 @@ static int fast_write_frame(FastSend *fast, PyObject *message, Py_ssize_t size, 
 static int fast_send_unlocked(FastSend *fast, PyObject *message) {
     const int64_t now_ns = monotonic_ns();
     if (now_ns >= fast->refresh_ns || !fast_has_ring_only(fast)) return 0;
-    PyObject *locked = PyObject_CallNoArgs(fast->locked);
-    if (locked == NULL) PyErr_Clear();
-    Py_XDECREF(locked);
-    const Py_ssize_t size = locked == Py_False ? measure_body(fast->coder, message) : -1;
+    const Py_ssize_t size = is_free(fast->locked) ? measure_body(fast->coder, message) : -1;
     return size >= 0 && size <= fast->limit && fast_write_frame(fast, message, size, now_ns);
 }
 

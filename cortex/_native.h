@@ -63,6 +63,15 @@ static inline PyObject *none_or_error(PyObject *made) {
     Py_RETURN_NONE;
 }
 
+/* Whether `locked` of a lock says that nobody has it. Who waits for it may have got it already, but runs no code before it has
+   the GIL, too. */
+static inline int is_free(PyObject *locked) {
+    PyObject *answer = PyObject_CallNoArgs(locked);
+    if (answer == NULL) PyErr_Clear();
+    Py_XDECREF(answer);
+    return answer == Py_False;
+}
+
 /* Give back a lock that is ours; keeps the error that is set, if one is. */
 static inline void give_back(PyObject *release) {
     PyObject *type, *value, *traceback;

@@ -23,6 +23,7 @@ from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.bodies import Body
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
+from neurosim_core.scene.normals import edge_keys
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import unique_name
 
@@ -286,7 +287,7 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
     corner, others = place[mesh.faces], ((1, 2), (2, 0), (0, 1))
     first, last = corner[:, (1, 2, 0)].reshape(-1), corner[:, (2, 0, 1)].reshape(-1)
-    key = np.minimum(first, last) << 32 | np.maximum(first, last)
+    key = edge_keys(first, last)
     order = np.argsort(key, kind="stable")
     same = key[order[1:]] == key[order[:-1]]
     one, other = order[:-1][same], order[1:][same]

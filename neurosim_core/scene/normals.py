@@ -10,6 +10,11 @@ CREASE_RAD = 0.7
 """Edges whose faces differ by more than this stay sharp [rad]; 40 degrees."""
 
 
+def edge_keys(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a number for each edge, whichever end is named first, of the numbers of its ends, below 2^31."""
+    return np.minimum(one, other) << 32 | np.maximum(one, other)
+
+
 def smooth_normals(
     positions: NDArray[np.float64], faces: NDArray[np.int64], group: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -50,7 +55,7 @@ def smooth_normals(
     tail = np.arange(faces.size)
     head = tail + 1 - 3 * (tail % 3 == 2)
     at = point[faces].reshape(-1)
-    edge_key = np.minimum(at, at[head]) << 32 | np.maximum(at, at[head])
+    edge_key = edge_keys(at, at[head])
     sorted_edges = np.argsort(edge_key, kind="stable")
     first, second = sorted_edges[:-1], sorted_edges[1:]
     gentle = edge_key[first] == edge_key[second]
