@@ -50,15 +50,6 @@ struct Entries { // a bit for each; those of one of two instants have room in th
         return entry;
     }
 };
-auto is_seen = [&](int face, int number) { // whether it is among the first ones; behind them there are none
-    bool found = false;
-#pragma unroll 1
-    for (int entry = 0; entry < number; entry += 4) {
-        const int4 four = *(const int4*)(seen + entry);
-        found |= four.x == face | four.y == face | four.z == face | four.w == face;
-    }
-    return found;
-};
 #include "edge_functions.cuh"
 auto along = [](const Quad& function, const wp::vec3& toward) {
     return fmaf(function.x, toward[0], fmaf(function.y, toward[1], function.z * toward[2]));
@@ -82,6 +73,27 @@ const int* const first_row = faces.data + (size_t)instant * height * width;
 for (int entry = pixel; entry < room; entry += 16) seen[entry] = -1;
 __syncwarp();
 int count = 0, parts[3], wholes[3];
+auto is_seen = [&](int face) {
+    bool found = false;
+#pragma unroll 1
+    for (int entry = 0; entry < wp::min(count, room); entry += 4) { // behind the last one there is none
+        const int4 four = *(const int4*)(seen + entry);
+        found |= four.x == face | four.y == face | four.z == face | four.w == face;
+    }
+    return found;
+};
+auto add = [&](int face, int part) { // those of the threads that are not -1, in their order, and each once
+    const unsigned same = __match_any_sync(ALL, face) & ours;
+    const bool added = face >= 0 && __ffs(same) - 1 == lane;
+    const unsigned additions = __ballot_sync(ALL, added) & ours;
+    const int entry = count + __popc(additions & below);
+    if (added && entry < room) {
+        seen[entry] = face;
+        part_of[entry] = part;
+    }
+    count += __popc(additions);
+    __syncwarp();
+};
 bool sky = false;
 #pragma unroll
 for (int turn = 0; turn < 3; ++turn) {
@@ -94,21 +106,12 @@ for (int turn = 0; turn < 3; ++turn) {
 for (int turn = 0; turn < 3; ++turn) wholes[turn] = parts[turn] >= 0 ? scene.whole_of_face.data[parts[turn]] : -1;
 #pragma unroll 1
 for (int turn = 0; turn < 3; ++turn) {
-    const int face = wholes[0], part = parts[0];
+    const int face = wholes[0] >= 0 && is_seen(wholes[0]) ? -1 : wholes[0], part = parts[0];
     wholes[0] = wholes[1];
     wholes[1] = wholes[2];
     parts[0] = parts[1];
     parts[1] = parts[2];
-    const unsigned same = __match_any_sync(ALL, face) & ours;
-    const bool added = face >= 0 && __ffs(same) - 1 == lane && !is_seen(face, wp::min(count, room));
-    const unsigned additions = __ballot_sync(ALL, added) & ours;
-    const int entry = count + __popc(additions & below);
-    if (added && entry < room) {
-        seen[entry] = face;
-        part_of[entry] = part;
-    }
-    count += __popc(additions);
-    __syncwarp();
+    add(face, part);
 }
 bool full = count > (alone ? room : room / 2); // there are more than have room, or so many that more are going to be found
 count = full ? 0 : count;
@@ -201,25 +204,15 @@ for (int begin = 0; more;) {
         int beyond = -1;
         if (!full && base + member < 3 * number && (crossings >> side) & 1u)
             beyond = scene.whole_neighbor.data[3 * (size_t)seen[begin + at] + side];
-        if (beyond >= 0 && !is_seen(beyond, count)) {
+        if (beyond >= 0 && !is_seen(beyond)) {
             const Quad edge = block.function[side][16 * half + at];
             const float function[3] = {edge.x, edge.y, edge.z};
             if (!is_beyond(beyond, function)) beyond = -1;
         } else {
             beyond = -1;
         }
-        for (unsigned waiting; (waiting = __ballot_sync(ALL, beyond >= 0)) != 0u;) {
-            const int next = __ffs(waiting & ours) - 1, face = __shfl_sync(ALL, beyond, next & 31);
-            if (next < 0) continue;
-            full |= count == room;
-            if (lane == next && !full) {
-                seen[count] = face;
-                part_of[count] = -1 - face;
-            }
-            count += !full;
-            if (beyond == face || full) beyond = -1;
-        }
-        __syncwarp();
+        add(beyond, -1 - beyond);
+        full |= count > room;
     }
     begin += number;
     if (full) count = begin = 0;
