@@ -13,6 +13,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -231,11 +232,17 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
             say(**getattr(peer, words.pop("do"))(**words))
 
 
-def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float) -> None:
-    """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked."""
+def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float, count_file: str = "") -> None:
+    """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked.
+
+    With a file of 8 bytes it begins once somebody reads, and keeps there how many it has published.
+    """
     with Node("endless publisher") as node, node.publisher(topic, Block) as publisher:
         say(pid=os.getpid())
         blocks = [make_block(0, size) for size in sizes]
+        counts = np.memmap(count_file, np.uint64) if count_file else np.zeros(1, np.uint64)
+        if count_file:
+            publisher.wait_for_subscribers(timeout_s=60.0)
         number = 0
         next_s = time.monotonic()
         while True:
@@ -246,6 +253,7 @@ def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float) -> None:
             block = blocks[number % len(blocks)]
             publisher.publish(Block(number, block.check, block.data))
             number += 1
+            counts[0] = number
             next_s += 1.0 / rate_hz
             time.sleep(max(next_s - time.monotonic(), 0.0))
 
@@ -279,13 +287,25 @@ def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
             del kept[: len(kept) - keep]
 
 
+ROLES: dict[str, Callable[..., None]] = {
+    "peer": as_peer,
+    "endless_publisher": as_endless_publisher,
+    "endless_subscriber": as_endless_subscriber,
+}
+
+
+def forked(role: str, arguments: dict[str, Any], directory: str, *streams: Connection) -> None:
+    """In a process that was forked: what `main` does, with these standard streams."""
+    os.environ["CORTEX_RUNTIME_DIR"] = directory
+    for number, stream in enumerate(streams):
+        os.dup2(stream.fileno(), number)
+        stream.close()
+    sys.stdin, sys.stdout, sys.stderr = (os.fdopen(number, mode) for number, mode in enumerate("rww"))
+    ROLES[role](**arguments)
+
+
 def main() -> None:
-    roles: dict[str, Callable[..., None]] = {
-        "peer": as_peer,
-        "endless_publisher": as_endless_publisher,
-        "endless_subscriber": as_endless_subscriber,
-    }
-    roles[sys.argv[1]](**json.loads(sys.argv[2]))
+    ROLES[sys.argv[1]](**json.loads(sys.argv[2]))
 
 
 if __name__ == "__main__":
