@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import cortex
+import cortex.node
 from cortex import Array, Node, Policy, UInt32
 from cortex.message import message
 
@@ -123,16 +124,23 @@ class Peer:
         return {"ok": self.subscribers[topic].wait_for_publisher(60.0)}
 
     def publish(
-        self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0
+        self,
+        topic: str,
+        count: int,
+        start: int = 0,
+        size: int = 0,
+        rate_hz: float = 0.0,
+        sizes: list[int] | None = None,
     ) -> dict[str, Any]:
         """Publish numbered messages; says how many were delivered, and the longest time that one took."""
+        sizes = sizes or [size]
         publisher = self.publishers[topic]
         delivered, longest_s, begin_s = 0, 0.0, time.monotonic()
         for k in range(count):
             if rate_hz:
                 while time.monotonic() < begin_s + k / rate_hz:
                     time.sleep(100e-6)
-            made = make(publisher.codec.type, start + k, size)
+            made = make(publisher.codec.type, start + k, sizes[k % len(sizes)])
             before_s = time.monotonic()
             delivered += publisher.publish(made)
             longest_s = max(longest_s, time.monotonic() - before_s)
@@ -210,12 +218,15 @@ class Peer:
             return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
 
 
-def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = None, **options: Any) -> None:
-    """Does what it is told until its input ends."""
+def node_at(name: str, host: str = "", **options: Any) -> Node:
+    """A node, of another host if that is named."""
     if host:
-        import cortex.node
-
         cortex.node.host_id = lambda: host
+    return Node(name, **options)
+
+
+def as_peer(name: str = "peer", limit_file_bytes: int | None = None, **options: Any) -> None:
+    """Does what it is told until its input ends."""
     if limit_file_bytes is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_file_bytes, limit_file_bytes))
     if "keys" in options:
@@ -224,7 +235,7 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
         from cortex.security import load_keys
 
         options["keys"] = load_keys(Path(options["keys"]))
-    with Node(name, **options) as node:
+    with node_at(name, **options) as node:
         peer = Peer(node)
         say(node=node.id)
         for line in sys.stdin:
@@ -232,12 +243,14 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
             say(**getattr(peer, words.pop("do"))(**words))
 
 
-def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float, count_file: str = "") -> None:
+def as_endless_publisher(
+    topic: str, sizes: list[int], rate_hz: float, count_file: str = "", **place: Any
+) -> None:
     """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked.
 
     With a file of 8 bytes it begins once somebody reads, and keeps there how many it has published.
     """
-    with Node("endless publisher") as node, node.publisher(topic, Block) as publisher:
+    with node_at("endless publisher", **place) as node, node.publisher(topic, Block) as publisher:
         say(pid=os.getpid())
         blocks = [make_block(0, size) for size in sizes]
         counts = np.memmap(count_file, np.uint64) if count_file else np.zeros(1, np.uint64)
@@ -258,10 +271,11 @@ def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float, count_fil
             time.sleep(max(next_s - time.monotonic(), 0.0))
 
 
-def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
+def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0, **place: Any) -> None:
     """Receives and checks blocks until its input ends; says what has come when asked."""
     kept: list[Block] = []
-    with Node("endless subscriber") as node, node.subscriber(topic, Block, policy=policy_of(policy)) as sub:
+    node = node_at("endless subscriber", **place)
+    with node, node.subscriber(topic, Block, policy=policy_of(policy)) as sub:
         say(pid=os.getpid())
         torn = count = 0
         while True:
