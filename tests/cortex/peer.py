@@ -213,9 +213,14 @@ class Peer:
         return {"count": self.served_count}
 
     def memory(self) -> dict[str, Any]:
-        """Resident memory now, and what a ring may use is part of it."""
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
+        """See `memory`."""
+        return memory()
+
+
+def memory() -> dict[str, int]:
+    """Resident memory now, and what a ring may use is part of it."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
 
 
 def node_at(name: str, host: str = "", **options: Any) -> Node:
