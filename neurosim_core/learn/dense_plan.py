@@ -20,7 +20,8 @@ from typing import Any
 from neurosim_core.config import SimulationConfig
 from neurosim_core.render.launch import core_count, limit_cores
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
-from neurosim_core.trajectory import Path, make_path
+from neurosim_core.sim.model import plan_path
+from neurosim_core.trajectory import Path
 from neurosim_core.warp_start import start_warp
 
 _PROCESSES_MAX = 8
@@ -100,8 +101,7 @@ def _paths(flights: Sequence[SimulationConfig]) -> list[Path] | ValueError:
     for flight in flights:
         try:
             space = _free_space(flight.scene, flight.free_space)
-            vehicle = flight.vehicle.airframe()
-            paths.append(make_path(flight.path, space, vehicle, duration_s=flight.duration_s))
+            paths.append(plan_path(flight, space))
         except ValueError as error:
             return error
     return paths
