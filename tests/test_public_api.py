@@ -18,7 +18,7 @@ def test_every_public_name_is_there(name):
 
 
 def test_examples_and_documents_need_no_other_import():
-    """Their two exceptions: parameters under RotorPy's names, and a function that has the name of its module."""
+    """Two exceptions: parameters under RotorPy's names, and a function that is named as its module."""
     root = Path(__file__).parents[1]
     files = [root / "README.md", *root.glob("docs/**/*.md"), *root.glob("examples/*.py")]
     wanted = {
