@@ -2,7 +2,8 @@
 
 An answer carries CLOCK_REALTIME of the registry's host, and was made at some moment between question and
 answer: half the round trip is the largest error. Of each second the quickest answer counts, and a line
-through those of a minute gives the drift. The clocks of the hosts need not agree, and may be set.
+through those of a minute gives the drift. The clocks of the hosts need not agree, and may be set. With a
+registry on this host, or none, time is CLOCK_REALTIME itself.
 """
 
 from __future__ import annotations
@@ -42,9 +43,14 @@ class _Sample(NamedTuple):
 
 
 class ClockEstimate:
-    """What a node knows of the time of the registry's host; `add` belongs to one thread."""
+    """What a node knows of the time of the registry's host; `add` belongs to one thread.
 
-    def __init__(self) -> None:
+    Args:
+        local: Whether that is this host: then `add` and `forget` must not be called.
+    """
+
+    def __init__(self, *, local: bool) -> None:
+        self.local = local
         self._samples: deque[_Sample] = deque(maxlen=WINDOWS)
         self._window_ns = 0
         self._line = (time.monotonic_ns(), time.time_ns() - time.monotonic_ns(), 0.0)
@@ -91,11 +97,15 @@ class ClockEstimate:
 
     def offset_ns(self, now_ns: int) -> int:
         """CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one, which is given [ns]."""
+        if self.local:
+            return time.time_ns() - time.monotonic_ns()
         at_ns, offset_ns, drift = self._line
         return offset_ns + round(drift * (now_ns - at_ns))
 
     def clock(self) -> Clock | None:
         """Return this host's clock beside that of the registry's host; None: it has not answered yet."""
+        if self.local:
+            return Clock(0, 0, 0.0)
         samples = list(self._samples)
         if not samples:
             return None

@@ -91,7 +91,7 @@ class Directory:
         """The other nodes' records, by node."""
         self.rejected = 0
         """Control frames that were malformed."""
-        self.clock = ClockEstimate()
+        self.clock = ClockEstimate(local=not registry.startswith("tcp://"))
         self._context = context
         self._domain = domain
         self._record = record
@@ -173,8 +173,8 @@ class Directory:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
                 message, header = parse_control(frames[0], self._link_types)
-                if isinstance(message, Alive) and self._is_timed(header, now_ns):
-                    self.clock.add(header.sequence, header.publish_ns, now_ns)
+                if isinstance(message, Alive):
+                    self._read_clock(header, now_ns)
                 self._on_message(link, message, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
@@ -282,15 +282,16 @@ class Directory:
         else:
             self._on_changed(link, message)
 
-    @staticmethod
-    def _is_timed(header: Header, now_ns: int) -> bool:
-        return 0 < header.sequence < now_ns and 0 < header.publish_ns < CLOCK_OFFSET_MAX_NS
+    def _read_clock(self, header: Header, now_ns: int) -> None:
+        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < CLOCK_OFFSET_MAX_NS
+        if is_told and not self.clock.local:
+            self.clock.add(header.sequence, header.publish_ns, now_ns)
 
     def _on_welcome(self, link: DirectoryLink, welcome: Welcome, now_ns: int) -> None:
         if len(welcome.nodes) != len(welcome.revisions):
             raise MalformedMessage("a welcome with lists of different lengths")
         link.greet(now_ns)
-        if welcome.epoch != link.epoch:
+        if welcome.epoch != link.epoch and not self.clock.local:
             self.clock.forget()
         self._revive_ns, self._revive_wait_ns = 0, _REVIVE_FIRST_NS
         link.epoch, link.version = welcome.epoch, welcome.version

@@ -287,7 +287,7 @@ class Directory {
 
   void read_clock(const wire::Header& header, std::int64_t now_ns) noexcept {
     const auto asked_ns = static_cast<std::int64_t>(header.sequence);
-    if (asked_ns <= 0 || asked_ns > now_ns || header.publish_ns <= 0) return;
+    if (!net::is_tcp(address_) || asked_ns <= 0 || asked_ns > now_ns || header.publish_ns <= 0) return;
     const std::int64_t trip_ns = now_ns - asked_ns;
     trip_limit_ns_ += trip_limit_ns_ / 16;  // clocks drift: what was quick once does not count for ever
     if (trip_ns > trip_limit_ns_) return;
