@@ -17,10 +17,12 @@ import numpy as np
 WINDOW_NS = 1_000_000_000
 """Of so much time the quickest answer counts."""
 WINDOWS = 64
-DRIFT_WINDOWS = 8
+DRIFT_WINDOWS = 16
 """A drift is estimated from so many windows on."""
 JITTER_NS = 20_000
 """Answers that took so much longer than the quickest count half in the line."""
+DRIFT_ERROR_MAX = 20e-6
+"""A drift is used once its standard error is smaller."""
 DRIFT_MAX = 500e-6
 """No two clocks of computers run further apart than this."""
 
@@ -33,7 +35,7 @@ class Clock(NamedTuple):
     error_ns: int
     """How wrong `ahead_ns` can be: half of the quickest round trip [ns]."""
     drift_ppm: float | None
-    """How much faster this host's clock runs; None: not known before eight seconds."""
+    """How much faster this host's clock runs; None: not known to 20 ppm yet, which takes 16 s and more."""
 
 
 class _Sample(NamedTuple):
@@ -53,6 +55,7 @@ class ClockEstimate:
         self.local = local
         self._samples: deque[_Sample] = deque(maxlen=WINDOWS)
         self._window_ns = 0
+        self._has_drift = False
         self._line = (time.monotonic_ns(), time.time_ns() - time.monotonic_ns(), 0.0)
         """A time by CLOCK_MONOTONIC, the offset then, and how much it grows in a nanosecond."""
 
@@ -82,14 +85,15 @@ class ClockEstimate:
 
     def _fit(self) -> None:
         best = min(self._samples, key=lambda sample: sample.trip_ns)
-        self._line = (best.at_ns, best.offset_ns, 0.0)
+        self._line, self._has_drift = (best.at_ns, best.offset_ns, 0.0), False
         if len(self._samples) >= DRIFT_WINDOWS:
             times, offsets, trips = (
                 np.array([sample[k] - best[k] for sample in self._samples], np.float64) for k in range(3)
             )
-            drift, offset_ns = np.polyfit(times, offsets, 1, w=1.0 / (trips + JITTER_NS))
-            if abs(drift) <= DRIFT_MAX:
+            (drift, offset_ns), spread = np.polyfit(times, offsets, 1, w=1.0 / (trips + JITTER_NS), cov=True)
+            if spread[0, 0] < DRIFT_ERROR_MAX**2 and abs(drift) <= DRIFT_MAX:
                 self._line = (best.at_ns, best.offset_ns + round(offset_ns), float(drift))
+                self._has_drift = True
 
     def forget(self) -> None:
         """Another registry answers from now on: begin anew, from where we are."""
@@ -111,5 +115,5 @@ class ClockEstimate:
             return None
         now_ns = time.monotonic_ns()
         ahead_ns = time.time_ns() - now_ns - self.offset_ns(now_ns)
-        drift = -self._line[2] * 1e6 if len(samples) >= DRIFT_WINDOWS else None
+        drift = -self._line[2] * 1e6 if self._has_drift else None
         return Clock(ahead_ns, min(sample.trip_ns for sample in samples) // 2, drift)

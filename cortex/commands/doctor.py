@@ -26,7 +26,7 @@ from cortex.security import PUBLIC_FILE, default_directory, load_keys
 
 _FILES_MIN = 1024
 _EXCHANGE_S = 20.0
-_CLOCK_S = 12.0
+_CLOCK_S = 18.0
 """Longest wait for an estimate of the drift of the clock [s]."""
 
 
@@ -49,10 +49,11 @@ def examine(options: argparse.Namespace) -> int:
         ("C module", _check_native),
         ("shared memory", _check_memory),
         ("limits", _check_limits),
-        ("CURVE", _check_curve),
+        ("CURVE", lambda: _check_curve(options)),
         ("two processes", _check_exchange),
     ]
     if options.registry not in ("auto", "off"):
+        checks[1] = ("registry", lambda: options.registry)
         checks.append(("clock", lambda: _check_clock(options)))
     faults = 0
     for name, check in checks:
@@ -123,12 +124,12 @@ def _check_limits() -> str:
     return f"{files} open files, no limit to their size"
 
 
-def _check_curve() -> str:
+def _check_curve(options: argparse.Namespace) -> str:
     if not zmq.has("curve"):
         raise Fault(
             "this libzmq has no CURVE, so tcp cannot be encrypted: `pip install pyzmq` brings one that has"
         )
-    directory = default_directory()
+    directory = options.keys or Path(os.environ.get("CORTEX_KEYS") or default_directory())
     if not (directory / PUBLIC_FILE).exists():
         return f"there; no keys in {directory} (`cortex keys new` makes some)"
     keys = load_keys(directory)

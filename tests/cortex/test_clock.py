@@ -76,6 +76,13 @@ def test_a_registry_whose_clock_is_set(step_ns):
     assert link.error_ns < 2 * 10**6
 
 
+def test_a_drift_that_is_not_known_is_not_told():
+    link = Link(ahead_ns=0, drift_ppm=0.0, delay_ns=20 * 10**6, jitter_ns=5 * 10**6)
+    link.beat(9.0)
+    assert link.estimate.clock().drift_ppm is None
+    assert link.error_ns < 5 * 10**6
+
+
 def test_a_slow_answer_moves_nothing():
     link = Link(ahead_ns=0, drift_ppm=0.0, delay_ns=10**6, jitter_ns=0)
     link.beat(20.0)
