@@ -75,7 +75,7 @@ class Info(NamedTuple):
     publish_ns: int
     """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
     latency_ns: int
-    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
+    """From `publish` to now [ns]; between hosts as good as `Node.clock` says."""
     size: int
     """Bytes of the body."""
 

@@ -389,7 +389,7 @@ class _Files:
 def _load(model: Model, is_lit: Callable[[], bool], *, rerun: bool) -> None:
     """Load what is used later while the scene is lit: kernels, then libraries as long as there is time."""
     warm_flight(model)
-    imports: list[Callable[[], object]] = [import_h5py, *([import_rerun] if rerun else []), _load_matplotlib]
+    imports: list[Callable[[], object]] = [import_h5py, *([import_rerun] if rerun else [])]
     for load in imports:
         if is_lit():
             break

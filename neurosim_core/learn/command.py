@@ -189,7 +189,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     if arguments.seeds != 1 or arguments.workers != 1:
         raise ValueError("--seeds and --workers need --ray: local, auto or host:port")
     if train(folder, config, resume=arguments.resume):
-        print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+        print(f"wrote {folder}/policy.onnx, evaluation.json and .webp; tensorboard --logdir {folder}")
     return 0
 
 
@@ -265,16 +265,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.train import evaluate_run
 
+    film = arguments.run / f"{Path(arguments.scenes).stem}.webp"
     for name, evaluation in evaluate_run(
         arguments.run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
         speed_m_s=arguments.speed,
+        film=film,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
             break
+    print(f"wrote {film}: the first of the episodes")
     return 0
 
 

@@ -26,6 +26,7 @@ from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.episodes import Randomisation
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
+from neurosim_core.learn.film import film_episode, film_sensors
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
@@ -358,6 +359,7 @@ def evaluate_run(
     device: str | None = None,
     worlds: int | None = None,
     speed_m_s: float | None = None,
+    film: Path | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does: first with events (`events`), then without (`blind`).
 
@@ -367,20 +369,22 @@ def evaluate_run(
         device: None: as in the training.
         worlds: Episodes; None: as configured.
         speed_m_s: At which all episodes begin [m/s]; None: as the task says.
+        film: Where to leave a film of the first episode, with events (.webp, .gif); None: none is made.
     """
     config = read_config(folder)
-    worlds = worlds or config.evaluation_worlds
-    task = config.make_task()
-    if speed_m_s is not None:
-        task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
-    env = make_env(
-        task,
-        worlds=worlds,
-        device=device or config.device,
-        scenes=scenes if scenes in ("seen", "unseen") else [scenes],  # type: ignore[arg-type]
-        pixels=config.pixels,
-    )
+
+    def make(**options: Any) -> Env:
+        task = config.make_task()
+        if speed_m_s is not None:
+            task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
+        return make_env(task, device=device or config.device, pixels=config.pixels, **options)
+
+    where: Any = scenes if scenes in ("seen", "unseen") else [scenes]
+    env = make(worlds=worlds or config.evaluation_worlds, scenes=where)
     policy = load_student(folder, env.device)
+    if film is not None:
+        filmed = make(worlds=1, models=env.sim.models[:1], sensors=film_sensors(env.task))
+        film_episode(filmed, student_actor(policy, filmed), film)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
         yield "blind" if blind else "events", evaluate(env, actor)
@@ -422,7 +426,7 @@ def train(
         say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
-    for name, evaluation in evaluate_run(folder):
+    for name, evaluation in evaluate_run(folder, film=folder / "evaluation.webp"):
         say(f"student, unseen scenes, {name}: {evaluation}")
         found[name] = evaluation
     values = {name: dataclasses.asdict(evaluation) for name, evaluation in found.items()}

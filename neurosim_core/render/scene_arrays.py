@@ -82,6 +82,7 @@ def upload_scene(
     )
     materials = (*scene.materials, *joined.materials)
     light: NDArray[np.float32] | None = None
+    data = SceneData()
     wp.zeros(1, device=device)  # Warp makes a device's streams at its first use, which must be in one thread
     with ThreadPoolExecutor(max_workers=3) as aside:
         packing = aside.submit(pack_textures, materials)
@@ -89,17 +90,25 @@ def upload_scene(
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
         building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
+
+        def cover() -> tuple[PackedTextures, RenderTerms]:
+            packed = packing.result()
+            terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
+            _upload_surfaces(data, scene, mesh, joined, packed, terms, device)
+            if connecting is not None:
+                _upload_wholes(data, scene, mesh, connecting.result(), device)
+            return packed, terms
+
+        covering = aside.submit(cover)
         if baked or config.exposure == "auto":
             light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
-        packed = packing.result()
+        packed, terms = covering.result()
         tree, embree = building.result()
-    terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
     material = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
         exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
-    data = SceneData()
     data.mesh = tree.id
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
@@ -107,10 +116,7 @@ def upload_scene(
     else:
         data.tree = make_ray_tree(tree)
         data.face_normal = face_normals(tree)
-    _upload_surfaces(data, scene, mesh, joined, packed, terms, device)
     _upload_light(data, scene, mesh, light, config, lamps=bool(bodies) or not baked, device=device)
-    if connecting is not None:
-        _upload_wholes(data, scene, mesh, connecting.result(), device)
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure

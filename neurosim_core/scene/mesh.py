@@ -124,7 +124,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
         across = f"{size.max():,.0f}" if size.max() > 1.0 else f"{size.max():.3g}"
         notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")
-    return Scene(
+    scene = Scene(
         name=path.stem,
         lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
@@ -135,6 +135,10 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),
         **arrays,
     )
+    for texture in (material.texture for material in scene.materials if pictures):
+        if texture is not None:
+            texture.decode()
+    return scene
 
 
 def _read(path: Path, config: MeshSceneConfig, pictures: bool) -> Source:

@@ -29,6 +29,10 @@ class Texture:
         """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
         return self._source() if callable(self._source) else self._source
 
+    def decode(self) -> None:
+        """Look at the texels now: raises what is wrong with their picture."""
+        self.srgb  # noqa: B018
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Material:

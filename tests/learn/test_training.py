@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from processes import ROOT
 
 import neurosim_core as ns
@@ -23,7 +24,7 @@ import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
-from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
+from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig  # noqa: E402
@@ -254,6 +255,29 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert slow.metrics["speed_m_s"] < 0.7 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
+
+
+def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
+    """The recording that a film is made of begins where the first world does, and goes the same way."""
+    run(tmp_path, hall)
+    scene, file = str(hall.config.scene.file), tmp_path / "flight.h5"
+    (_, evaluation), *_ = evaluate_run(tmp_path, scenes=scene, worlds=1, film=file)
+    with ns.Recording(file) as flight:
+        poses, pictures = (list(flight.packets(name)) for name in ("odometry", "rgb"))
+        assert [packet.stamp_ns for packet in poses] == [20_000_000 * step for step in range(20)]
+        assert len(pictures) == 20
+        assert pictures[0].data.shape == (220, 220, 3)
+        assert np.ptp(pictures[0].data) > 50
+        assert len(flight.events("front", 0.0, 0.4).t) > 20
+    env = ns.learn.make_env("brief-hover", worlds=3, device="cpu", scenes=[scene])
+    env.reset(seed=EPISODE_SEED)
+    np.testing.assert_allclose(poses[0].position, env.view.position[0], atol=1e-6)  # float32
+    speed_m_s = np.linalg.norm(poses[-1].velocity)  # a step before the end: at most 10 m/s2
+    assert evaluation.metrics["speed_m_s"] == pytest.approx(speed_m_s, abs=0.2)
+    film = tmp_path / "film.webp"
+    next(evaluate_run(tmp_path, scenes=scene, worlds=1, film=film))
+    with Image.open(film) as frames:
+        assert frames.n_frames == 4
 
 
 def test_a_policy_is_evaluated_where_it_was_not_trained(tmp_path, hall, monkeypatch):

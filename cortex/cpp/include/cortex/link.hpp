@@ -40,13 +40,12 @@ struct TypeId {
 class Link {
  public:
   Link(zmq::context_t& context, std::string address, std::uint64_t source, TypeId type, const Policy& policy,
-       bool local, std::int64_t clock_offset_ns, const std::function<void(zmq::socket_t&)>& secure,
+       bool local, const std::function<void(zmq::socket_t&)>& secure,
        std::shared_ptr<SubscriberCounters> counters, std::shared_ptr<net::Complaints> complaints)
       : address_(std::move(address)),
         source_(source),
         type_(type),
         policy_(policy),
-        clock_offset_ns_(clock_offset_ns),
         counters_(std::move(counters)),
         complaints_(std::move(complaints)),
         socket_(net::make_socket(context, zmq::socket_type::sub, net::is_tcp(address_),
@@ -73,6 +72,7 @@ class Link {
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }
+  std::int64_t clock_offset_ns = 0;  // what to add to the publisher's clock to read it on ours
   std::int64_t leaving_ns = 0;  // when the publisher had left and there was still something to read; 0: it is there
 
   // There may be more to read, if the publisher has left or not.
@@ -228,7 +228,7 @@ class Link {
     item.source = source_;
     item.sequence = sequence;
     item.stamp_ns = stamp_ns;
-    item.publish_ns = publish_ns + clock_offset_ns_;
+    item.publish_ns = publish_ns + clock_offset_ns;
     if (sample_++ % 8 == 0) count_latency(item.publish_ns);
     return item;
   }
@@ -343,7 +343,6 @@ class Link {
   std::uint64_t source_;
   TypeId type_;
   Policy policy_;
-  std::int64_t clock_offset_ns_;
   std::shared_ptr<SubscriberCounters> counters_;
   std::shared_ptr<net::Complaints> complaints_;
   zmq::socket_t socket_;
