@@ -75,7 +75,7 @@ class Info(NamedTuple):
     publish_ns: int
     """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
     latency_ns: int
-    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
+    """From `publish` to now [ns]; between hosts as good as `Node.clock` says."""
     size: int
     """Bytes of the body."""
 
@@ -294,7 +294,6 @@ class Link:
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
-        self._told = max(self._told, answer.sequence)
         known = self.expected >= 0
         if first and not self._use_ring():
             self.attached = False
@@ -379,7 +378,7 @@ class Link:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""
         if 0 <= self.expected < self._reached:
             self.advance(self._reached, 0)
-        if self._policy.reliable and self.expected > max(self._told, 0):
+        if self._policy.reliable and self.expected > self._told:
             self.counters.cut_off += 1
             logger.warning("%s: a publisher ended without saying how much it had sent", self.record.topic)
 

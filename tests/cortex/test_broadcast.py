@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import random
 import resource
 import select
 import socket
+import struct
 import threading
 import time
 from pathlib import Path
@@ -306,6 +308,27 @@ def test_a_reader_that_is_gone_is_forgotten(ring):
     with pytest.raises(IndexError, match="no member"):
         ring.writer.remove(member)
     assert ring.join(strict=True)[1] == member
+
+
+def test_a_reader_that_spoke_and_died_is_forgotten(ring):
+    """What it has said waits in its connection, which has ended all the same."""
+    page = os.memfd_create("page", os.MFD_ALLOW_SEALING)
+    os.ftruncate(page, 4096)
+    fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+    bell = os.eventfd(0)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(ring.path)
+        socket.send_fds(other, [b"CTXCAST3" + struct.pack("<QQ", SOURCE, 1)], [page, bell])
+        connection = native.accept(ring.listener)
+        ring.writer.add(connection, *native.hear(connection)[2:], True, 700, 5)
+        other.send(b"still here")
+        fill(ring, 1000)
+        for _ in range(2):  # of the first ring, and of the larger one
+            assert other.recv(64)[:8] == b"CTXCAST3"
+        assert ring.writer.patience(1064) == 700
+    assert takes(ring.writer, frame(0, 1000))
+    os.close(page)
+    os.close(bell)
 
 
 def test_a_reader_cannot_write_to_the_ring(ring):

@@ -381,6 +381,56 @@ def test_mvsec_has_the_ground_truth(tmp_path):
         assert np.array_equal(one.column("cam", "t"), two.column("events", "t"))
 
 
+def test_mvsec_reads_the_ground_truth_beside_its_data(tmp_path):
+    """As it is published: events and pictures in one file, depth and poses in another."""
+    flight(tmp_path / "flight.h5", draw(5000, span_us=1_999_000, begin_us=1))
+    transfer(tmp_path / "flight.h5", tmp_path / "mvsec.h5")
+    data, truth = tmp_path / "indoor1_data.hdf5", tmp_path / "indoor1_gt.hdf5"
+    with h5py.File(tmp_path / "mvsec.h5") as whole, h5py.File(data, "w") as one, h5py.File(truth, "w") as two:
+        for name in whole["davis/left"]:
+            part = two if name.startswith(("depth", "flow", "pose")) else one
+            whole.copy(f"davis/left/{name}", part.require_group("davis/left"))
+    transfer(data, tmp_path / "both.h5")
+    transfer(tmp_path / "mvsec.h5", tmp_path / "back.h5")
+    with Recording(tmp_path / "both.h5") as found, Recording(tmp_path / "back.h5") as expected:
+        assert found.sensors == expected.sensors
+        assert np.array_equal(found.column("depth", "data"), expected.column("depth", "data"))
+        assert np.array_equal(found.column("pose", "position"), expected.column("pose", "position"))
+    with pytest.raises(EventFileError, match=r"has no events: .* NAME_data\.hdf5"):
+        open_events(truth)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.h5"])
+def test_nanoseconds_that_no_file_tells(name, tmp_path, capsys):
+    """They pass for microseconds, and a note asks; the user's word counts, also for times since 1970."""
+    events = draw(20_000, span_us=4_000_000, begin_us=1_700_000_000_000_000)
+    path, t_ns = tmp_path / name, events.t * 1000 + 7
+    columns = {"t": t_ns, "x": events.x, "y": events.y, "p": events.polarity}
+    if name == "a.csv":
+        np.savetxt(path, np.stack([*columns.values()], 1).astype(np.int64), fmt="%d", delimiter=",")
+    elif name == "a.npz":
+        np.savez(path, **columns)
+    else:
+        with h5py.File(path, "w") as file:
+            file["events/t"], file["t_offset"] = t_ns - t_ns[0], t_ns[0]
+            for key in "xyp":
+                file[f"events/{key}"] = columns[key]
+    assert same(read(path, time_unit="ns"), events)
+    assert cli.main(["convert", str(path), str(tmp_path / "b.raw"), "--from-zero", "--time-unit", "ns"]) == 0
+    assert "note" not in capsys.readouterr().out
+    first_us = 1_700_000_000_000_000 if name == "a.h5" else events.t[0]  # HDF5 may have ground truth
+    assert same(read(tmp_path / "b.raw"), events._replace(t=events.t - first_us))
+    with pytest.raises(EventFileError, match="times of evt3 have a unit"):
+        open_events(tmp_path / "b.raw", time_unit="ns")
+
+
+def test_nanoseconds_from_zero_are_asked_for(tmp_path, capsys):
+    events = draw(20_000, span_us=4_000_000)
+    write(tmp_path / "a.npz", events._replace(t=events.t * 1000))
+    assert cli.main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.raw")]) == 0
+    assert "--time-unit ns" in capsys.readouterr().out
+
+
 def test_the_command(tmp_path, capsys):
     events = draw(3000, span_us=2_000_000, begin_us=7_000_000)
     write(tmp_path / "a.raw", events)
