@@ -38,7 +38,9 @@ from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
 
 MUTATIONS = 3000
-CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+HOSTILE_WRITES = int(os.environ.get("CORTEX_HOSTILE_WRITES", "100000"))
+"""Writes of a peer that writes at random; ten millions take a few minutes."""
+CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0, "cut_off": 0}
 
 __all__ = ["programs", "start"]
 
@@ -84,6 +86,18 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith(f"{len(lines)} bodies, ")
+
+
+def test_a_peer_that_writes_at_random(programs: Path, tmp_path: Path) -> None:
+    """Into a ring and its slots, a page, a bell, a connection: it hurts itself only (ASan, UBSan)."""
+    done = subprocess.run(
+        [programs / "hostile_test", tmp_path, str(HOSTILE_WRITES), "1"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S + 1e-3 * HOSTILE_WRITES,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
 def test_between_threads(programs: Path) -> None:

@@ -84,6 +84,9 @@ class Link {
   void end() {
     try {
       if (known_ && expected_ < reached_) advance(reached_, 0);
+      if (!policy_.is_reliable || !known_ || is_told_) return;
+      ++counters_->cut_off;
+      complaints_->once("cut off " + address_, "a publisher at " + address_ + " ended without saying how much it had sent");
     } catch (const MalformedMessage& error) {
       reject(error.what());
     }
@@ -208,6 +211,7 @@ class Link {
       if (policy_.is_reliable) confirm(sequence);  // the publisher may have given us up
     }
     known_ = true;
+    is_told_ = count == 0;
     expected_ = sequence + count;
     return true;
   }
@@ -347,6 +351,7 @@ class Link {
   std::uint64_t reader_ = 0;
   bool attached_ = false;
   bool known_ = false;  // whether `expected_` is
+  bool is_told_ = false;  // whether the publisher has said so after its last message
   std::uint64_t expected_ = 0;
   std::uint64_t reached_ = 0;  // the highest number below which all has been given away
   std::uint64_t sample_ = 0;
