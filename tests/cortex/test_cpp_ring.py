@@ -139,6 +139,18 @@ def test_reader_without_ring(
     assert scans.counters.lost == 0
 
 
+def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(
+    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands still, and holds up a C++ publisher after 8 MB, as one in Python."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.05))
+    with scans._receive_lock:
+        result = result_of(start("fill", "/scan", 200, 250_000))  # 1 MB each
+    # What is on its way besides: in the kernel, and one in the queue of the reader.
+    assert 8 <= result["taken"] <= 12
+
+
 @pytest.mark.parametrize("others", [0, 2])
 def test_killed_cpp_reader_that_holds_up_its_publisher(
     start: Callable[..., Peer], make_node: Callable[..., Node], others: int

@@ -304,7 +304,7 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
   while (!publisher.done) {
     const auto counters = std::make_shared<cortex::SubscriberCounters>();
     const auto complaints = std::make_shared<cortex::net::Complaints>(cortex::Log{});
-    cortex::detail::Link link(context, "ipc://" + directory + "/1.strict", source, type, policy, true, 0, [](zmq::socket_t&) {},
+    cortex::detail::Link link(context, "ipc://" + directory + "/1.strict", source, type, policy, true, [](zmq::socket_t&) {},
                               counters, complaints);
     std::deque<cortex::detail::Item> queue, held;
     std::uint64_t accepted = 0;

@@ -211,6 +211,9 @@ static inline int cortex_accept(int listener) {
     return -1;
 }
 
+/* Whether this is the magic of a ring of an older or newer kind: only the last letter differs. */
+static inline int cortex_is_other_version(uint64_t magic) { return magic != CORTEX_RING_MAGIC && !((magic ^ CORTEX_RING_MAGIC) << 8); }
+
 static inline int cortex_hear(int socket, CortexHello *hello) {
     uint64_t said[3];
     int fds[2];
@@ -224,7 +227,7 @@ static inline int cortex_hear(int socket, CortexHello *hello) {
         return 0;
     close(fds[0]);
     close(fds[1]);
-    errno = EPROTO;
+    errno = cortex_is_other_version(said[0]) ? EPROTONOSUPPORT : EPROTO;
     return -1;
 }
 
