@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import sys
 from typing import Any
 
 logger = logging.getLogger(__name__)
@@ -38,5 +39,12 @@ def _load() -> Any:
     return module
 
 
+def _require_gil() -> None:
+    """Refuse to run without the GIL, which a free-threaded Python has again once the C module is there."""
+    if not getattr(sys, "_is_gil_enabled", lambda: True)():
+        raise ImportError("cortex needs the GIL: unset PYTHON_GIL, or run python with -X gil=1")
+
+
 native: Any = _load()
 """`cortex._native`, or None."""
+_require_gil()

@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
@@ -44,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for matrices as small as here threads cost time
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
     arguments.began_s = began_s
@@ -126,7 +128,7 @@ def _add_run(commands: _Commands) -> None:
     )
     run.add_argument("--overwrite", action="store_true", help="replace a flight that is already in --out")
     run.add_argument("--no-rrd", action="store_true", help="leave out flight.rrd")
-    run.set_defaults(command=_run)
+    run.set_defaults(command=_run, computes=False)  # it starts Warp itself
 
 
 def _add_serve(commands: _Commands) -> None:
@@ -351,7 +353,13 @@ def _load(arguments: argparse.Namespace, overrides: dict[str, Any]) -> Simulatio
 def _run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    with Console(stderr=True).status("preparing: libraries"):  # on the screen before they are there
+    with (
+        Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
+        ThreadPoolExecutor(max_workers=1) as aside,
+    ):
+        from neurosim_core.warp_start import start_warp
+
+        aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
         config = _load(arguments, _overrides(arguments))
         if not arguments.print_config:
             from neurosim_core.flight import fly, new_folder

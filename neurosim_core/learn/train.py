@@ -25,7 +25,7 @@ from neurosim_core.learn import need, ranks
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.episodes import Randomisation
-from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
+from neurosim_core.learn.evaluate import Evaluation, evaluate_policy, student_actor, teacher_actor
 from neurosim_core.learn.film import film_episode, film_sensors
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
@@ -243,7 +243,7 @@ class Training:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
         assert self.teacher is not None
         env = self._trainers["teacher"].env
-        return evaluate(env, teacher_actor(self.teacher, env))
+        return evaluate_policy(env, teacher_actor(self.teacher, env))
 
 
 def prepare_torch() -> None:
@@ -385,7 +385,7 @@ def evaluate_run(
         film_episode(filmed, student_actor(policy, filmed), film)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
-        yield "blind" if blind else "events", evaluate(env, actor)
+        yield "blind" if blind else "events", evaluate_policy(env, actor)
 
 
 def train(

@@ -24,7 +24,7 @@ import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
-from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate, student_actor, teacher_actor  # noqa: E402
+from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate_policy, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig  # noqa: E402
@@ -181,10 +181,10 @@ def test_ppo_learns_to_stop(hall):
     config = dataclasses.replace(PpoConfig(), worlds=192, iterations=24)
     env = ns.learn.make_env("hover", worlds=config.worlds, device="cpu", observe=["state"], models=[hall])
     ppo = Ppo(env, config, torch.Generator().manual_seed(0))
-    before = evaluate(env, teacher_actor(ppo.policy, env))
+    before = evaluate_policy(env, teacher_actor(ppo.policy, env))
     ppo.begin(1)
     rewards = [ppo.iterate(i / config.iterations)["reward"] for i in range(config.iterations)]
-    after = evaluate(env, teacher_actor(ppo.policy, env))
+    after = evaluate_policy(env, teacher_actor(ppo.policy, env))
     assert np.mean(rewards[-3:]) > np.mean(rewards[2:6]) + 0.2
     assert after.metrics["speed_m_s"] < before.metrics["speed_m_s"]
 
@@ -235,12 +235,12 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     training = run(tmp_path, hall)
     env = ns.learn.make_env("brief-hover", worlds=6, device="cpu", models=[hall])
     policy = load_student(tmp_path, env.device)
-    first = evaluate(env, student_actor(policy, env))
-    assert first == evaluate(env, student_actor(policy, env))
+    first = evaluate_policy(env, student_actor(policy, env))
+    assert first == evaluate_policy(env, student_actor(policy, env))
     assert first.episodes == 6
     assert set(first.metrics) == {"success", "crash", "speed_m_s"}
     assert first.metrics["success"] == 0.0  # an episode is shorter than the time to hold
-    assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
+    assert first.metrics != evaluate_policy(env, student_actor(policy, env, blind=True)).metrics
     assert "0 % success (0 to 39)" in str(first)  # 1 - 1.96^2 / (6 + 1.96^2) of all might have failed
     del training
 
