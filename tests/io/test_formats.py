@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from neurosim_core import cli
+from neurosim_core.flight import rerun_file
 from neurosim_core.io import FORMATS, EventFileError, create_events, open_events
 from neurosim_core.io.transfer import transfer
 from neurosim_core.packets import EventArrays, Events, Image, ImuSample, Odometry
@@ -446,6 +447,20 @@ def test_any_event_file_can_be_viewed(tmp_path):
     write(tmp_path / "a.evt2.raw", draw(3000, span_us=200_000, begin_us=1_700_000_000_000_000))
     assert cli.main(["view", str(tmp_path / "a.evt2.raw"), "--save", str(tmp_path / "a.rrd")]) == 0
     assert (tmp_path / "a.rrd").stat().st_size > 10_000
+
+
+def test_files_of_one_stem_are_not_viewed_as_each_other(tmp_path):
+    """A Rerun file that was made before is that of one file, and of what was in it; a bag is a folder."""
+    pytest.importorskip("rerun")
+    made = []
+    for name in ("a.raw", "a.csv", "a_bag"):
+        write(tmp_path / name, draw(3000, span_us=200_000, seed=len(made)))
+        made.append(rerun_file(tmp_path / name))
+        assert rerun_file(tmp_path / name) == made[-1]
+    assert len(set(made)) == 3
+    before = made[1].stat().st_size
+    write(tmp_path / "a.csv", draw(9000, span_us=600_000))
+    assert rerun_file(tmp_path / "a.csv").stat().st_size > 1.5 * before
 
 
 @pytest.mark.parametrize("name", WRITABLE)
