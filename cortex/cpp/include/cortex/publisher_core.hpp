@@ -408,7 +408,8 @@ class PublisherCore {
 inline void PubSockets::refresh() {
   for (PubSocket* pub_socket : {&lossy, &strict}) {
     zmq::message_t event;
-    while (pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
+    const std::int64_t until_ns = monotonic_ns() + look_max_ns;  // others may send more than we can read
+    while (monotonic_ns() < until_ns && pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
       wire::AttachKey request;
       if (bytes.empty()) continue;
