@@ -45,9 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for matrices as small as here threads cost time
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
+    if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         if arguments.computes:
