@@ -10,7 +10,6 @@ import argparse
 import torch
 
 import neurosim_core as ns
-from neurosim_core.learn.evaluate import evaluate
 
 
 @ns.register("task", "climb")
@@ -62,7 +61,7 @@ def main(iterations: int) -> float:
         log = ppo.iterate(iteration / iterations)
         if iteration % 20 == 19:
             print(f"{iteration + 1}: reward {log['reward']:.2f}")
-    found = evaluate(env, ns.learn.teacher_actor(ppo.policy, env))
+    found = ns.learn.evaluate_policy(env, ns.learn.teacher_actor(ppo.policy, env))
     print(f"{found}; {found.metrics['error_m']:.2f} m from the height")
     return found.metrics["error_m"]
 

@@ -18,13 +18,13 @@ def test_every_public_name_is_there(name):
 
 
 def test_examples_and_documents_need_no_other_import():
-    """Two exceptions: parameters under RotorPy's names, and a function that is named as its module."""
+    """One exception: parameters under RotorPy's names."""
     root = Path(__file__).parents[1]
     files = [root / "README.md", *root.glob("docs/**/*.md"), *root.glob("examples/*.py")]
     wanted = {
         name for file in files for name in re.findall(r"from (neurosim_core[\w.]*) import", file.read_text())
     }
-    assert wanted <= {"neurosim_core.bench.rotorpy_peer", "neurosim_core.learn.evaluate"}
+    assert wanted == {"neurosim_core.bench.rotorpy_peer"}
 
 
 def test_an_unknown_name_is_said():

@@ -98,8 +98,8 @@ def _check_native() -> str:
 
 
 def _check_memory() -> str:
-    if not hasattr(os, "memfd_create"):
-        raise Fault(f"{sys.platform} has no memfd: large messages go through sockets, with two copies more")
+    if sys.platform != "linux":
+        return f"none, {sys.platform} has no memfd: large messages go through sockets, with two copies more"
     descriptor = os.memfd_create("cortex-doctor", os.MFD_ALLOW_SEALING)
     try:
         os.ftruncate(descriptor, 1 << 20)
@@ -181,7 +181,7 @@ def _check_exchange() -> str:
                 os.environ.pop(name, None) if value is None else os.environ.update({name: value})
     if sizes != _SIZES:
         raise Fault(f"messages of {_SIZES} bytes were sent, {sizes} have come")
-    if not any("shared memory" in carrier for carrier in carriers):
+    if sys.platform == "linux" and not any("shared memory" in carrier for carrier in carriers):
         raise Fault(f"they meet, but share no memory ({'; '.join(carriers)}): see above")
     return f"they talk by {'; '.join(carriers)}"
 

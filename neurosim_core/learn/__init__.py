@@ -23,7 +23,10 @@ if TYPE_CHECKING:  # isort: off
         Randomisation as Randomisation,
         StartConfig as StartConfig,
     )
-    from neurosim_core.learn.evaluate import teacher_actor as teacher_actor
+    from neurosim_core.learn.evaluate import (
+        evaluate_policy as evaluate_policy,
+        teacher_actor as teacher_actor,
+    )
     from neurosim_core.learn.ppo import (
         Ppo as Ppo,
         PpoConfig as PpoConfig,

@@ -173,6 +173,10 @@ def _learn(arguments: argparse.Namespace) -> int:
         teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
     if arguments.randomise is not None:
         config = dataclasses.replace(config, randomise=arguments.randomise)
+    changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
+    changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
+    if arguments.resume and changed:
+        raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")

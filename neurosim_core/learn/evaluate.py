@@ -67,7 +67,7 @@ def teacher_actor(policy: Callable[[torch.Tensor], torch.Tensor], env: Env) -> A
 
 
 @torch.no_grad()
-def evaluate(
+def evaluate_policy(
     env: Env,
     actor: Actor,
     *,
