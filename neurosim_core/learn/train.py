@@ -2,8 +2,8 @@
 
 A run is a folder: `run.json` (what was asked for), `checkpoint.pt`, TensorBoard's files, `policy.onnx` and
 `evaluation.json`. Training goes in blocks of some iterations. A block begins in all worlds anew, with a seed
-that hangs on the run's seed and the block's number, and ends with a checkpoint: a run that is resumed does
-what it would have done without the interruption, to the bit on a CPU.
+that hangs on the run's seed, the block's number and the process (`ranks`), and ends with a checkpoint: a run
+that is resumed does what it would have done without the interruption, to the bit on a CPU.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ class Training:
         self.trained_s: dict[str, float] = {}
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
-        drawn = config.make_task().training
+        task = config.make_task()
         randomise: bool | Randomisation = config.randomise != "none"
-        if config.randomise == "training" and drawn is not None:
-            randomise = drawn
+        if config.randomise == "training" and task.training is not None:
+            randomise = task.training
         self.env = make_env(
-            config.make_task(),
+            task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
@@ -123,7 +123,7 @@ class Training:
             seed=config.seed,
         )
         device = self.env.device
-        self._generator = torch.Generator(device=device).manual_seed(config.seed + ranks.rank())
+        self._generator = torch.Generator(device=device)
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
@@ -178,9 +178,6 @@ class Training:
         _check_layers(file, state, self.student)
         for stage, trainer in self._trainers.items():
             trainer.descent.load_state_dict(state[stage])
-        self._generator.set_state(state["generator"].cpu())
-        if ranks.rank() > 0:
-            self._generator.manual_seed(ranks.rank() + sum(state["done"].values()))
         self._done = state["done"]
 
     def run(self, *, until: tuple[int, int] | None = None) -> None:
@@ -208,7 +205,9 @@ class Training:
         begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
         apart = ranks.rank() * trainer.env.num_envs
-        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart)
+        seed = (self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart
+        self._generator.manual_seed(seed)
+        trainer.begin(seed)
         end = min(done + self.config.block, whole)
         sums: dict[str, list[float]] = {}
         for iteration in range(done, end):
@@ -234,7 +233,6 @@ class Training:
                 **{stage: trainer.descent.state_dict() for stage, trainer in self._trainers.items()},
                 "shape": self.student.shape,
                 "weights": self.student.state_dict(),
-                "generator": self._generator.get_state(),
                 "done": self._done,
             },
             partial,
@@ -398,7 +396,7 @@ def train(
     Args:
         folder: Where everything goes.
         config: What to do.
-        resume: Go on with the run in the folder, as it was configured.
+        resume: Go on with the run in the folder, as it was configured; only `config.wandb` counts.
         say: Told what happens, line by line.
 
     Returns:
@@ -410,7 +408,9 @@ def train(
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
     prepare_torch()
-    config = dataclasses.replace(read_config(folder) if resume else config, device=ranks.join(config.device))
+    if resume:
+        config = dataclasses.replace(read_config(folder), wandb=config.wandb)
+    config = dataclasses.replace(config, device=ranks.join(config.device))
     if config.wandb and importlib.util.find_spec("wandb") is None:
         raise ImportError("--wandb needs the package wandb: pip install wandb")
     if ranks.rank() > 0:

@@ -311,6 +311,9 @@ def test_weights_and_biases_must_be_there_before_anything_is_set_up(tmp_path, mo
     with pytest.raises(ImportError, match="--wandb needs the package wandb: pip install wandb"):
         train(tmp_path / "run", small(wandb=True))
     assert not (tmp_path / "run").exists()
+    (tmp_path / "run.json").write_text(json.dumps(dataclasses.asdict(small())))
+    with pytest.raises(ImportError, match="--wandb needs the package wandb"):  # asked for by who goes on
+        train(tmp_path, small(wandb=True), resume=True)
 
 
 def test_a_training_may_have_longer_steps(tmp_path, hall):
@@ -419,7 +422,10 @@ def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
 
 
 def test_two_processes_train_one_policy(tmp_path, hall):
-    """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
+    """They fly in different worlds and end with the same weights, to the bit, also if they are resumed.
+
+    One alone ends with others.
+    """
     pytest.importorskip("tensorboard")
     script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
@@ -434,7 +440,7 @@ def test_two_processes_train_one_policy(tmp_path, hall):
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     first, second = sorted(found, key=lambda each: each["rank"])
     alone = rank_process.train(tmp_path / "alone", hall)
-    assert first["digests"] == second["digests"]
+    assert first["digests"] == second["digests"] == first["resumed"] == second["resumed"]
     assert first["position"] != second["position"]
     assert not set(first["digests"]) & set(alone["digests"])
     assert (tmp_path / "both" / "checkpoint.pt").exists()
