@@ -59,6 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return int(arguments.command(arguments))
         except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+            if arguments.debug:
+                raise
             print(f"neurosim: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
@@ -102,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
     parser.set_defaults(computes=True)
+    parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
