@@ -235,7 +235,7 @@ class Fanout:
         """Send header and body through a socket; False if a reliable reader lost the message."""
 
         def has_room() -> bool:
-            return self.large.has_room(pub_socket, body.nbytes)
+            return self.large.has_room(pub_socket, body)
 
         if not has_room() and not (
             pub_socket.strict and self._await_room(has_room, self._timeout_s(pub_socket))

@@ -173,6 +173,10 @@ def _learn(arguments: argparse.Namespace) -> int:
         teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
     if arguments.randomise is not None:
         config = dataclasses.replace(config, randomise=arguments.randomise)
+    changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
+    changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
+    if arguments.resume and changed:
+        raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
@@ -189,7 +193,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     if arguments.seeds != 1 or arguments.workers != 1:
         raise ValueError("--seeds and --workers need --ray: local, auto or host:port")
     if train(folder, config, resume=arguments.resume):
-        print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+        print(f"wrote {folder}/policy.onnx, evaluation.json and .webp; tensorboard --logdir {folder}")
     return 0
 
 
@@ -221,10 +225,13 @@ def _measure_rate(arguments: argparse.Namespace) -> int:
 
 
 def _learn_dense(arguments: argparse.Namespace) -> int:
+    import logging
+
     import torch
 
     from neurosim_core.learn.dense_train import DenseConfig, train_dense
 
+    logging.getLogger(train_dense.__module__).setLevel(logging.INFO)  # it takes minutes: how far it has come
     device, task = arguments.device or "auto", arguments.what
     if device == "auto":
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
@@ -265,16 +272,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.train import evaluate_run
 
+    film = arguments.run / f"{Path(arguments.scenes).stem}.webp"
     for name, evaluation in evaluate_run(
         arguments.run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
         speed_m_s=arguments.speed,
+        film=film,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
             break
+    print(f"wrote {film}: the first of the episodes")
     return 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
-from neurosim_core.scene.scene import Light, LinearRgb
+from neurosim_core.scene.scene import Light, LinearRgb, extent
 
 LEVEL = 0.3
 """What the median bit of surface would reflect if it were white and faced its brightest lamp, alone."""
@@ -75,7 +75,7 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     Returns:
         Positions [m], shape [n, 3], and the end of a sentence that says what was done.
     """
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    low, high = extent(triangles)
     size = high - low
     if size[:2].min() < 2.0 or size[2] < 1.8 or size.max() > 500.0:
         return _around(low, high), "placed above and around the scene, which is no room"

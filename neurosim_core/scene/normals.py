@@ -43,7 +43,7 @@ def smooth_normals(
     point = np.empty(len(key), dtype=np.int64)
     point[order] = np.cumsum(new) - 1
 
-    corner = positions[faces]
+    corner = positions.take(faces, axis=0)
     edge = np.roll(corner, -1, axis=1) - corner
     face_normal = np.cross(edge[:, 0], edge[:, 1])
     face_normal /= np.linalg.norm(face_normal, axis=1, keepdims=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import random
 import resource
 import select
 import socket
+import struct
 import threading
 import time
 from pathlib import Path
@@ -23,7 +25,7 @@ import cortex.subscriber
 from cortex import keep_last, reliable
 from cortex.broadcast import Listener
 from cortex.compiled import native
-from cortex.wire import MESSAGE, Header, pack_header
+from cortex.wire import MESSAGE, AttachKey, Header, attach_key, message_head, pack_header
 
 pytestmark = pytest.mark.skipif(native is None, reason="no C module")
 
@@ -306,6 +308,73 @@ def test_a_reader_that_is_gone_is_forgotten(ring):
     with pytest.raises(IndexError, match="no member"):
         ring.writer.remove(member)
     assert ring.join(strict=True)[1] == member
+
+
+@contextlib.contextmanager
+def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3"):
+    """The connection of a reader, number 1, that has said hello."""
+    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0)
+    os.ftruncate(page, 4096)
+    fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(path)
+        socket.send_fds(other, [magic + struct.pack("<QQ", source, 1)], [page, bell])
+        os.close(page)
+        os.close(bell)
+        yield other
+
+
+def test_a_reader_that_spoke_and_died_is_forgotten(ring):
+    """What it has said waits in its connection, which has ended all the same."""
+    with asks_by_hand(ring.path, SOURCE) as other:
+        connection = native.accept(ring.listener)
+        ring.writer.add(connection, *native.hear(connection)[2:], True, 700, 5)
+        other.send(b"still here")
+        fill(ring, 1000)
+        for _ in range(2):  # of the first ring, and of the larger one
+            assert other.recv(64)[:8] == b"CTXCAST3"
+        assert ring.writer.patience(1064) == 700
+    assert takes(ring.writer, frame(0, 1000))
+
+
+def test_a_reader_of_another_version_gets_messages_and_it_is_said(make_node, caplog):
+    """It asks for a ring of an older kind."""
+    publisher = make_node().publisher("/numbers", Number)
+    address = publisher._pub_sockets._pub_sockets[0].socket.last_endpoint.decode()
+    key = attach_key(AttachKey(publisher.source, 1, True, False, 10, 0), stamped=True)
+    path = address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
+    context = zmq.Context()
+    with asks_by_hand(path, publisher.source, b"CTXCAST2"), context.socket(zmq.SUB) as other:
+        other.connect(address)
+        for each in (message_head(MESSAGE, publisher.source, publisher.codec.fingerprint, stamped=True), key):
+            other.subscribe(each)
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        wait_for(lambda: "a subscriber with another version of cortex" in caplog.text)
+        publisher.publish(Number(1, 2))
+        assert other.recv()[:32] == key
+        assert other.recv()[3:4] == MESSAGE
+    context.term()
+
+
+def test_a_publisher_of_another_version_is_heard_and_it_is_said(make_node, monkeypatch, caplog):
+    """It closes the connection of who asks for a ring that it does not know."""
+    take, asked = Listener.take, []
+
+    def close(self, source, reader):
+        asked.append(reader)
+        take(self, source, reader).close()
+
+    monkeypatch.setattr(Listener, "take", close)
+    node = make_node()
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable())
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher.publish(Number(1, 2))
+    assert subscriber.recv(SOON_S) == Number(1, 2)
+    assert subscriber.wait_for_publisher(SOON_S)
+    assert subscriber.carriers == ["ipc"]
+    assert caplog.text.count("another version of cortex") == 1
+    assert len(asked) == 1
 
 
 def test_a_reader_cannot_write_to_the_ring(ring):

@@ -349,6 +349,22 @@ def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
     wait_for(lambda: is_given_back(after_s=11.0))
 
 
+def test_a_small_body_in_memory_of_a_larger_one_counts_as_that(node, monkeypatch):
+    """What waits for a reliable reader is bounded by the memory that it takes."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
+    large = publisher._fanout.large
+    bodies = [large.acquire(4_000_000) for _ in range(8)]
+    bodies.clear()
+    assert len(large._free) == 8
+    with subscriber._receive_lock:
+        for _ in range(10):
+            publisher.publish(scan(0, 300_000))  # 1.2 MB
+    held = sum(large._lent.values())
+    assert 0 < held <= large.waiting_bytes[True] <= 8 << 20
+    del bodies
+
+
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
 def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     """A reader that reads nothing, large messages, no shared memory: memory does not grow for ever."""

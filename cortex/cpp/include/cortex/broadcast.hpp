@@ -42,6 +42,7 @@ class Listener {
       } else if (errno == EAGAIN && unheard_.size() < waiting_max) {
         unheard_.push_back(fd);
       } else {
+        heard_other_version = heard_other_version || errno == EPROTONOSUPPORT;
         ::close(fd);
       }
     }
@@ -54,6 +55,8 @@ class Listener {
     heard_.erase(found);
     return true;
   }
+
+  bool heard_other_version = false;  // of a reader that asked for a ring of another kind
 
  private:
   static constexpr std::size_t waiting_max = 256;  // who have asked and not attached
