@@ -40,9 +40,9 @@ def _load() -> Any:
 
 
 def _require_gil() -> None:
-    """Refuse to run without the GIL, which a free-threaded Python has again once the C module is there."""
-    if not getattr(sys, "_is_gil_enabled", lambda: True)():
-        raise ImportError("cortex needs the GIL: unset PYTHON_GIL, or run python with -X gil=1")
+    """Refuse to run without the GIL, on which much relies that takes no lock."""
+    if not getattr(sys, "_is_gil_enabled", lambda: True)():  # a free-threaded Python
+        raise ImportError("cortex needs the GIL: run python with -X gil=1, or PYTHON_GIL=1")
 
 
 native: Any = _load()

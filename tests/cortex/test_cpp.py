@@ -38,7 +38,7 @@ from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
 
 MUTATIONS = 3000
-HOSTILE_WRITES = int(os.environ.get("CORTEX_HOSTILE_WRITES", "100000"))
+HOSTILE_WRITES = int(os.environ.get("CORTEX_HOSTILE_WRITES", "40000"))
 """Writes of a peer that writes at random; ten millions take a few minutes."""
 CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0, "cut_off": 0}
 

@@ -20,7 +20,7 @@ from processes import SOON_S, fork_server, wait_for
 from cortex import reliable
 from cortex.context import Closed
 
-RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "20"))
+RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "8"))
 KINDS = ["a publisher closes", "a publisher is killed", "a subscriber leaves", "connections are cut"]
 SIZES = [[40], [3_000], [40_000], [40, 40_000, 3_000, 200_000]]
 ELSEWHERE = {"listen": "127.0.0.1", "host": "elsewhere", "forked": True}
