@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, TypeVar, cast
 
 from cortex.answers import Answers, ask_stats
-from cortex.callbacks import CallbackThread
+from cortex.callbacks import CallbackThread, check_callable
 from cortex.clock import Clock
 from cortex.codec import codec_of
 from cortex.context import LINGER_MS, Closed, context
@@ -36,7 +36,7 @@ from cortex.overview import (
 from cortex.places import Places, network
 from cortex.policy import Policy, keep_last
 from cortex.pub_socket import PubSockets
-from cortex.publisher import COMMAND_MAX_WAIT_S, INLINE_MAX, MAX_WAIT_S, Publisher, close_publishers
+from cortex.publisher import INLINE_MAX, Publisher, close_publishers, usual_max_wait_s
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import NodeRecord, StatsReply
 from cortex.schema import Schema, schema_of
@@ -160,8 +160,7 @@ class Node:
         if inline_max < 0:
             raise ValueError(f"inline_max must not be negative, got {inline_max}")
         if max_wait_s is None:
-            is_command = message_type.__module__ == "cortex.messages.commands"
-            max_wait_s = COMMAND_MAX_WAIT_S if is_command else MAX_WAIT_S
+            max_wait_s = usual_max_wait_s(message_type)
         if not 0.0 <= max_wait_s <= 86_400.0:
             raise ValueError(f"max_wait_s must be 0 to 86400, got {max_wait_s}")
         return self._add_publisher(
@@ -212,8 +211,8 @@ class Node:
         self._check_open()
         if policy is not None and not isinstance(policy, Policy):
             raise TypeError(f"policy must be a Policy such as latest() or reliable(), got {policy!r:.80}")
-        if callback is not None and not callable(callback):
-            raise TypeError(f"callback must be a function of one message, got {callback!r:.80}")
+        if callback is not None:
+            check_callable(callback, "callback must be a function of one message")
         subscriber: Subscriber[T] = Subscriber(
             check_pattern(topic),
             None if message_type is None else codec_of(message_type),
@@ -242,8 +241,7 @@ class Node:
             A function that withdraws it.
         """
         self._check_open()
-        if not callable(handler):
-            raise TypeError(f"handler must be a function of one request, got {handler!r:.80}")
+        check_callable(handler, "handler must be a function of one request")
         number = service_number(check_topic(name), request_type, reply_type)
         service = Service(name, number, request_type, reply_type, handler)
         self._server.add(service)
@@ -281,6 +279,7 @@ class Node:
             A function that ends it.
         """
         self._check_open()
+        check_callable(callback, "callback must be a function of one change")
         watch = Watch(pattern, callback)
         with self._lock:
             self._watches.append(watch)
@@ -324,10 +323,7 @@ class Node:
         return reply
 
     def now_ns(self) -> int:
-        """CLOCK_REALTIME of the registry's host [ns]: stamps of it can be compared between hosts.
-
-        It is estimated, and may go back as the estimate becomes better.
-        """
+        """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""
         now_ns = time.monotonic_ns()
         return now_ns + self._directory.clock.offset_ns(now_ns)
 

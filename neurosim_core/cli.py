@@ -45,9 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for matrices as small as here threads cost time
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
+    if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         if arguments.computes:
@@ -58,6 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return int(arguments.command(arguments))
         except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+            if arguments.debug:
+                raise
             print(f"neurosim: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
@@ -101,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
     parser.set_defaults(computes=True)
+    parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)

@@ -234,6 +234,12 @@ class Stream:
     def __iter__(self) -> Iterator[Any]:
         return self.batches()
 
+    def __getitem__(self, index: Any) -> Any:
+        """Raise TypeError: PyTorch's DataLoader, for one, asks for windows by number."""
+        raise TypeError(
+            "a Stream is iterated; for PyTorch take ns.data.Loader, or a DataLoader of ns.data.Dataset"
+        )
+
     def batches(self, *, worker: int = 0, workers: int = 1) -> Iterator[Any]:
         """Yield the batches of an epoch, or every `workers`-th from number `worker` on."""
         begin = self._position.batch if self._resume else 0

@@ -225,10 +225,13 @@ def _measure_rate(arguments: argparse.Namespace) -> int:
 
 
 def _learn_dense(arguments: argparse.Namespace) -> int:
+    import logging
+
     import torch
 
     from neurosim_core.learn.dense_train import DenseConfig, train_dense
 
+    logging.getLogger(train_dense.__module__).setLevel(logging.INFO)  # it takes minutes: how far it has come
     device, task = arguments.device or "auto", arguments.what
     if device == "auto":
         device = "cuda:0" if torch.cuda.is_available() else "cpu"

@@ -33,6 +33,8 @@ _SILENT_S = 120.0
 """Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
 _REMEMBERED = 0.75
 """Share of the sequences of a step that begin with the memory that the step before has left."""
+_TOLD_S = 10.0
+"""How often the log tells how far training has come [s]."""
 _TEST_SEED = 1_000_000
 """Of the first flight that is only tested on."""
 
@@ -268,9 +270,11 @@ def train_dense(
         mirrored=head.mirrored,
         device=config.device if worlds else None,
     )
+    _log.info("waiting for the first windows")
     with _source(pool, config, data, live, worlds, ray) as more:
         fit = _fit(net.to(config.device), pool, config, more)
     constant = head.constant(pool.targets()).cpu()[None]
+    _log.info("testing in scenes that were not trained in" if test is None else f"testing on {test}")
     tested = [*held_out_windows(config, test)]
     net.eval()
     errors = {
@@ -434,6 +438,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
     head, random = config.head, np.random.default_rng(config.seed)
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=1e-4)
     begin_s, steps, waited_s = time.monotonic(), 0, 0.0
+    told_s = begin_s
     memory: Memory | None = None
 
     def share_done() -> float:
@@ -458,7 +463,8 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
         steps += 1
-        if steps % 100 == 0:
+        if time.monotonic() - told_s > _TOLD_S:
+            told_s = time.monotonic()
             told = (steps, 100.0 * share, loss.item(), pool.window_count)
             _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
     fit = _Fit(steps, waited_s / (time.monotonic() - begin_s), _gpus(config.device))
