@@ -14,7 +14,7 @@ from pydantic import Field
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
-from neurosim_core.scene.lamps import hang_lamps, scaled_lights
+from neurosim_core.scene.lamps import lights_of
 from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
@@ -130,7 +130,15 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")
     scene = Scene(
         name=path.stem,
-        lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
+        lights=lights_of(
+            source,
+            config.light_scale,
+            triangles,
+            notes,
+            turn=turn,
+            shift_m=np.array(config.position_m) - origin,
+            path=path,
+        ),
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
         instance_names=tuple(source.instance_names),
         instance_labels=source.instance_labels,
@@ -386,7 +394,8 @@ def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], pa
     if color_uv is not None:
         final_uv = np.where(apart[first][:, None], color_uv[first], final_uv)
 
-    used, face_material = np.unique(material, return_inverse=True)
+    used = np.flatnonzero(np.bincount(material))
+    face_material = np.searchsorted(used, material)
     return {
         "vertices": positions[vertex].astype(np.float32),
         "faces": index.reshape(-1, 3).astype(np.int32),
@@ -466,38 +475,3 @@ def _patches(color: NDArray[np.float64], name: str) -> tuple[Texture, NDArray[np
     uv = at / [width, height]
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return Texture(name=f"{name} (vertex colours)", srgb=linear_to_srgb8(image)), uv
-
-
-def _lights(
-    config: MeshSceneConfig,
-    source: Source,
-    turn: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    triangles: NDArray[np.float64],
-    notes: list[str],
-) -> Any:
-    if not source.lamps:
-        if config.light_scale is not None:
-            raise SceneError(
-                f"light_scale = {config.light_scale:g} scales the lights of the file, and {config.file} has "
-                "none: leave it out"
-            )
-        places, sentence = hang_lamps(triangles)
-        notes.append(f"The file has no lights; {len(places)} are {sentence}.")
-        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
-    low, high = extent(triangles)
-    away = 20.0 * float(np.linalg.norm(high - low))
-    positions, intensities = [], []
-    for lamp in source.lamps:
-        vector = turn @ lamp.vector
-        if lamp.kind == "directional":  # a point light so far off that its rays are parallel
-            vector = vector / np.linalg.norm(vector)
-            positions.append((low + high) / 2.0 - away * vector)
-            intensities.append(rgb(np.asarray(lamp.intensity) * away**2))
-        else:
-            positions.append(vector + shift)
-            intensities.append(lamp.intensity)
-    lights, factor = scaled_lights(positions, intensities, triangles, factor=config.light_scale)
-    how = "as declared" if config.light_scale is not None else "so that the median surface is well lit"
-    notes.append(f"{len(lights)} lights of the file, their intensities (cd, lx) times {factor:.3g}, {how}.")
-    return lights

@@ -311,9 +311,9 @@ def test_a_reader_that_is_gone_is_forgotten(ring):
 
 
 @contextlib.contextmanager
-def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3"):
+def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3", bell: int | None = None):
     """The connection of a reader, number 1, that has said hello."""
-    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0)
+    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0) if bell is None else bell
     os.ftruncate(page, 4096)
     fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
@@ -322,6 +322,20 @@ def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3"):
         os.close(page)
         os.close(bell)
         yield other
+
+
+@pytest.mark.parametrize(
+    "make", [os.pipe, lambda: [end.detach() for end in socket.socketpair()]], ids=["pipe", "socket"]
+)
+def test_a_bell_whose_ringing_would_end_the_process_is_refused(ring, make):
+    """Nobody is at its other end: to write there sends SIGPIPE."""
+    other, bell = make()
+    os.close(other)
+    with asks_by_hand(ring.path, SOURCE, bell=bell):
+        connection = native.accept(ring.listener)
+        with pytest.raises(OSError, match=r"[Pp]rotocol"):
+            native.hear(connection)
+        os.close(connection)
 
 
 def test_a_reader_that_spoke_and_died_is_forgotten(ring):
