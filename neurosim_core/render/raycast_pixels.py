@@ -31,6 +31,7 @@ from neurosim_core.render.ray_intersection import (
     intersect_candidate,
     intersect_scene,
 )
+from neurosim_core.render.raycast_quads import casts_quads, quad_program
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -56,9 +57,12 @@ def _bounds_of(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[int, int] 
 
 def pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Build the kernel; see `raycast.raycast_kernel`."""
-    render_thread = (
-        _group_program(outputs, terms) if terms.candidate_group else _pixel_program(outputs, terms)
-    )
+    if terms.candidate_group:
+        render_thread = _group_program(outputs, terms)
+    elif casts_quads(outputs, terms):
+        render_thread = quad_program(outputs, terms)
+    else:
+        render_thread = _pixel_program(outputs, terms)
 
     @wp.kernel(
         module="unique",
