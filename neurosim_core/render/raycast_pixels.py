@@ -130,7 +130,7 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     ):
         # `index` counts the pixels of a tile in one instant, then the instants of a tile, then tiles.
         # Adjacent threads should traverse the same nodes: a block is a quarter of a tile at four instants,
-        # and at the remaining instants the whole tile.
+        # half of it at two that remain, and at the last instant the whole tile.
         in_tile = index % 64
         block = index // 64
         instant = block % view.instant_count
@@ -140,6 +140,10 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                 quarter = instant % 4
                 instant += in_tile // 16 - quarter
                 in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
+            elif instant < view.instant_count // 2 * 2:
+                half = instant % 2
+                instant += (in_tile // 16) % 2 - half
+                in_tile = 32 * half + 4 * (in_tile // 32) + 8 * ((in_tile % 16) // 4) + in_tile % 4
         place = locate_tile(tile, instant, view, worlds)
         if wp.static(terms.world_scenes):
             scene = worlds.scenes[worlds.scene[place.world]]
