@@ -47,7 +47,7 @@ class Avoid(Task):
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03), "rpy_rad": (0.0, -0.2, 0.0)}
     surface = LeakySurface(tau_s=(0.02, 0.06, 0.3))
     probes = tuple((r * math.cos(b), r * math.sin(b), 0.0) for r in _RANGES_M for b in _BEARINGS_RAD)
-    teacher: Mapping[str, Any] = {"worlds": 2048, "iterations": 300, "reward_scale": 0.1}
+    teacher: Mapping[str, Any] = {"worlds": 2048, "iterations": 300, "reward_scale": 0.1, "divergence": 0.016}
     student: Mapping[str, Any] = {"disturbance": 0.1}
     hint = "room"
     mirror: Mapping[str, Sequence[float]] = {
