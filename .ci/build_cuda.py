@@ -63,7 +63,7 @@ SENSORS = {
         "accelerometer_resolution_m_s2": 1e-3,
     },
 }
-LEARN = {"torch", "gymnasium", "rsl_rl", "stable_baselines3", "tensordict"}
+LEARN = {"torch", "gymnasium", "rsl_rl", "skrl", "stable_baselines3", "tensordict"}
 """Libraries of which the CUDA build needs none."""
 
 

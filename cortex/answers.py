@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import zmq
 
 from cortex.codec import MalformedMessage
 from cortex.control import control_types
+from cortex.places import Reach
 from cortex.records import StatsReply, StatsRequest
 from cortex.service import Server
 from cortex.wire import REQUEST, control_frame, parse_control, unpack_header
@@ -79,3 +82,17 @@ class Answers:
             router, identity, frame = self._replies.popleft()
             with contextlib.suppress(zmq.Again, zmq.ZMQError):  # an asker that is gone gets nothing
                 router.send_multipart([identity, frame], zmq.DONTWAIT)
+
+
+def ask_stats(place: Reach, asker: int, timeout_s: float) -> StatsReply | None:
+    """Ask a node for its counters; None if it did not answer in time."""
+    deadline_s = time.monotonic() + timeout_s
+    types = control_types(StatsReply)
+    with place.open() as socket:
+        socket.send(control_frame(StatsRequest(asker)), zmq.DONTWAIT)
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            if socket.poll(max(1, int(left_s * 1000.0))):
+                with contextlib.suppress(MalformedMessage):
+                    reply, _ = parse_control(socket.recv(zmq.DONTWAIT), types)
+                    return cast(StatsReply, reply)
+    return None

@@ -8,6 +8,7 @@ Who does not ask, and everybody where there is no C, goes on with ZeroMQ.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import select
@@ -79,12 +80,18 @@ class Listener:
         self._fd = native.listen(str(path))
         self._unheard: list[int] = []
         self._heard: dict[tuple[int, int], Hello] = {}
+        self.heard_other_version = False
+        """Whether a reader asked for a ring of another kind."""
 
     def take(self, source: int, reader: int) -> Hello | None:
         """What a reader has handed over, if it has asked for the ring of a publisher; now the caller's."""
         with contextlib.suppress(OSError):  # too many files, or somebody else's process
-            while (fd := native.accept(self._fd)) >= 0:
+            for _ in range(WAITING_MAX):  # others may come faster than they can be taken in
+                if (fd := native.accept(self._fd)) < 0:
+                    break
                 self._unheard.append(fd)
+        for fd in self._unheard[:-WAITING_MAX]:
+            os.close(fd)
         unheard, self._unheard = self._unheard[-WAITING_MAX:], []
         for fd in unheard:
             try:
@@ -92,7 +99,8 @@ class Listener:
                 self._heard[asked, number] = Hello(fd, page, bell)
             except BlockingIOError:
                 self._unheard.append(fd)
-            except OSError:
+            except OSError as error:
+                self.heard_other_version |= error.errno == errno.EPROTONOSUPPORT
                 os.close(fd)
         while len(self._heard) > WAITING_MAX:
             self._heard.pop(next(iter(self._heard))).close()
@@ -157,6 +165,7 @@ class Broadcast:
         self._expected_bytes = expected_bytes
         self._unavailable_until_s = 0.0
         self._is_dissolved = False
+        self._has_complained = False
         self._ring: Any = None
         self._readers: dict[int, Reader] = {}
         self._moving: set[Reader] = set()
@@ -168,6 +177,9 @@ class Broadcast:
         """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
         listener = reader.pub_socket.listener
         hello = None if listener is None else listener.take(self._source, reader.request.reader)
+        if listener is not None and listener.heard_other_version and not self._has_complained:
+            self._has_complained = True
+            self._note("a subscriber with another version of cortex cannot share memory, which is slower")
         if hello is None:
             return
         try:

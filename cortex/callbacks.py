@@ -6,6 +6,7 @@ have a thread of their own.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import select
 import threading
@@ -19,6 +20,21 @@ from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
+
+
+def check_callable(function: object, what: str) -> None:
+    """Refuse what the callback thread cannot call.
+
+    Raises:
+        TypeError: It is no function, or a coroutine function, which nobody would await.
+    """
+    if not callable(function):
+        raise TypeError(f"{what}, got {function!r:.80}")
+    if inspect.iscoroutinefunction(function):
+        raise TypeError(
+            f"{what}, got the coroutine function {function!r:.80}, which no loop would run: "
+            "use `async for`, or asyncio.run_coroutine_threadsafe"
+        )
 
 
 class CallbackThread:

@@ -161,12 +161,18 @@ def _add(
         group.add_argument("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
         group.add_argument(
             "--registry",
-            default="auto",
+            default=os.environ.get("CORTEX_REGISTRY") or "auto",
             metavar="ADDRESS",
-            help='"auto" (this host, the default), "off", or tcp://host:port',
+            help='"auto" (this host), "off", or tcp://host:port; default: CORTEX_REGISTRY, else "auto"',
         )
-        group.add_argument("--listen", metavar="IP", help="let other hosts reach us, e.g. 192.168.1.5")
-        group.add_argument("--keys", type=_directory, metavar="DIR", help="key directory, for tcp")
+        group.add_argument(
+            "--listen",
+            metavar="IP",
+            help="let other hosts reach us, e.g. 192.168.1.5; default: CORTEX_LISTEN",
+        )
+        group.add_argument(
+            "--keys", type=_directory, metavar="DIR", help="key directory, for tcp; default: CORTEX_KEYS"
+        )
         group.add_argument("--insecure", action="store_true", help="allow plain tcp beyond this host")
     return parser
 
@@ -336,8 +342,8 @@ def _add_tools(commands: Any) -> None:
         "doctor",
         "check what Cortex needs on this host, and say how to mend what is wrong",
         ("doctor", "examine"),
-        network=False,
-    ).add_argument("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
+        examples=["cortex doctor", "cortex doctor --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex"],
+    )
     schema = _add(
         commands,
         "schema",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import sys
 from typing import Any
 
 logger = logging.getLogger(__name__)
@@ -38,5 +39,12 @@ def _load() -> Any:
     return module
 
 
+def _require_gil() -> None:
+    """Refuse to run without the GIL, on which much relies that takes no lock."""
+    if not getattr(sys, "_is_gil_enabled", lambda: True)():  # a free-threaded Python
+        raise ImportError("cortex needs the GIL: run python with -X gil=1, or PYTHON_GIL=1")
+
+
 native: Any = _load()
 """`cortex._native`, or None."""
+_require_gil()

@@ -12,8 +12,9 @@ from typing import Any
 import zmq
 
 from cortex.answers import Answers
+from cortex.clock import wall_offset_ns
 from cortex.discovery import Directory
-from cortex.places import Places, clock_offset_ns
+from cortex.places import Places
 from cortex.pub_socket import PubSockets
 from cortex.publisher import Publisher
 from cortex.subscriber import Subscriber
@@ -25,7 +26,8 @@ TICK_MS = 20
 TICK_BUSY_MS = 2
 BUSY_NS = 300_000_000
 """For so long after a change ticks are short, so that new peers meet quickly."""
-CLOCK_STEP_NS = 5_000_000
+CLOCK_STEP_NS = 500_000
+"""The others are told of our clock when it has moved by more than this."""
 
 
 class ControlThread:
@@ -37,14 +39,15 @@ class ControlThread:
     _pub_sockets: PubSockets
     _publishers: Callable[[], list[Publisher[Any]]]
     _subscribers: Callable[[], list[Subscriber[Any]]]
+    _on_clock: Callable[[], None]
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._wakeup = Wakeup()
         self._stopping = False
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
-        self.clock_offset_ns = clock_offset_ns()
-        """CLOCK_REALTIME less CLOCK_MONOTONIC, as the others are told [ns]."""
+        self.clock_offset_ns = wall_offset_ns()
+        """CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC here, as the others are told [ns]."""
         self._thread = threading.Thread(target=self._run, name=f"{name} control", daemon=True)
 
     def start(
@@ -56,15 +59,19 @@ class ControlThread:
         *,
         publishers: Callable[[], list[Publisher[Any]]],
         subscribers: Callable[[], list[Subscriber[Any]]],
+        on_clock: Callable[[], None],
     ) -> None:
-        """Begin. Places and directory are closed at the end, by this thread."""
+        """Begin. Places and directory are closed at the end, by this thread.
+
+        `on_clock` is called when `clock_offset_ns` has changed.
+        """
         self._places, self._directory, self._answers, self._pub_sockets = (
             places,
             directory,
             answers,
             pub_sockets,
         )
-        self._publishers, self._subscribers = publishers, subscribers
+        self._publishers, self._subscribers, self._on_clock = publishers, subscribers, on_clock
         self._thread.start()
 
     def wake(self) -> None:
@@ -124,10 +131,11 @@ class ControlThread:
         self._directory.tick(now_ns)
         self._pub_sockets.tick()
         self._pub_sockets.emit_notes()
-        offset_ns = clock_offset_ns()
+        offset_ns = self._directory.clock.offset_ns(now_ns)
         if abs(offset_ns - self.clock_offset_ns) > CLOCK_STEP_NS:
-            self.clock_offset_ns = offset_ns  # somebody has set the clock: tell the others
+            self.clock_offset_ns = offset_ns
             self._directory.announce()
+            self._on_clock()
         for publisher in self._publishers():
             publisher.tick(now_ns)
         self._top_up(self._subscribers(), now_ns)

@@ -11,6 +11,7 @@ from typing import Any
 
 import zmq
 
+from cortex.clock import ClockEstimate
 from cortex.codec import MalformedMessage
 from cortex.control import (
     HEARTBEAT_NS,
@@ -23,6 +24,7 @@ from cortex.control import (
 from cortex.directory_link import DirectoryLink
 from cortex.host import REGISTRY_SOCKET, runtime_dir
 from cortex.records import (
+    CLOCK_OFFSET_MAX_NS,
     Alive,
     Changed,
     Gone,
@@ -36,7 +38,7 @@ from cortex.records import (
 )
 from cortex.registry import Registry, ensure_registry, main
 from cortex.security import Keys, apply_client, check_address, host_of
-from cortex.wire import control_frame, parse_control
+from cortex.wire import Header, control_frame, parse_control
 
 __all__ = ["Directory", "Registry", "ensure_registry", "main"]
 
@@ -89,6 +91,7 @@ class Directory:
         """The other nodes' records, by node."""
         self.rejected = 0
         """Control frames that were malformed."""
+        self.clock = ClockEstimate(local=not registry.startswith("tcp://"))
         self._context = context
         self._domain = domain
         self._record = record
@@ -169,7 +172,9 @@ class Directory:
             try:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
-                message, _ = parse_control(frames[0], self._link_types)
+                message, header = parse_control(frames[0], self._link_types)
+                if isinstance(message, Alive):
+                    self._read_clock(header, now_ns)
                 self._on_message(link, message, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
@@ -210,7 +215,8 @@ class Directory:
         if not link.welcomed:
             self._say_hello(link, now_ns, snapshot=True)
             return
-        if try_send(link.socket, control_frame(Heartbeat(self._own.node, self._own.revision, 0))):
+        heartbeat = Heartbeat(self._own.node, self._own.revision, 0)
+        if try_send(link.socket, control_frame(heartbeat, time.monotonic_ns())):  # the answer returns it
             link.next_ns = now_ns + HEARTBEAT_NS
             self._warn_of_silence(link, now_ns)
         else:
@@ -276,10 +282,17 @@ class Directory:
         else:
             self._on_changed(link, message)
 
+    def _read_clock(self, header: Header, now_ns: int) -> None:
+        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < CLOCK_OFFSET_MAX_NS
+        if is_told and not self.clock.local:
+            self.clock.add(header.sequence, header.publish_ns, now_ns)
+
     def _on_welcome(self, link: DirectoryLink, welcome: Welcome, now_ns: int) -> None:
         if len(welcome.nodes) != len(welcome.revisions):
             raise MalformedMessage("a welcome with lists of different lengths")
         link.greet(now_ns)
+        if welcome.epoch != link.epoch and not self.clock.local:
+            self.clock.forget()
         self._revive_ns, self._revive_wait_ns = 0, _REVIVE_FIRST_NS
         link.epoch, link.version = welcome.epoch, welcome.version
         named = dict(zip(welcome.nodes, welcome.revisions, strict=True))

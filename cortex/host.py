@@ -10,14 +10,16 @@ import contextlib
 import fcntl
 import hashlib
 import os
+import platform
 import re
 import stat
+import sys
 import threading
 import time
 from pathlib import Path
 from typing import ClassVar
 
-SOCKET_PATH_MAX = 107
+SOCKET_PATH_MAX = 107 if sys.platform == "linux" else 103
 """Longest path of a unix socket in bytes: `sun_path` less its terminating zero."""
 DOMAIN_MAX = 232
 """Largest domain; the range is that of ROS 2, so that one number can serve both."""
@@ -113,14 +115,18 @@ def host_id() -> str:
     That takes one kernel, one user, one process namespace (shared memory is opened through `/proc`) and one
     runtime directory (the same inode, so containers with private file systems differ).
     """
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        processes = os.readlink("/proc/self/ns/pid")
+    except OSError:  # not Linux: no shared memory, and one space of processes
+        boot, processes = platform.node(), ""
     base = runtime_base()
     try:
         status = os.stat(base)
         place = f"{status.st_dev}:{status.st_ino}"
     except FileNotFoundError:
         place = str(base)
-    parts = (boot, os.readlink("/proc/self/ns/pid"), str(os.getuid()), place)
+    parts = (boot, processes, str(os.getuid()), place)
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=8).hexdigest()
 
 

@@ -29,6 +29,8 @@ class LargeSender:
         self.waiting_bytes = {False: 0, True: 0}
         """Bytes that wait, of lossy and of strict sockets."""
         self._free: list[NDArray[np.uint8]] = []
+        self._lent: dict[int, int] = {}
+        """Where memory lies that is in use, and its bytes: up to four times those of the body in it."""
 
     def acquire(self, size: int) -> NDArray[np.uint8]:
         """Return memory for a body of so many bytes, as large or larger; it is not cleared.
@@ -44,10 +46,12 @@ class LargeSender:
             del self._free[:1]  # sizes have changed
             memory = np.empty(size, np.uint8)
         lent = (ctypes.c_ubyte * len(memory)).from_buffer(memory.data)
+        self._lent[ctypes.addressof(lent)] = len(memory)
         weakref.finalize(lent, self._release, memory).atexit = False
         return np.frombuffer(memoryview(lent), np.uint8)
 
     def _release(self, memory: NDArray[np.uint8]) -> None:
+        del self._lent[memory.ctypes.data]
         kept = sum(map(len, self._free)) + len(memory)
         if len(self._free) < FREE_MAX and kept <= max(PRIVATE_BYTES, 4 * len(memory)):
             self._free.append(memory)
@@ -56,9 +60,14 @@ class LargeSender:
         """Give back the memory of bodies that were sent; those that follow get new memory."""
         self._free.clear()
 
-    def has_room(self, pub_socket: PubSocket, size: int) -> bool:
-        """Whether so many bytes more may wait."""
+    def _bytes_of(self, body: memoryview) -> int:
+        """What a body takes as long as it waits."""
+        return self._lent.get(np.frombuffer(body, np.uint8).ctypes.data, body.nbytes)
+
+    def has_room(self, pub_socket: PubSocket, body: memoryview) -> bool:
+        """Whether a body more may wait."""
         self.prune()
+        size = self._bytes_of(body)
         most = max(STRICT_BYTES, 2 * size) if pub_socket.strict else max(PRIVATE_BYTES, 4 * size)
         return self.waiting_bytes[pub_socket.strict] + size <= most
 
@@ -71,8 +80,9 @@ class LargeSender:
         finally:
             if pub_socket.strict:
                 pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 1)
-        self._waiting[pub_socket].append((tracker, body.nbytes))
-        self.waiting_bytes[pub_socket.strict] += body.nbytes
+        size = self._bytes_of(body)
+        self._waiting[pub_socket].append((tracker, size))
+        self.waiting_bytes[pub_socket.strict] += size
 
     def prune(self) -> None:
         """Let go of what has been sent."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 import secrets
@@ -75,7 +76,7 @@ class Info(NamedTuple):
     publish_ns: int
     """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
     latency_ns: int
-    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
+    """From `publish` to now [ns]; between hosts as good as `Node.clock` says."""
     size: int
     """Bytes of the body."""
 
@@ -156,6 +157,7 @@ class Link:
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
         self._reader = secrets.randbits(64) or 1
+        self._asks_for_ring = shared_memory
         if shared_memory and native is not None and self.address.startswith("ipc://"):
             path = self.address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
             try:
@@ -294,26 +296,26 @@ class Link:
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
-        self._told = max(self._told, answer.sequence)
         known = self.expected >= 0
-        if first and not self._use_ring():
-            self.attached = False
-            return []  # it is asked again
+        if first:
+            try:
+                self._use_ring()
+            except OSError as error:
+                reason = f"it is of another version of cortex, or has too many readers ({error})"
+                self._do_without_shared_memory(reason, logging.WARNING)
+                self.attached = False
+                return []  # it is asked again
         if known:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
         return items
 
-    def _use_ring(self) -> bool:
-        """If the publisher has taken us in, its ring has all that follows; False if we cannot read it."""
-        try:
-            first = None if self._end is None else self._end.welcomed()
-        except OSError as error:
-            self._do_without_shared_memory(str(error))
-            return False
+    def _use_ring(self) -> None:
+        """If the publisher has taken us in, its ring has all that follows; OSError if we cannot read it."""
+        first = self._end.welcomed() if self._end is not None and self._asks_for_ring else None
         if first is None:
-            return True
+            return
         self._ring = self._end
         self.receive = self._ring.receive
         if self.coder is not None:
@@ -323,7 +325,6 @@ class Link:
             self.expected = first
         for head in self._socket_heads:
             self.socket.unsubscribe(head)
-        return True
 
     def _use_socket(self) -> None:
         """What follows comes through the socket again, as we shall be another reader to the publisher."""
@@ -362,8 +363,8 @@ class Link:
             raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
         return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)]
 
-    def _do_without_shared_memory(self, reason: str) -> None:
-        logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
+    def _do_without_shared_memory(self, reason: str, level: int = logging.INFO) -> None:
+        logger.log(level, "%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
         if self._ring is not None:
             self._use_socket()
         key = self._key
@@ -373,13 +374,14 @@ class Link:
     def leave(self) -> None:
         """The publisher has left: what it wrote into its ring counts, also if its answer never came."""
         if not self.attached:
-            self._use_ring()
+            with contextlib.suppress(OSError):
+                self._use_ring()
 
     def end(self) -> None:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""
         if 0 <= self.expected < self._reached:
             self.advance(self._reached, 0)
-        if self._policy.reliable and self.expected > max(self._told, 0):
+        if self._policy.reliable and self.expected > self._told:
             self.counters.cut_off += 1
             logger.warning("%s: a publisher ended without saying how much it had sent", self.record.topic)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any, Generic, TypeVar
 
 from cortex.context import Closed
 from cortex.fast_receive import NOTHING, PAUSE_COUNT, PAUSE_NS
@@ -113,6 +113,22 @@ class LoopReader:
 def _resolve(waiter: asyncio.Future[None]) -> None:
     if not waiter.done():
         waiter.set_result(None)
+
+
+class Receiver(Generic[T]):
+    """Iterates; unlike a generator it goes on after an exception, such as one publisher's `TypeMismatch`."""
+
+    def __init__(self, receive: Callable[[], T]) -> None:
+        self._receive = receive
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        try:
+            return self._receive()
+        except Closed:
+            raise StopIteration from None
 
 
 class AsyncReceiver(AsyncIterator[T]):

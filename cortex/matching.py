@@ -51,12 +51,16 @@ class Matcher:
             if matches(subscriber.topic, publisher.topic)
         }
         subscriber.refused &= wanted.keys()
-        present = subscriber.sources().keys()
-        for source in present - wanted.keys():
+        present = subscriber.sources()
+        for source in present.keys() - wanted.keys():
             subscriber.forget(source)
-        for source in wanted.keys() - present:
-            if not subscriber.revive(source):
-                self._connect(subscriber, *wanted[source], own.clock_offset_ns)
+        for source, (node, publisher) in wanted.items():
+            offset_ns = 0 if node.host == self._host else node.clock_offset_ns - own.clock_offset_ns
+            if source in present or subscriber.revive(source):
+                if present.get(source) != offset_ns:
+                    subscriber.set_clock(source, offset_ns)
+            else:
+                self._connect(subscriber, node, publisher, offset_ns)
 
     def _connect(
         self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord, clock_offset_ns: int
@@ -87,7 +91,6 @@ class Matcher:
         if place is None:
             logger.debug("%s of %s cannot be reached from here", publisher.topic, node.name)
             return
-        offset_ns = 0 if node.host == self._host else node.clock_offset_ns - clock_offset_ns
         try:
             link = Link(
                 publisher,
@@ -97,7 +100,7 @@ class Matcher:
                 local=place.local,
                 shared_memory=place.local,
                 counters=subscriber.counters,
-                clock_offset_ns=offset_ns,
+                clock_offset_ns=clock_offset_ns,
                 secure=place.secure,
             )
         except (OSError, zmq.ZMQError) as error:  # tried again when something changes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import logging
 import os
 import secrets
@@ -15,13 +14,11 @@ from functools import partial
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-import zmq
-
-from cortex.answers import Answers
-from cortex.callbacks import CallbackThread
-from cortex.codec import MalformedMessage, codec_of
+from cortex.answers import Answers, ask_stats
+from cortex.callbacks import CallbackThread, check_callable
+from cortex.clock import Clock
+from cortex.codec import codec_of
 from cortex.context import LINGER_MS, Closed, context
-from cortex.control import control_types
 from cortex.control_thread import ControlThread
 from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
@@ -36,18 +33,17 @@ from cortex.overview import (
     subscriber_stats,
     topics_of,
 )
-from cortex.places import Places
+from cortex.places import Places, network
 from cortex.policy import Policy, keep_last
 from cortex.pub_socket import PubSockets
-from cortex.publisher import COMMAND_MAX_WAIT_S, INLINE_MAX, MAX_WAIT_S, Publisher, close_publishers
+from cortex.publisher import INLINE_MAX, Publisher, close_publishers, usual_max_wait_s
 from cortex.raw import RawCodec, RawMessage
-from cortex.records import NodeRecord, StatsReply, StatsRequest
+from cortex.records import NodeRecord, StatsReply
 from cortex.schema import Schema, schema_of
 from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number
 from cortex.subscriber import Subscriber
 from cortex.topic import check_pattern, check_topic, matches
-from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
 
@@ -64,10 +60,13 @@ class Node:
     Args:
         name: For people; need not be unique.
         domain: Nodes of one domain see each other; None takes `CORTEX_DOMAIN`, else 0.
-        registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port".
-        listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None: this host only.
-            Without `keys` also "127.0.0.1" lets every user of this host read and call this node.
-        keys: CURVE keys for tcp, from `cortex.security.load_keys`.
+        registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port"; None
+            takes `CORTEX_REGISTRY`, else "auto".
+        listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None takes
+            `CORTEX_LISTEN`, else this host only. Without `keys` also "127.0.0.1" lets every user of this
+            host read and call this node.
+        keys: CURVE keys for tcp, from `cortex.security.load_keys`; None takes those in `CORTEX_KEYS`, a
+            directory, if that is set.
         insecure: Allow plain tcp beyond this host.
 
     Raises:
@@ -80,7 +79,7 @@ class Node:
         name: str,
         *,
         domain: int | None = None,
-        registry: str = "auto",
+        registry: str | None = None,
         listen: str | None = None,
         keys: Keys | None = None,
         insecure: bool = False,
@@ -90,6 +89,7 @@ class Node:
         self.name = name
         self.domain = domain_id(domain)
         self.id = secrets.randbits(64) or 1
+        registry, listen, keys = network(registry, listen, keys)
         self._pid = os.getpid()
         self._lock = threading.RLock()
         self._pub_sockets = PubSockets()
@@ -126,6 +126,7 @@ class Node:
             self._pub_sockets,
             publishers=lambda: list(self._publishers),
             subscribers=lambda: list(self._subscribers),
+            on_clock=self._match_all,
         )
         _nodes.add(self)
 
@@ -159,8 +160,7 @@ class Node:
         if inline_max < 0:
             raise ValueError(f"inline_max must not be negative, got {inline_max}")
         if max_wait_s is None:
-            is_command = message_type.__module__ == "cortex.messages.commands"
-            max_wait_s = COMMAND_MAX_WAIT_S if is_command else MAX_WAIT_S
+            max_wait_s = usual_max_wait_s(message_type)
         if not 0.0 <= max_wait_s <= 86_400.0:
             raise ValueError(f"max_wait_s must be 0 to 86400, got {max_wait_s}")
         return self._add_publisher(
@@ -211,8 +211,8 @@ class Node:
         self._check_open()
         if policy is not None and not isinstance(policy, Policy):
             raise TypeError(f"policy must be a Policy such as latest() or reliable(), got {policy!r:.80}")
-        if callback is not None and not callable(callback):
-            raise TypeError(f"callback must be a function of one message, got {callback!r:.80}")
+        if callback is not None:
+            check_callable(callback, "callback must be a function of one message")
         subscriber: Subscriber[T] = Subscriber(
             check_pattern(topic),
             None if message_type is None else codec_of(message_type),
@@ -241,8 +241,7 @@ class Node:
             A function that withdraws it.
         """
         self._check_open()
-        if not callable(handler):
-            raise TypeError(f"handler must be a function of one request, got {handler!r:.80}")
+        check_callable(handler, "handler must be a function of one request")
         number = service_number(check_topic(name), request_type, reply_type)
         service = Service(name, number, request_type, reply_type, handler)
         self._server.add(service)
@@ -280,6 +279,7 @@ class Node:
             A function that ends it.
         """
         self._check_open()
+        check_callable(callback, "callback must be a function of one change")
         watch = Watch(pattern, callback)
         with self._lock:
             self._watches.append(watch)
@@ -317,17 +317,19 @@ class Node:
         """
         if node == self.id:
             return self._stats()
-        place = self._matcher.reach_control(self._known()[node])
-        deadline_s = time.monotonic() + timeout_s
-        types = control_types(StatsReply)
-        with place.open() as socket:
-            socket.send(control_frame(StatsRequest(self.id)), zmq.DONTWAIT)
-            while (left_s := deadline_s - time.monotonic()) > 0.0:
-                if socket.poll(max(1, int(left_s * 1000.0))):
-                    with contextlib.suppress(MalformedMessage):
-                        reply, _ = parse_control(socket.recv(zmq.DONTWAIT), types)
-                        return cast(StatsReply, reply)
-        raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
+        reply = ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
+        if reply is None:
+            raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
+        return reply
+
+    def now_ns(self) -> int:
+        """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""
+        now_ns = time.monotonic_ns()
+        return now_ns + self._directory.clock.offset_ns(now_ns)
+
+    def clock(self) -> Clock | None:
+        """Return this host's clock beside that of the registry's host; None: it has not answered yet."""
+        return self._directory.clock.clock()
 
     def wait_for_registry(self, timeout_s: float = 5.0) -> bool:
         """Wait until the registry has told of all nodes; False if it has not in time."""
@@ -390,9 +392,7 @@ class Node:
     def _add_publisher(self, publisher: Publisher[T]) -> Publisher[T]:
         with self._lock:
             self._publishers.append(publisher)
-            for subscriber in self._subscribers:
-                if matches(subscriber.topic, publisher.topic):
-                    self._match(subscriber)
+            self._match_all(publisher.topic)
         self._announce()
         return publisher
 
@@ -400,9 +400,7 @@ class Node:
         with self._lock:
             if publisher in self._publishers:
                 self._publishers.remove(publisher)
-            for subscriber in self._subscribers:
-                if matches(subscriber.topic, publisher.topic):
-                    self._match(subscriber)
+            self._match_all(publisher.topic)
         self._announce()
 
     def _drop_subscriber(self, subscriber: Subscriber[Any]) -> None:
@@ -448,14 +446,19 @@ class Node:
         return {**self._directory.nodes, self.id: self._record()}
 
     def _on_change(self, _: frozenset[int]) -> None:
+        self._match_all()
+        self._tell_watches()
+        self._control.hurry()
+
+    def _match_all(self, topic: str | None = None) -> None:
         with self._lock:
             for subscriber in self._subscribers:
+                if topic is not None and not matches(subscriber.topic, topic):
+                    continue
                 try:
                     self._match(subscriber)
                 except Exception:  # one that cannot be connected must not take the others along
                     logger.exception("%s: cannot connect the subscriber of %s", self.name, subscriber.topic)
-        self._tell_watches()
-        self._control.hurry()
 
     def _match(self, subscriber: Subscriber[Any]) -> None:
         """Connect a subscriber to the publishers of its topic, and let go of those that have left."""

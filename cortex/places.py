@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import socket as sockets
-import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import zmq
@@ -15,14 +16,27 @@ from cortex.context import context, new_socket
 from cortex.host import NodeFiles
 from cortex.pub_socket import PubSockets, open_pub_socket
 from cortex.records import Endpoint, NodeRecord
-from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
+from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address, load_keys
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
 
-def clock_offset_ns() -> int:
-    """CLOCK_REALTIME less CLOCK_MONOTONIC [ns]."""
-    return time.time_ns() - time.monotonic_ns()
+class Network(NamedTuple):
+    """How a node meets those of other hosts."""
+
+    registry: str
+    listen: str | None
+    keys: Keys | None
+
+
+def network(registry: str | None, listen: str | None, keys: Keys | None) -> Network:
+    """What was given, else what CORTEX_REGISTRY, CORTEX_LISTEN and CORTEX_KEYS (a key directory) say."""
+    directory = os.environ.get("CORTEX_KEYS")
+    return Network(
+        registry or os.environ.get("CORTEX_REGISTRY") or "auto",
+        listen or os.environ.get("CORTEX_LISTEN") or None,
+        load_keys(Path(directory)) if keys is None and directory else keys,
+    )
 
 
 class Places:

@@ -38,6 +38,11 @@ COMMAND_MAX_WAIT_S = 0.1
 """Default of `max_wait_s` for the types of `cortex.messages.commands`: a controller must not stand still."""
 
 
+def usual_max_wait_s(message_type: type) -> float:
+    """Longest time that `publish` waits for reliable subscribers, unless the publisher says otherwise [s]."""
+    return COMMAND_MAX_WAIT_S if message_type.__module__ == "cortex.messages.commands" else MAX_WAIT_S
+
+
 class Publisher(Generic[T]):
     """Sends messages of one type; made by `Node.publisher`. Every method may be called from any thread."""
 

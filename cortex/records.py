@@ -64,7 +64,8 @@ class NodeRecord:
     """All that others know of a node.
 
     `revision` grows with every change, so that an old record never replaces a newer one. `clock_offset_ns` is
-    CLOCK_REALTIME less CLOCK_MONOTONIC on its host. Nodes with equal `host` share memory and unix sockets.
+    CLOCK_REALTIME of the registry's host, as estimated, less CLOCK_MONOTONIC on its own. Nodes with equal
+    `host` share memory and unix sockets.
     """
 
     node: UInt64

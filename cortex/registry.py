@@ -335,7 +335,8 @@ class Registry:
         held = 0
         if entry is not None and entry.route == route:
             entry.seen_ns, held = now_ns, entry.revision
-        self._reply(route, Alive(self.epoch, self.version, held))
+        alive = Alive(self.epoch, self.version, held)
+        self._send(route, control_frame(alive, self._sequence, told_ns=time.time_ns()))
 
     def _on_leave(self, leave: Leave, size: int, route: Route, now_ns: int) -> None:
         entry = self._entries.get(leave.node)

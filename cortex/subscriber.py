@@ -22,7 +22,7 @@ from cortex.context import Closed
 from cortex.fast_receive import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Info, Item, Link
-from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver
+from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver, Receiver
 from cortex.policy import Policy
 from cortex.receive_lock import ReceiveLock
 from cortex.schema import Schema, TypeMismatch
@@ -152,7 +152,7 @@ class Subscriber(Generic[T]):
 
     def __iter__(self) -> Iterator[T]:
         """Messages as they come, until the subscriber is closed. An error ends it not: iterate again."""
-        return _Messages(self)
+        return Receiver(self.recv)
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
@@ -399,14 +399,22 @@ class Subscriber(Generic[T]):
             self._links_changed()
 
     def sources(self) -> dict[int, int]:
-        """The publishers that are connected and have not left, and the sequence that comes next of each."""
+        """The publishers that are connected and have not left, and what to add to their clocks [ns]."""
         with self._receive_lock:
-            return {link.source: link.expected for link in self._links if link not in self._leaving}
+            return {link.source: link.clock_offset_ns for link in self._links if link not in self._leaving}
 
     def revive(self, source: int) -> bool:
         """A publisher that had left is back: keep its connection; False if there is none. For the node."""
         with self._receive_lock:
             return self._intake.revive(source)
+
+    def set_clock(self, source: int, offset_ns: int) -> None:
+        """The clock of a publisher's host has moved beside ours; for the node."""
+        with self._receive_lock:
+            for link in self._links:
+                if link.source == source and link.clock_offset_ns != offset_ns:
+                    link.clock_offset_ns = offset_ns
+                    self._open_fast_receive()
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node.
@@ -482,19 +490,3 @@ class Subscriber(Generic[T]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-class _Messages(Generic[T]):
-    """Iterates; unlike a generator it goes on after an exception, such as one publisher's `TypeMismatch`."""
-
-    def __init__(self, subscriber: Subscriber[T]) -> None:
-        self._subscriber = subscriber
-
-    def __iter__(self) -> Iterator[T]:
-        return self
-
-    def __next__(self) -> T:
-        try:
-            return self._subscriber.recv()
-        except Closed:
-            raise StopIteration from None

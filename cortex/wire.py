@@ -101,13 +101,14 @@ def unpack_header(frame: bytes | memoryview) -> Header:
     )
 
 
-def control_frame(message: Any, sequence: int = 0, *, source: int = 0) -> bytes:
-    """One control message as a frame of kind `C`."""
+def control_frame(message: Any, sequence: int = 0, *, source: int = 0, told_ns: int = 0) -> bytes:
+    """One control message as a frame of kind `C`; `told_ns` is the time that an `Alive` tells."""
     codec = codec_of(type(message))
     body = codec.encode(message, CONTROL_LIMIT)
     if body is None:
         raise ValueError(f"a control message of {codec.size(message)} bytes exceeds {CONTROL_LIMIT}")
-    return pack_header(Header(CONTROL, source, codec.fingerprint, sequence, None, 0, len(body), 0)) + body
+    header = Header(CONTROL, source, codec.fingerprint, sequence, None, told_ns, len(body), 0)
+    return pack_header(header) + body
 
 
 def parse_control(frame: bytes, types: Mapping[int, type]) -> tuple[Any, Header]:

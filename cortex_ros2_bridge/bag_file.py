@@ -65,13 +65,14 @@ class BagWriter:
         self._ways: dict[str, list[_Way]] = {}
         self._closed = False
 
-    def write(self, topic: str, message: Any, *, frame_id: str = "") -> None:
-        """Write a message.
+    def write(self, topic: str, message: Any, *, frame_id: str = "", at_ns: int | None = None) -> int:
+        """Write a message, and return how many messages of ROS were made of it.
 
         Args:
             topic: In Cortex, such as "/drone/imu".
             message: Any message with a stamp.
             frame_id: Frame of a message that does not name its own, such as "drone/base_link".
+            at_ns: Its time in the bag [ns]; None: its stamp.
 
         Raises:
             ConvertError: ROS has no such values.
@@ -79,11 +80,14 @@ class BagWriter:
         """
         if topic not in self._ways:
             self._ways[topic] = self._ways_of(topic, message, frame_id)
+        written = 0
         for convert, context, publisher in self._ways[topic]:
             data = convert(message, context)
             if data is not None:
-                publisher.publish(data, at_ns=message.stamp_ns)
+                written += 1
+                publisher.publish(data, at_ns=message.stamp_ns if at_ns is None else at_ns)
             context.sequence += 1
+        return written
 
     def close(self) -> None:
         """Complete the bag. Closing twice is allowed."""
@@ -129,6 +133,7 @@ class BagReader:
     Attributes:
         topics: Type in ROS of each topic that can be read, but for commands.
         commands: Likewise of commands, which are read where they are asked for.
+        others: The topics that cannot be read.
     """
 
     def __init__(self, path: Path, *, max_thrust_n: float | None = None) -> None:
@@ -149,6 +154,9 @@ class BagReader:
         self.topics = {each.topic: each.msgtype for each in self._connections}
         self.commands = {each.topic: each.msgtype for each in of_commands}
         self._connections += of_commands
+        self.others = sorted(
+            {each.topic for each in self._reader.connections} - self.topics.keys() - self.commands.keys()
+        )
 
     def messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
         """Yield topics and messages of Cortex in the order in which they were recorded.
@@ -159,13 +167,18 @@ class BagReader:
         Raises:
             BagError: The bag is damaged, or has a message that cannot be used.
         """
+        for topic, message, _ in self.timed_messages(*topics):
+            yield topic, message
+
+    def timed_messages(self, *topics: str) -> Iterator[tuple[str, Any, int]]:
+        """As `messages`, with the time at which each was recorded [ns]."""
         chosen = [each for each in self._connections if each.topic in (topics or self.topics)]
         if not chosen:
             return
         decoders = {each.id: self._decoder_of(each) for each in chosen}
-        for connection, data in self._raw(chosen):
+        for connection, data, at_ns in self._raw(chosen):
             try:
-                yield connection.topic, decoders[connection.id](data)
+                yield connection.topic, decoders[connection.id](data), at_ns
             except (cdr.CdrError, ConvertError, EventCodecError, struct.error, ValueError) as error:
                 raise BagError(f"{self._path}: {connection.topic}: {error}") from None
 
@@ -186,12 +199,12 @@ class BagReader:
 
         return decode
 
-    def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, Buffer]]:
+    def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, Buffer, int]]:
         try:
-            for connection, _, data in self._reader.messages(connections):
+            for connection, at_ns, data in self._reader.messages(connections):
                 if self._ros1 and connection.msgtype != _EVENT_ARRAY:
                     data = typestore().ros1_to_cdr(data, connection.msgtype)
-                yield connection, data
+                yield connection, data, at_ns
         except Exception as error:
             raise BagError(f"{self._path} is damaged: {error}") from None
 

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -45,6 +46,7 @@ _EXAMPLES = """examples:
   cortex-ros2-bridge --list                            what would go where
   cortex-ros2-bridge --print-config > bridge.yaml      settings to edit, for --config bridge.yaml
   cortex-ros2-bridge --backend run.mcap                into a bag, until Ctrl-C
+  cortex-ros2-bridge --convert bag log.mcap            a bag for `cortex play`; a log into a bag likewise
 """
 
 
@@ -56,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _parser().parse_args(arguments)
         _log_to_console(logging.DEBUG if options.verbose else ros.log_level or logging.INFO)
         make, given = _settings(options, ros)
+        if options.convert:
+            return _convert(*options.convert)
         if options.list or options.print_config:
             return _show(make(given), as_yaml=options.print_config)
         return _bridge(make, given, beside=options.beside)
@@ -64,6 +68,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError, RuntimeError) as error:
         print(f"cortex-ros2-bridge: {error}", file=sys.stderr)
         return 1
+
+
+def _convert(source: Path, target: Path) -> int:
+    from cortex_ros2_bridge.log_file import convert
+
+    counts, others = convert(source, target)
+    for topic, count in sorted(counts.items()):
+        print(f"{topic}  {count}")
+    if others:
+        print(f"left out: {', '.join(others)}", file=sys.stderr)
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -87,6 +102,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--cortex-domain", "--domain", type=int, help="domain of Cortex; that of ROS is ROS_DOMAIN_ID"
+    )
+    parser.add_argument(
+        "--convert",
+        nargs=2,
+        type=Path,
+        metavar=("SOURCE", "TARGET"),
+        help="convert a bag into a log of Cortex, or a log into a bag, and exit",
     )
     parser.add_argument("--version", action="version", version=f"cortex-ros2-bridge {_version()}")
     parser.add_argument("--list", action="store_true", help="print which topic would go where, and exit")

@@ -8,7 +8,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 import neurosim_core as ns
-from neurosim_core.sensors import ErrorConfig, Motion, StateSampler, make_reader
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,7 +20,7 @@ class Airflow(ns.Packet):
 
 # annotations must be objects: a file with such a function has no `from __future__ import annotations`
 @wp.func
-def _read_air(scale: wp.float64, motion: Motion, world: int, output: int) -> wp.vec3d:
+def _read_air(scale: wp.float64, motion: ns.sensors.Motion, world: int, output: int) -> wp.vec3d:
     against = motion.air_velocity[world] - motion.velocity[world]
     return scale * wp.quat_rotate_inv(motion.orientation[world], against)
 
@@ -33,7 +32,7 @@ class AnemometerConfig(ns.sensors.StateSensorConfig):
     kind: Literal["anemometer"] = "anemometer"
     rate_hz: ns.sensors.RateHz = 100.0
     """Readings a second [Hz]."""
-    errors: ErrorConfig = ErrorConfig(white=0.05, markov=0.1)
+    errors: ns.sensors.ErrorConfig = ns.sensors.ErrorConfig(white=0.05, markov=0.1)
     """In m/s."""
 
     scale: float = 1.0
@@ -41,10 +40,10 @@ class AnemometerConfig(ns.sensors.StateSensorConfig):
 
     packet_type = Airflow
 
-    def make(self, context: ns.sensors.SamplerContext) -> StateSampler:
+    def make(self, context: ns.sensors.SamplerContext) -> ns.sensors.StateSampler:
         """Return the sensor at work."""
         scale, errors = wp.float64(self.scale), {"air": self.errors}
-        return make_reader(context, _read_air, scale, errors, Airflow, rate_hz=self.rate_hz)
+        return ns.sensors.make_reader(context, _read_air, scale, errors, Airflow, rate_hz=self.rate_hz)
 
 
 def main() -> float:

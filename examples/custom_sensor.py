@@ -15,9 +15,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 import neurosim_core as ns
-from neurosim_core.flight import fly
-from neurosim_core.packets import FieldSpec
-from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,11 +22,11 @@ class Proximity(ns.Packet):
     """What the switch reads: its recording, plot and messages follow from these fields."""
 
     closed: bool
-    height_m: Annotated[float, FieldSpec(unit="m")]
+    height_m: Annotated[float, ns.packets.FieldSpec(unit="m")]
 
 
 @ns.register("sensor", "proximity")
-class ProximityConfig(StateSensorConfig):
+class ProximityConfig(ns.sensors.StateSensorConfig):
     """A switch that closes below a height."""
 
     kind: Literal["proximity"] = "proximity"
@@ -40,15 +37,15 @@ class ProximityConfig(StateSensorConfig):
 
     packet_type = Proximity
 
-    def make(self, context: SamplerContext) -> ProximitySampler:
+    def make(self, context: ns.sensors.SamplerContext) -> ProximitySampler:
         """Return the switch at work."""
         return ProximitySampler(self.threshold_m, context)
 
 
-class ProximitySampler(Sampler):
+class ProximitySampler(ns.sensors.Sampler):
     """Copies the heights of the vehicles of all worlds on the device; the host compares them."""
 
-    def __init__(self, threshold_m: float, context: SamplerContext) -> None:
+    def __init__(self, threshold_m: float, context: ns.sensors.SamplerContext) -> None:
         self._threshold_m, self._position = threshold_m, context.vehicle.arrays.position
         shape = (context.slot_count, context.vehicle.count)
         self.arrays = {"position": wp.zeros(shape, dtype=wp.vec3d, device=self._position.device)}
@@ -67,7 +64,7 @@ def main(out: Path = Path("proximity")) -> int:
     """Fly a descent; return how many readings said that the switch was closed."""
     sensors = {"proximity": {"kind": "proximity", "threshold_m": 1.45}}
     config = {"duration_s": 2.0, "device": "cpu", "scene": {"rooms": 1}, "sensors": sensors}
-    fly(ns.load_config(config), out)
+    ns.fly(ns.load_config(config), out)
     with ns.Recording(out / "flight.h5") as flight:
         readings = [packet for packet in flight.packets() if isinstance(packet, Proximity)]
     closed = sum(reading.closed for reading in readings)

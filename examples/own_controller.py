@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 import neurosim_core as ns
-from neurosim_core.sim import observe
 
 
 def main() -> float:
@@ -23,12 +22,12 @@ def main() -> float:
     )
     model = ns.make_model(config)
     state = ns.make_state(model)
-    goal = observe(state).position + np.array([0.0, 0.0, 0.5])
+    goal = ns.sim.observe(state).position + np.array([0.0, 0.0, 0.5])
     while state.stamp_ns < 4_000_000_000:
-        away = goal - observe(state).position
+        away = goal - ns.sim.observe(state).position
         velocity = np.clip(2.0 * away, -0.5, 0.5)
         ns.step(model, state, ns.Velocity(velocity_m_s=velocity.tolist(), yaw_rate_rad_s=0.0))
-    error_m = float(np.linalg.norm(goal - observe(state).position))
+    error_m = float(np.linalg.norm(goal - ns.sim.observe(state).position))
     print(f"{1e3 * error_m:.1f} mm from the goal after 4 s")
     return error_m
 

@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 
 import neurosim_core as ns
-from neurosim_core.data.ray_source import cluster
-from neurosim_core.data.sources import RunSource
-from neurosim_core.data.windows import WindowConfig
 
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
 CONFIG = {
@@ -37,16 +34,13 @@ def train() -> None:
     import ray.train.torch
     import torch
 
-    from neurosim_core.learn.dense import DenseNet
-    from neurosim_core.learn.depth import depth_loss
-
-    net = ray.train.torch.prepare_model(DenseNet((0.7,), channels=4))
+    net = ray.train.torch.prepare_model(ns.learn.DenseNet((0.7,), channels=4))
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     shard = ray.train.get_dataset_shard("train")
     for _ in range(4):
         for batch in shard.iter_torch_batches(batch_size=5, dtypes=torch.float32):
             predicted, _ = net(batch["voxel"])
-            loss = depth_loss(predicted, batch["depth"][:, None])
+            loss = ns.learn.depth_loss(predicted, batch["depth"][:, None])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -60,9 +54,11 @@ def main() -> dict[str, Any]:
     """Return the last loss of worker 0, and how many workers there were."""
     import ray.train.torch
 
-    with tempfile.TemporaryDirectory() as name, cluster("local"):
+    with tempfile.TemporaryDirectory() as name, ns.data.cluster("local"):
         shards = Path(name, "shards")
-        ns.data.write_shards(RunSource(CONFIG).samples(WindowConfig(window_s=0.05)), shards, windows=5)
+        ns.data.write_shards(
+            ns.data.RunSource(CONFIG).samples(ns.data.WindowConfig(window_s=0.05)), shards, windows=5
+        )
         trainer = ray.train.torch.TorchTrainer(
             train,
             datasets={"train": ray.data.read_webdataset(str(shards)).map(voxel_and_depth)},

@@ -14,8 +14,6 @@ import numpy as np
 import warp as wp
 
 import neurosim_core as ns
-from neurosim_core.live.remote_renderer import Frames, serve_frames
-from neurosim_core.render.conformance import check_renderer
 
 SCENE = {"kind": "apartment", "rooms": 1}
 LENS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -27,7 +25,7 @@ def render_process(topic: str, ready: Any, done: Any) -> None:
     scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
     cameras: dict[ns.PinholeConfig, Any] = {}
 
-    def render(request: Any) -> Frames:
+    def render(request: Any) -> ns.Frames:
         lens = ns.PinholeConfig(**{name: getattr(request, name) for name in LENS})
         if lens not in cameras:
             cameras[lens] = ns.make_renderer(scene, lens, outputs=["depth", "rgb"], instant_count=1)
@@ -38,11 +36,11 @@ def render_process(topic: str, ready: Any, done: Any) -> None:
             camera.render(p_WC, q_WC, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
             depths.append(camera.depth.numpy()[0].copy())
             pictures.append(camera.rgb.numpy()[0].copy())
-        return Frames(srgb=np.array(pictures), depth=np.array(depths))
+        return ns.Frames(srgb=np.array(pictures), depth=np.array(depths))
 
     stop = threading.Event()
     threading.Thread(target=lambda: (done.wait(), stop.set()), daemon=True).start()
-    serve_frames(render, topic=topic, stop=stop, on_ready=ready.set)
+    ns.serve_frames(render, topic=topic, stop=stop, on_ready=ready.set)
 
 
 def main() -> tuple[int, list[str]]:
@@ -60,7 +58,7 @@ def main() -> tuple[int, list[str]]:
         renderer = {"kind": "remote", "topic": "/example/renderer"}
         model = ns.make_model(ns.load_config({**config, "renderer": renderer}))
         pictures = [p for p in ns.run_model(model, ns.make_state(model)) if isinstance(p, ns.Image)]
-        complaints = check_renderer(
+        complaints = ns.check_renderer(
             model.scene_on_device,
             ns.PinholeConfig(**lens),
             position=model.path.evaluate([0]).position[0],

@@ -13,50 +13,51 @@ from numpy.typing import NDArray
 
 import neurosim_core as ns
 from neurosim_core.bench.rotorpy_peer import make_rotorpy_vehicle
-from neurosim_core.vehicle import Acceleration, MultirotorConfig, MultirotorState
-from neurosim_core.vehicle.config import VehicleConfig, VehicleContext
-from neurosim_core.vehicle.host_vehicle import HostVehicle
 
-_NAMES = dict(zip(MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
+_NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 
 
 @ns.register("vehicle", "rotorpy")
-class RotorPyVehicleConfig(VehicleConfig):
+class RotorPyVehicleConfig(ns.vehicle.VehicleConfig):
     """RotorPy's multirotor, with the parameters of one of our airframes."""
 
     kind: Literal["rotorpy"] = "rotorpy"
     preset: str = "hummingbird"
     """Name of the airframe."""
 
-    def airframe(self) -> MultirotorConfig:
+    def airframe(self) -> ns.MultirotorConfig:
         """Return what controllers take it for."""
         return ns.preset(self.preset)
 
-    def make(self, context: VehicleContext) -> RotorPyVehicle:
+    def make(self, context: ns.vehicle.VehicleContext) -> RotorPyVehicle:
         """Return the vehicles of all worlds."""
         return RotorPyVehicle(self.airframe(), context)
 
 
-class RotorPyVehicle(HostVehicle):
+class RotorPyVehicle(ns.vehicle.HostVehicle):
     """Integrates with RotorPy, one vehicle after the other."""
 
-    def __init__(self, config: MultirotorConfig, context: VehicleContext) -> None:
+    def __init__(self, config: ns.MultirotorConfig, context: ns.vehicle.VehicleContext) -> None:
         super().__init__(config, context)
         self._vehicle = make_rotorpy_vehicle(config)
 
     def move(
-        self, state: MultirotorState, command: NDArray[np.float64], duration_s: float
-    ) -> MultirotorState:
+        self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64], duration_s: float
+    ) -> ns.vehicle.MultirotorState:
         """Let RotorPy integrate."""
         later = self._vehicle.step(self._told(state), {"cmd_motor_speeds": command}, duration_s)
-        return MultirotorState(*(later[_NAMES[name]] for name in MultirotorState._fields))
+        return ns.vehicle.MultirotorState(
+            *(later[_NAMES[name]] for name in ns.vehicle.MultirotorState._fields)
+        )
 
-    def acceleration(self, state: MultirotorState, command: NDArray[np.float64]) -> Acceleration:
+    def acceleration(
+        self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64]
+    ) -> ns.vehicle.Acceleration:
         """Ask RotorPy for the derivatives; IMUs need them."""
         rates = self._vehicle.statedot(self._told(state), {"cmd_motor_speeds": command}, 0.0)
-        return Acceleration(linear=rates["vdot"], angular=rates["wdot"])
+        return ns.vehicle.Acceleration(linear=rates["vdot"], angular=rates["wdot"])
 
-    def _told(self, state: MultirotorState) -> dict[str, Any]:
+    def _told(self, state: ns.vehicle.MultirotorState) -> dict[str, Any]:
         return {_NAMES[name]: value for name, value in state._asdict().items()} | {"wind": np.zeros(3)}
 
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:  # isort: off
         registry as registry,
         scene as scene,
         sensors as sensors,
+        sim as sim,
+        vehicle as vehicle,
     )
     from neurosim_core.config import (
         ConfigError as ConfigError,
@@ -31,10 +33,15 @@ if TYPE_CHECKING:  # isort: off
         Position as Position,
         Velocity as Velocity,
     )
+    from neurosim_core.flight import fly as fly
     from neurosim_core.frames import Mount as Mount
     from neurosim_core.live.messages import (
         message_type as message_type,
         to_packet as to_packet,
+    )
+    from neurosim_core.live.remote_renderer import (
+        Frames as Frames,
+        serve_frames as serve_frames,
     )
     from neurosim_core.packets import (
         Collision as Collision,
@@ -47,6 +54,7 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core.record import Recording as Recording
     from neurosim_core.registry import register as register
     from neurosim_core.render.camera import PinholeConfig as PinholeConfig
+    from neurosim_core.render.conformance import check_renderer as check_renderer
     from neurosim_core.render.renderer import (
         make_renderer as make_renderer,
         upload_scene as upload_scene,

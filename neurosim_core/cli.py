@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
+    if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         if arguments.computes:
@@ -56,6 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return int(arguments.command(arguments))
         except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+            if arguments.debug:
+                raise
             print(f"neurosim: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
@@ -99,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
     parser.set_defaults(computes=True)
+    parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
@@ -126,7 +132,7 @@ def _add_run(commands: _Commands) -> None:
     )
     run.add_argument("--overwrite", action="store_true", help="replace a flight that is already in --out")
     run.add_argument("--no-rrd", action="store_true", help="leave out flight.rrd")
-    run.set_defaults(command=_run)
+    run.set_defaults(command=_run, computes=False)  # it starts Warp itself
 
 
 def _add_serve(commands: _Commands) -> None:
@@ -351,7 +357,13 @@ def _load(arguments: argparse.Namespace, overrides: dict[str, Any]) -> Simulatio
 def _run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    with Console(stderr=True).status("preparing: libraries"):  # on the screen before they are there
+    with (
+        Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
+        ThreadPoolExecutor(max_workers=1) as aside,
+    ):
+        from neurosim_core.warp_start import start_warp
+
+        aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
         config = _load(arguments, _overrides(arguments))
         if not arguments.print_config:
             from neurosim_core.flight import fly, new_folder

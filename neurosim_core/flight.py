@@ -191,16 +191,19 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     """Return the Rerun file of a flight; write it from the recording if there is none, or to `save` if given.
 
     Args:
-        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file of events.
+        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
         save: Write here.
 
     Raises:
         FileNotFoundError: There is no flight.
         ImportError: Rerun or h5py is not installed.
     """
-    recorded = flight / "flight.h5" if flight.is_dir() else flight
-    made = recorded.with_suffix(".rrd")
-    if save is None and made.exists():
+    recorded = flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
+    # events.raw and events.csv may be different events: each has a Rerun file of its own
+    is_flight = recorded.suffix in (".h5", ".rrd")
+    made = recorded.with_suffix(".rrd") if is_flight else recorded.with_name(f"{recorded.name}.rrd")
+    is_newer = made.exists() and (is_flight or made.stat().st_mtime_ns > recorded.stat().st_mtime_ns)
+    if save is None and is_newer:
         return made
     if not recorded.exists():
         folder = flight if flight.suffix == "" else "DIR"
@@ -389,7 +392,7 @@ class _Files:
 def _load(model: Model, is_lit: Callable[[], bool], *, rerun: bool) -> None:
     """Load what is used later while the scene is lit: kernels, then libraries as long as there is time."""
     warm_flight(model)
-    imports: list[Callable[[], object]] = [import_h5py, *([import_rerun] if rerun else []), _load_matplotlib]
+    imports: list[Callable[[], object]] = [import_h5py, *([import_rerun] if rerun else [])]
     for load in imports:
         if is_lit():
             break

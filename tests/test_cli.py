@@ -310,8 +310,15 @@ def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+def test_debug_shows_where_an_error_arose(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"nothing\.yaml") as error:
+        cli.main(["--debug", "run", "nothing.yaml"])
+    assert error.traceback[-1].path.name == "config.py"
+
+
 @pytest.mark.parametrize("command", ["run", "serve", "fly", "up"])
-def test_mistakes_in_a_file_are_said_of_the_file(command, tmp_path, capsys):
+def test_errors_in_a_file_are_said_of_the_file(command, tmp_path, capsys):
     """Nobody has typed an option: the file and its keys are named, and what is typed beside it as it is."""
     file = tmp_path / "scene.yaml"
     file.write_text("{duration_s: -5, seed: -1, device: gpu, live: {real_time_factor: -1}}")
@@ -338,7 +345,7 @@ def test_mistakes_in_a_file_are_said_of_the_file(command, tmp_path, capsys):
         (["scene.seed=[3"], "--set scene.seed: the value '[3' is not YAML"),
     ],
 )
-def test_mistakes_of_set_are_said_of_it(settings, said, capsys):
+def test_errors_of_set_are_said_of_it(settings, said, capsys):
     options = [part for text in settings for part in ("--set", text)]
     assert cli.main(["run", *options]) == 1
     (line,) = capsys.readouterr().err.splitlines()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,16 @@ import neurosim_core as ns
 @pytest.mark.parametrize("name", ns.__all__)
 def test_every_public_name_is_there(name):
     assert getattr(ns, name) is not None
+
+
+def test_examples_and_documents_need_no_other_import():
+    """One exception: parameters under RotorPy's names."""
+    root = Path(__file__).parents[1]
+    files = [root / "README.md", *root.glob("docs/**/*.md"), *root.glob("examples/*.py")]
+    wanted = {
+        name for file in files for name in re.findall(r"from (neurosim_core[\w.]*) import", file.read_text())
+    }
+    assert wanted == {"neurosim_core.bench.rotorpy_peer"}
 
 
 def test_an_unknown_name_is_said():

@@ -18,7 +18,7 @@ from cortex.bench.cases import choose
 from cortex.bench.measure import CaseResult, Settings, run_case
 from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
-from cortex.bench.report import make_console, print_case, print_header, print_summary, write_csv
+from cortex.bench.report import print_case, print_header, print_summary, write_csv
 
 _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
@@ -57,7 +57,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> list[CaseResult]:
     """Run the cases, each printed when it is over."""
-    console = make_console()
     cases = choose(options.case)
     if options.against is not None:
         cases = [case.beside(str(options.against.resolve())) for case in cases]
@@ -73,18 +72,18 @@ def _run(options: argparse.Namespace) -> list[CaseResult]:
     results: list[CaseResult] = []
     with ExitStack() as stack:
         _make_place(stack, options.against)
-        print_header(console)
-        console.print(
+        print_header()
+        print(
             f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved; "
             "median ± half of what lies between the quartiles\n"
         )
         try:
             for case in cases:
                 results.append(run_case(case, settings))
-                print_case(console, results[-1])
+                print_case(results[-1])
         except KeyboardInterrupt:
-            console.print("interrupted; what was measured until then:\n")
-    print_summary(console, results, judged=not options.quick)
+            print("interrupted; what was measured until then:\n")
+    print_summary(results, judged=not options.quick)
     return results
 
 

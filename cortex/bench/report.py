@@ -10,23 +10,15 @@ from datetime import datetime
 from pathlib import Path
 
 import zmq
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from cortex.bench.cases import METRICS, Bar
 from cortex.bench.measure import CaseResult, Spread, Verdict, faults_of, spread_of, values_of
+from cortex.commands.text import table
 
-WIDTH = 110
 _PEERS = ("pyzmq", "numpy", "cyclonedds", "rclpy")
 
 
-def make_console() -> Console:
-    """Return what prints the tables, as wide as a page, to a terminal or a file."""
-    return Console(width=WIDTH, highlight=False, markup=False, emoji=False)
-
-
-def print_header(console: Console) -> None:
+def print_header() -> None:
     """Print what the figures depend on: date, machine, versions, load."""
     versions = [f"Python {platform.python_version()}", f"libzmq {zmq.zmq_version()}"]
     for name in _PEERS:
@@ -36,48 +28,44 @@ def print_header(console: Console) -> None:
             versions.append(f"{name} not installed")
     load = " ".join(f"{value:.2f}" for value in os.getloadavg())
     system = f"{platform.system()} {platform.release()}"
-    console.print(f"cortex bench, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}")
-    console.print(f"{os.cpu_count()} cores, {_processor()}, {system}, load {load}")
-    console.print(", ".join(versions))
+    print(f"cortex bench, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}")
+    print(f"{os.cpu_count()} cores, {_processor()}, {system}, load {load}")
+    print(", ".join(versions))
 
 
-def print_case(console: Console, result: CaseResult) -> None:
+def print_case(result: CaseResult) -> None:
     """Print what each contestant of a case did."""
     case = result.case
-    console.print(f"{case.name}: {case.title}; payload {4 * case.floats:,} B")
-    table = Table(box=None, show_header=False, padding=(0, 3, 0, 0))
-    for _ in ("name", *case.metrics):
-        table.add_column(no_wrap=True)
-    for name, reports in result.reports.items():
-        cells = [_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics]
-        table.add_row(f"  {name}", *cells, faults_of(reports))
-    console.print(table)
-    console.print()
+    print(f"{case.name}: {case.title}; payload {4 * case.floats:,} B")
+    rows = [
+        (
+            name,
+            *(_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics),
+            faults_of(reports),
+        )
+        for name, reports in result.reports.items()
+    ]
+    for line in table(("", *(METRICS[metric].text for metric in case.metrics), "<"), rows, indent="  "):
+        print(line)
+    print(flush=True)
 
 
-def print_summary(console: Console, results: list[CaseResult], *, judged: bool) -> None:
+def print_summary(results: list[CaseResult], *, judged: bool) -> None:
     """Print the table of all bars, and how many are met."""
-    table = Table(box=box.HORIZONTALS, padding=(0, 2, 0, 0))
-    for title in ("case", "what", "measured", "bar", "verdict"):
-        table.add_column(title, no_wrap=title != "what", justify="right" if title == "measured" else "left")
-    words = []
+    words, rows = [], []
     for result in results:
         for verdict in result.verdicts():
             words.append(_word(verdict, judged).partition(" (")[0])  # the reason stands above
-            table.add_row(
-                result.case.name,
-                _what(verdict.bar, verdict.against),
-                _measured(verdict),
-                _bound(verdict.bar),
-                words[-1],
-            )
+            what, measured = _what(verdict.bar, verdict.against), _measured(verdict)
+            rows.append((result.case.name, what, measured, _bound(verdict.bar), words[-1]))
     if words:
-        console.print(table)
+        for line in table(("case", "<what", "measured", "<bar", "<verdict"), rows):
+            print(line)
     counts = {
         word: sum(w.startswith(word) for w in words)
         for word in ("met", "missed", "not measured", "not judged")
     }
-    console.print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
+    print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
 
 
 def write_csv(path: Path, results: list[CaseResult]) -> None:
@@ -98,8 +86,7 @@ def _cell(spread: Spread | None, metric: str) -> str:
     if spread is None:
         return ""
     percent = 50.0 * (spread.high - spread.low) / spread.median if spread.median else 0.0
-    name = "" if metric == "rate" else f"{METRICS[metric].text} "
-    return f"{name}{_number(spread.median)} {METRICS[metric].unit} ± {percent:.0f} %"
+    return f"{_number(spread.median)} {METRICS[metric].unit} ± {percent:.0f} %"
 
 
 def _number(value: float) -> str:

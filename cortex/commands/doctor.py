@@ -10,12 +10,15 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import zmq
 
+from cortex.commands.session import open_node
+from cortex.commands.text import seconds
 from cortex.compiled import native
 from cortex.host import REGISTRY_LOCK, FileLock, domain_id, runtime_dir
 from cortex.message import message
@@ -23,6 +26,8 @@ from cortex.security import PUBLIC_FILE, default_directory, load_keys
 
 _FILES_MIN = 1024
 _EXCHANGE_S = 20.0
+_CLOCK_S = 18.0
+"""Longest wait for an estimate of the drift of the clock [s]."""
 
 
 class Fault(Exception):
@@ -44,9 +49,12 @@ def examine(options: argparse.Namespace) -> int:
         ("C module", _check_native),
         ("shared memory", _check_memory),
         ("limits", _check_limits),
-        ("CURVE", _check_curve),
+        ("CURVE", lambda: _check_curve(options)),
         ("two processes", _check_exchange),
     ]
+    if options.registry not in ("auto", "off"):
+        checks[1] = ("registry", lambda: options.registry)
+        checks.append(("clock", lambda: _check_clock(options)))
     faults = 0
     for name, check in checks:
         try:
@@ -90,8 +98,8 @@ def _check_native() -> str:
 
 
 def _check_memory() -> str:
-    if not hasattr(os, "memfd_create"):
-        raise Fault(f"{sys.platform} has no memfd: large messages go through sockets, with two copies more")
+    if sys.platform != "linux":
+        return f"none, {sys.platform} has no memfd: large messages go through sockets, with two copies more"
     descriptor = os.memfd_create("cortex-doctor", os.MFD_ALLOW_SEALING)
     try:
         os.ftruncate(descriptor, 1 << 20)
@@ -116,16 +124,32 @@ def _check_limits() -> str:
     return f"{files} open files, no limit to their size"
 
 
-def _check_curve() -> str:
+def _check_curve(options: argparse.Namespace) -> str:
     if not zmq.has("curve"):
         raise Fault(
             "this libzmq has no CURVE, so tcp cannot be encrypted: `pip install pyzmq` brings one that has"
         )
-    directory = default_directory()
+    directory = options.keys or Path(os.environ.get("CORTEX_KEYS") or default_directory())
     if not (directory / PUBLIC_FILE).exists():
         return f"there; no keys in {directory} (`cortex keys new` makes some)"
     keys = load_keys(directory)
     return f"keys in {directory}, {len(keys.authorized) - 1} others are authorised"
+
+
+def _check_clock(options: argparse.Namespace) -> str:
+    """This host's clock beside that of the registry's: what `time.time` of both would disagree by."""
+    with open_node(options) as node:
+        deadline_s = time.monotonic() + _CLOCK_S
+        while ((clock := node.clock()) is None or clock.drift_ppm is None) and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+    if clock is None:
+        raise Fault(f"the registry at {options.registry} does not answer: does it run, are the keys known?")
+    ahead = "ahead of" if clock.ahead_ns >= 0 else "behind"
+    drift = "" if clock.drift_ppm is None else f", and gains {clock.drift_ppm:.1f} us a second"
+    return (
+        f"{seconds(abs(clock.ahead_ns) * 1e-9)} {ahead} the registry's, to {seconds(clock.error_ns * 1e-9)}"
+        f"{drift}; stamps of `node.now_ns()` agree"
+    )
 
 
 def _check_exchange() -> str:
@@ -134,17 +158,18 @@ def _check_exchange() -> str:
     from cortex.policy import reliable
 
     with tempfile.TemporaryDirectory(prefix="cortex-doctor-") as directory:
-        environment = {**os.environ, "CORTEX_RUNTIME_DIR": directory, "CORTEX_DOMAIN": "0"}
         root = str(Path(__file__).resolve().parents[2])
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
-        before = {name: os.environ.get(name) for name in ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN")}
+        path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+        before = {name: os.environ.pop(name, None) for name in _ENVIRONMENT}
         os.environ.update(CORTEX_RUNTIME_DIR=directory, CORTEX_DOMAIN="0")
         command = [sys.executable, "-c", "from cortex.commands.doctor import publish; publish()"]
         try:
             with (
                 Node("doctor") as node,
                 node.subscriber("/doctor", Sample, policy=reliable()) as subscriber,
-                subprocess.Popen(command, env=environment, stdin=subprocess.PIPE) as child,
+                subprocess.Popen(
+                    command, env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.PIPE
+                ) as child,
             ):
                 try:
                     sizes = [len(each.data) for each in _receive(subscriber)]
@@ -153,14 +178,15 @@ def _check_exchange() -> str:
                     child.kill()
         finally:
             for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
+                os.environ.pop(name, None) if value is None else os.environ.update({name: value})
     if sizes != _SIZES:
         raise Fault(f"messages of {_SIZES} bytes were sent, {sizes} have come")
-    if not any("shared memory" in carrier for carrier in carriers):
+    if sys.platform == "linux" and not any("shared memory" in carrier for carrier in carriers):
         raise Fault(f"they meet, but share no memory ({'; '.join(carriers)}): see above")
     return f"they talk by {'; '.join(carriers)}"
 
 
+_ENVIRONMENT = ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN", "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
 _SIZES = [10, 1_000_000]
 
 

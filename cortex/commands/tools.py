@@ -29,8 +29,8 @@ def make_keys(options: argparse.Namespace) -> int:
     hint(
         f"The line above is the public key. The keys are in {directory}.\n"
         f"1. Add it to the file {AUTHORIZED_FILE} of each that shall talk to us.\n"
-        f"2. Add their public keys to {directory / AUTHORIZED_FILE}.\n"
-        f"3. Use --keys {directory}."
+        f"2. Add their public keys to {directory / AUTHORIZED_FILE}, and its host behind the registry's.\n"
+        f"3. Use --keys {directory}, or set CORTEX_KEYS to it."
     )
     return 0
 

@@ -79,7 +79,7 @@ def show_rate(options: argparse.Namespace) -> int:
     """`cortex hz`: the time between messages as they were published, which our own delays do not change."""
     last: dict[int, tuple[int, int]] = {}
 
-    def period(info: Info) -> float | None:
+    def period(info: Info, _: Node) -> float | None:
         sequence, publish_ns = last.get(info.source, (-1, 0))
         last[info.source] = info.sequence, info.publish_ns
         return (info.publish_ns - publish_ns) * 1e-9 if info.sequence == sequence + 1 > 0 else None
@@ -89,18 +89,18 @@ def show_rate(options: argparse.Namespace) -> int:
 
 def show_bandwidth(options: argparse.Namespace) -> int:
     """`cortex bw`."""
-    return _watch(options, lambda info: float(info.size), "size", bytes_of)
+    return _watch(options, lambda info, _: float(info.size), "size", bytes_of)
 
 
 def show_delay(options: argparse.Namespace) -> int:
     """`cortex delay`."""
     if not options.stamp:
-        return _watch(options, lambda info: info.latency_ns * 1e-9, "delay", seconds)
+        return _watch(options, lambda info, _: info.latency_ns * 1e-9, "delay", seconds)
 
-    def age(info: Info) -> float:
+    def age(info: Info, node: Node) -> float:
         if info.stamp_ns is None:
             raise CommandError(f"the messages of {info.topic} have no stamp_ns")
-        return (time.time_ns() - info.stamp_ns) * 1e-9
+        return (node.now_ns() - info.stamp_ns) * 1e-9
 
     return _watch(options, age, "age", seconds)
 
@@ -122,7 +122,7 @@ class _Second:
 
 def _watch(
     options: argparse.Namespace,
-    measure: Callable[[Info], float | None],
+    measure: Callable[[Info, Node], float | None],
     what: str,
     show: Callable[[float], str],
 ) -> int:
@@ -130,7 +130,7 @@ def _watch(
     with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
         patience = Patience(node, options.topic)
         window: deque[_Second] = deque(maxlen=max(1, round(options.window)))
-        for printed, second in enumerate(_by_second(subscriber, measure, patience)):
+        for printed, second in enumerate(_by_second(subscriber, lambda info: measure(info, node), patience)):
             window.append(second)
             if printed % _HEAD_EVERY == 0:
                 second_title = "bandwidth" if what == "size" else "std"

@@ -18,12 +18,14 @@ from cortex.log.format import LogError, LogInfo, LogTopic
 from cortex.log.player import Player
 from cortex.log.reader import Log, open_log
 from cortex.log.recorder import Recorder, RecordStats, TopicStats
+from cortex.log.writer import LogWriter
 
 __all__ = [
     "Log",
     "LogError",
     "LogInfo",
     "LogTopic",
+    "LogWriter",
     "Player",
     "RecordStats",
     "Recorder",

@@ -11,8 +11,9 @@ record `cortex.start` says where and when, `cortex.end` what was counted, as JSO
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
+from cortex.log.sink import Sink
 from cortex.schema import Schema
 
 PROFILE = "cortex"
@@ -20,6 +21,7 @@ MESSAGE_ENCODING = "cortex"
 SCHEMA_ENCODING = "cortex-json"
 FORMAT_VERSION = "1"
 START, END = "cortex.start", "cortex.end"
+CHUNK_BYTES = 1 << 20
 
 
 class LogError(ValueError):
@@ -38,6 +40,20 @@ def require_mcap() -> None:
         raise ImportError(
             "recordings need the library mcap, which is not installed: pip install mcap"
         ) from error
+
+
+def open_writer(sink: Sink, compression: str) -> Any:
+    """Open the writer of the library `mcap`; the compression is "none", "lz4" or "zstd"."""
+    from mcap.exceptions import UnsupportedCompressionError
+    from mcap.writer import CompressionType, Writer
+
+    try:
+        return Writer(
+            cast(Any, sink), chunk_size=CHUNK_BYTES, compression=CompressionType[compression.upper()]
+        )
+    except UnsupportedCompressionError as error:
+        library = {"lz4": "lz4", "zstd": "zstandard"}[compression]
+        raise ImportError(f"the compression {compression} needs: pip install {library}") from error
 
 
 class LogInfo(NamedTuple):

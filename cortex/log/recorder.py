@@ -29,6 +29,7 @@ from cortex.log.format import (
     PROFILE,
     SCHEMA_ENCODING,
     START,
+    open_writer,
     require_mcap,
 )
 from cortex.log.sink import Sink
@@ -43,7 +44,6 @@ logger = logging.getLogger(__name__)
 
 FLUSH_NS = 500_000_000
 """What was received longer ago than this is in the file, even if the process is killed."""
-CHUNK_BYTES = 1 << 20
 _LOOK_NS = 100_000_000
 """How often to look for new topics."""
 _DRAIN_NS = 250_000_000
@@ -163,7 +163,7 @@ class Recorder:
         self._wall_offset_ns = time.time_ns() - self._start_ns
         self._sink = Sink(self.path, overwrite=overwrite)
         try:
-            self._writer: Any = _open_writer(self._sink, compression)
+            self._writer: Any = open_writer(self._sink, compression)
             self._begin(topics)
             for topic in topics or ():
                 self._subscribe(topic)
@@ -430,19 +430,6 @@ class Recorder:
 def _clamp(time_ns: int) -> int:
     """A time as the file can hold it; that of a strange clock may be anything."""
     return min(max(time_ns, 0), _U64_MAX)
-
-
-def _open_writer(sink: Sink, compression: str) -> Any:
-    from mcap.exceptions import UnsupportedCompressionError
-    from mcap.writer import CompressionType, Writer
-
-    try:
-        return Writer(
-            cast(Any, sink), chunk_size=CHUNK_BYTES, compression=CompressionType[compression.upper()]
-        )
-    except UnsupportedCompressionError as error:
-        library = {"lz4": "lz4", "zstd": "zstandard"}[compression]
-        raise ImportError(f"the compression {compression} needs: pip install {library}") from error
 
 
 def _take_from(subscriber: Subscriber[Any], taken: list[_Taken]) -> bool:

@@ -40,7 +40,11 @@ _OPTIONS = {
     ),
     "fps": _Option("fps", "frames a second; needed for folders, else as the video says", "HZ", float),
     "timestamps": _Option("timestamps", "time of each frame, one a line, instead of --fps", "FILE"),
-    "time-unit": _Option("time_unit", "of --timestamps (default: seconds)", choices=("s", "ms", "us", "ns")),
+    "time-unit": _Option(
+        "time_unit",
+        "of --timestamps (default: seconds), or of events in a text, NPZ or HDF5 file that does not say it",
+        choices=("s", "ms", "us", "ns"),
+    ),
     "slow-motion": _Option(
         "slow_motion",
         "how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
@@ -124,6 +128,7 @@ def _transfer(arguments: argparse.Namespace) -> int:
             size=None if text is None else read_size(text),
             sensor=arguments.sensor,
             from_zero=arguments.from_zero,
+            time_unit=arguments.time_unit,
             on_block=lambda count: progress.update(task, description=f"{count:,} events"),
         )
     span_s = (done.end_us - done.begin_us) * 1e-6

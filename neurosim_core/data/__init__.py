@@ -14,8 +14,12 @@ if TYPE_CHECKING:  # isort: off
         collate as collate,
     )
     from neurosim_core.data.live import LiveSource as LiveSource
-    from neurosim_core.data.ray_source import RaySource as RaySource
+    from neurosim_core.data.ray_source import (
+        RaySource as RaySource,
+        cluster as cluster,
+    )
     from neurosim_core.data.shards import write_shards as write_shards
+    from neurosim_core.data.sources import RunSource as RunSource
     from neurosim_core.data.stream import (
         Dataset as Dataset,
         Stream as Stream,
@@ -25,5 +29,6 @@ if TYPE_CHECKING:  # isort: off
         Loader as Loader,
         as_tensors as as_tensors,
     )
+    from neurosim_core.data.windows import WindowConfig as WindowConfig
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -233,7 +233,7 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
     label_axes(plots[1], "time between two events of a pixel", "interval [ms]", "share", x="log")
     label_axes(plots[2], "spatial spectrum of 20 ms", "frequency [cycles/px]", "share of the power", y="log")
     plots[0].set_ylim(0.0, 1.25 * plots[0].get_ylim()[1])  # room for the legend
-    plots[0].legend(loc="upper right", frameon=False, fontsize=9)
+    plots[0].legend(loc="upper right", frameon=False, fontsize=9, ncols=-(-len(stats) // 3))
     shown = stats[: len(_COLORS)]
     width = 6 // max(1, min(len(shown), 6))
     for column, one in enumerate(shown):
@@ -255,6 +255,6 @@ def _draw_map(axes: Any, stats: EventStats) -> None:
     """Draw how often each pixel fires; black is the pixel at 99.5 %."""
     top = float(np.quantile(stats.pixel_counts, 0.995)) if stats.pixel_counts.size else 1.0
     axes.imshow(stats.pixel_counts, cmap="Greys", vmin=0.0, vmax=max(top, 1.0), interpolation="nearest")
-    axes.set_title(f"{stats.name}: {stats.silent_share:.0%} of the pixels silent", fontsize=10, color=_INK)
+    axes.set_title(f"{stats.name}\n{stats.silent_share:.0%} silent pixels", fontsize=10, color=_INK)
     axes.set_xticks([])
     axes.set_yticks([])

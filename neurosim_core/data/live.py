@@ -72,7 +72,10 @@ class LiveSource:
                         break
                     time.sleep(_POLL_S)
             if not started:
-                raise TimeoutError("no simulator sends the sensors that are wanted")
+                raise TimeoutError(
+                    "no simulator sends the sensors that are wanted; one that streams waits for its first "
+                    "command, which `neurosim fly` sends"
+                )
             for flight in flights:
                 yield from flight.windows.end()
             self.skipped_count = sum(flight.skipped_count() for flight in flights)

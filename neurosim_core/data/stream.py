@@ -234,6 +234,12 @@ class Stream:
     def __iter__(self) -> Iterator[Any]:
         return self.batches()
 
+    def __getitem__(self, index: Any) -> Any:
+        """Raise TypeError: PyTorch's DataLoader, for one, asks for windows by number."""
+        raise TypeError(
+            "a Stream is iterated; for PyTorch take ns.data.Loader, or a DataLoader of ns.data.Dataset"
+        )
+
     def batches(self, *, worker: int = 0, workers: int = 1) -> Iterator[Any]:
         """Yield the batches of an epoch, or every `workers`-th from number `worker` on."""
         begin = self._position.batch if self._resume else 0
@@ -297,7 +303,7 @@ class Stream:
 def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Return the files of a source: of folders all recordings and event files below, in alphabetical order.
 
-    Texts in folders that tell no events, but poses say, are left out.
+    Texts, HDF5 and NPZ files in folders that hold no events, but poses say, are left out.
 
     Raises:
         FileNotFoundError: There is none.
@@ -310,7 +316,7 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     if path.is_file() or (path.is_dir() and is_event_file(path)):
         return [path]
     files = (p for p in path.rglob("*") if p.name[0] != "." and p.exists())
-    hits = {p for p in files if p.suffix == ".tar" or (is_event_file(p) and not _is_other_text(p))}
+    hits = {p for p in files if p.suffix == ".tar" or (is_event_file(p) and not _is_other(p))}
     found = sorted(p for p in hits if p.parent not in hits)  # what is in a bag is the bag's
     if not found:
         raise FileNotFoundError(
@@ -319,16 +325,16 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     return found
 
 
-def _is_other_text(path: Path) -> bool:
-    from neurosim_core.io import FORMATS, EventFileError
-    from neurosim_core.io.csv import CsvSource
+def _is_other(path: Path) -> bool:
+    from neurosim_core.io import EventFileError, NoEventsError, check_events
 
-    if path.suffix.lower() in FORMATS["csv"].suffixes:
-        try:
-            CsvSource(path)
-        except EventFileError as error:
-            _log.warning("%s; it is left out", error)
-            return True
+    try:
+        check_events(path)
+    except NoEventsError as error:
+        _log.warning("%s; it is left out", error)
+        return True
+    except (EventFileError, OSError):
+        pass  # whoever reads it says so
     return False
 
 

@@ -17,7 +17,15 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.io.event_file import EventFileError, are_seconds, events_of, split_blocks
+from neurosim_core.io.event_file import (
+    UNITS_US,
+    EventFileError,
+    NoEventsError,
+    are_seconds,
+    events_of,
+    in_microseconds,
+    split_blocks,
+)
 from neurosim_core.packets import EventArrays
 
 _BLOCK_LINES = 200_000
@@ -28,20 +36,24 @@ _NAMES = {
 }
 _HEADER_LINES_MAX = 100
 _UNIT = re.compile(r"\[([^]]*)\]|\(([^)]*)\)")
-_UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "\N{MICRO SIGN}s": 1.0, "ns": 1e-3}
 
 
 class CsvSource:
     """Reads events from text."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
         self._path = path
         self.notes: list[str] = []
         self._columns: tuple[str, ...] = ("t", "x", "y", "p")
         self._skip, self._delimiter = 0, ","
         self._kind: type = np.int64  # read twice as fast as others
-        self._unit_us: float | None = None
+        self._unit_us = unit_us
         self.size = self._read_header()
+
+    @property
+    def knows_unit(self) -> bool:
+        """Whether the header or the user says in which unit times are."""
+        return self._unit_us is not None
 
     def close(self) -> None:
         """Nothing is open between blocks."""
@@ -56,8 +68,8 @@ class CsvSource:
                     size = int(geometry[1]), int(geometry[2])
                 elif len(words) >= 4 and {_NAMES.get(word.lower()) for word in words} >= {"t", "x", "y", "p"}:
                     self._columns = tuple(_NAMES.get(word.lower(), "") for word in words)
-                    units = (_UNITS_US.get("".join(unit).strip()) for unit in _UNIT.findall(text))
-                    self._unit_us = next((unit for unit in units if unit is not None), None)
+                    units = (UNITS_US.get("".join(unit).strip()) for unit in _UNIT.findall(text))
+                    self._unit_us = self._unit_us or next((unit for unit in units if unit is not None), None)
                 elif len(words) == 2 and all(word.isdigit() for word in words) and not text.startswith("%"):
                     size = int(words[0]), int(words[1])
                 elif text and text[0] not in "%#":
@@ -67,25 +79,25 @@ class CsvSource:
                     try:
                         events_of(0, *self._load([text])[0, 1:])
                     except (ValueError, IndexError):
-                        raise EventFileError(f"{self._path} is not a text of events: {text[:60]!r}") from None
+                        raise NoEventsError(f"{self._path} is not a text of events: {text[:60]!r}") from None
                     break
                 self._skip += 1
         return size
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        number, unit_us = self._skip, self._unit_us
+        number, unit_us, is_first = self._skip, self._unit_us, True
         with self._open() as file:
             lines = islice(file, self._skip, None)
             while chunk := list(islice(lines, _BLOCK_LINES)):
                 t, *rest = self._rows(chunk, number).T
                 number += len(chunk)
                 if len(t):
-                    if unit_us is None:
-                        unit_us = 1e6 if are_seconds(t) else 1.0
+                    if is_first and unit_us is None and are_seconds(t):
+                        unit_us = 1e6
+                    is_first = False
                     try:
-                        whole = unit_us == 1.0 and self._unit_us is None
-                        events = events_of(t if whole else np.rint(t * unit_us), *rest)
+                        events = events_of(in_microseconds(t, unit_us), *rest)
                     except ValueError as error:
                         raise EventFileError(f"{self._path}, before line {number}: {error}") from None
                     yield events

@@ -21,10 +21,18 @@ _DISORDER_MAX_US = 10_000
 
 _TIME_MAX_US = 1 << 53
 """285 years; float64 holds all whole numbers up to it."""
+_RATE_MIN_HZ = 0.05
+"""Of a pixel, on average: a camera that sees anything has more events."""
+UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "\N{MICRO SIGN}s": 1.0, "ns": 1e-3}
+"""Units of time [us]."""
 
 
 class EventFileError(ValueError):
     """A file is damaged or not of its format, or its format cannot hold some events."""
+
+
+class NoEventsError(EventFileError):
+    """A file of a format that others use too is whole, and has no events."""
 
 
 def check_new(path: Path, *, overwrite: bool) -> None:
@@ -78,6 +86,7 @@ class EventReader:
         path: The file.
         source: It, opened; closed here.
         size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
+        knows_unit: Whether somebody says in which unit times are.
 
     Attributes:
         width: Of the sensor [px].
@@ -86,8 +95,16 @@ class EventReader:
         packets: Yields what is there besides events, in the order of time; None: nothing ever is.
     """
 
-    def __init__(self, path: Path, source: EventSource, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        source: EventSource,
+        size: tuple[int, int] | None = None,
+        *,
+        knows_unit: bool = True,
+    ) -> None:
         self._path, self._source, self.notes = path, source, source.notes
+        self._knows_unit = knows_unit
         self._first_notes = [*source.notes]
         self.packets: Callable[[], Iterator[Packet]] | None = getattr(source, "packets", None)
         try:
@@ -120,6 +137,11 @@ class EventReader:
                 yield checker.check(held)
             held = events
         yield checker.check(held)
+        if not self._knows_unit and checker.rate_hz < _RATE_MIN_HZ:
+            self.notes.append(
+                f"a pixel has an event every {1.0 / checker.rate_hz:.0f} s: if times are nanoseconds, "
+                "`neurosim convert --time-unit ns` says so"
+            )
 
     def close(self) -> None:
         """Close the file."""
@@ -165,9 +187,17 @@ class BlockChecker:
     def __init__(self, path: Path, *, width: int, height: int, notes: list[str] | None = None) -> None:
         self._path, self._width, self._height = path, width, height
         self._notes = notes
-        self._last_us = -_TIME_MAX_US
+        self._first_us = self._last_us = -_TIME_MAX_US
         self._count = 0
         self._disordered = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Events of a pixel so far [1/s], on average; inf where there are less than a thousand."""
+        if self._count < 1000:
+            return float("inf")
+        span_s = 1e-6 * max(1, self._last_us - self._first_us)
+        return self._count / (self._width * self._height * span_s)
 
     def check(self, events: EventArrays) -> EventArrays:
         """Return a block, sorted; a reader's notes say whether it had to be.
@@ -194,6 +224,7 @@ class BlockChecker:
                 f"{self._path}: time goes back by {self._last_us - int(t[0])} us at event {self._count}"
             )
         events = self.sort(events)
+        self._first_us = self._first_us if self._count else int(events.t[0])
         self._last_us = int(events.t[-1])
         self._count += len(t)
         return events
@@ -314,6 +345,13 @@ def are_seconds(t: NDArray[Any]) -> bool:
     """Whether the first times of a file are seconds, if it does not say: those of microseconds are whole."""
     with np.errstate(invalid="ignore"):  # what is infinite is refused later
         return t.dtype.kind == "f" and bool((t % 1.0).any())
+
+
+def in_microseconds(t: NDArray[Any], unit_us: float | None) -> NDArray[Any]:
+    """Return times in whole microseconds, of a unit; None: they are microseconds already."""
+    if unit_us == 1e-3 and t.dtype.kind in "iu":  # of nanoseconds since 1970 float64 has not all
+        return (t + 500) // 1000
+    return t if unit_us is None else np.rint(t * unit_us)
 
 
 def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Iterator[tuple[int, bytes]]:

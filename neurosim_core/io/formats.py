@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neurosim_core.io.event_file import EventFileError, EventReader, EventWriter
+from neurosim_core.io.event_file import UNITS_US, EventFileError, EventReader, EventWriter
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 
 
@@ -39,6 +39,8 @@ FORMATS = {
     "rosbag_sqlite3": Format("ros2_bag", "BagSource", "BagSink", (".sqlite3",), {"storage": "sqlite3"}),
 }
 """By name. Where two suffixes fit, the longer one counts."""
+_UNITLESS = ("csv", "npz", "recording")
+"""Formats that others use too, for anything, with times of any unit."""
 _FOLDERS = {"metadata.yaml": "rosbag", "events/left/events.h5": "dsec"}
 """Formats that are folders, by a file that is in each."""
 
@@ -81,8 +83,25 @@ def is_event_file(path: Path) -> bool:
         return False
 
 
+def check_events(path: Path) -> None:
+    """Look whether there are events in a file of a format that is used for other things as well.
+
+    Raises:
+        NoEventsError: There are none.
+        EventFileError: It is damaged.
+        OSError: It cannot be read.
+    """
+    if not path.is_dir() and (name := _format_in(path)) in (*_UNITLESS, "mvsec"):
+        _open(name, path).close()
+
+
 def open_events(
-    path: str | Path, *, format: str | None = None, size: tuple[int, int] | None = None, sensor: str = ""
+    path: str | Path,
+    *,
+    format: str | None = None,
+    size: tuple[int, int] | None = None,
+    sensor: str = "",
+    time_unit: str | None = None,
 ) -> EventReader:
     """Open a file of events, of any format.
 
@@ -91,22 +110,39 @@ def open_events(
         format: Key of `FORMATS`; None: by its suffix, and for HDF5 by what is in it.
         size: Width and height of the sensor [px], where the file does not say it.
         sensor: Event camera, of files that hold several; empty: the first.
+        time_unit: s, ms, us or ns: that of a text, NPZ or HDF5 file that does not say it.
 
     Raises:
         FileNotFoundError: There is no such file.
-        EventFileError: It is not of the format, or damaged.
+        EventFileError: It is not of the format, or damaged; or times of the format have a unit.
         ImportError: A library for the format is not installed.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"no file {path}")
-    name = format_of(path, format)
-    if format is None and name in ("mvsec", "recording"):
+    name = _format_in(path) if format is None else format_of(path, format)
+    more: dict[str, Any] = {}
+    if name == "recording" or FORMATS[name].module == "ros2_bag":
+        more["sensor"] = sensor
+    if time_unit is not None:
+        if name not in _UNITLESS:
+            raise EventFileError(f"{path}: times of {name} have a unit, it cannot be {time_unit}")
+        more["unit_us"] = UNITS_US[time_unit]
+    source = _open(name, path, **more)
+    return EventReader(path, source, size, knows_unit=name not in _UNITLESS or source.knows_unit)
+
+
+def _format_in(path: Path) -> str:
+    """Return the format of a file; that of HDF5 depends on what is in it."""
+    name = format_of(path)
+    if name in ("mvsec", "recording"):
         with open_hdf5(path) as file, damage_of(path):
             name = "mvsec" if "davis" in file else "recording"
-    known = FORMATS[name]
-    more = {"sensor": sensor} if name == "recording" or known.module == "ros2_bag" else {}
-    return EventReader(path, _load(known, known.source)(path, **more), size)
+    return name
+
+
+def _open(name: str, path: Path, **options: Any) -> Any:
+    return _load(FORMATS[name], FORMATS[name].source)(path, **options)
 
 
 def create_events(path: str | Path, *, width: int, height: int, format: str | None = None) -> EventWriter:

@@ -22,9 +22,11 @@ from neurosim_core.io.event_file import (
     BLOCK_EVENTS,
     PACKET_US,
     EventFileError,
+    NoEventsError,
     PacketCutter,
     are_seconds,
     events_of,
+    in_microseconds,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
@@ -58,13 +60,14 @@ def open_hdf5(path: Path) -> Any:
 class Hdf5Source:
     """Reads the events of a recording, or of a file of DSEC."""
 
-    def __init__(self, path: Path, *, sensor: str = "") -> None:
-        self._path = path
+    def __init__(self, path: Path, *, sensor: str = "", unit_us: float | None = None) -> None:
+        self._path, self._unit_us = path, unit_us
         self.notes: list[str] = []
         self._file = open_hdf5(path)
         try:
             with damage_of(path):
                 self._open(sensor)
+                self.knows_unit = unit_us is not None or self._file.attrs.get("format") == FORMAT
                 attributes = self._group.attrs
                 is_told = "width" in attributes and "height" in attributes
                 self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
@@ -90,7 +93,8 @@ class Hdf5Source:
         if file.attrs.get("format") == FORMAT:
             cameras = [name for name, group in file["sensors"].items() if "events" in group]
             if sensor not in ("", *cameras) or not cameras:
-                raise EventFileError(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
+                kind = EventFileError if cameras else NoEventsError
+                raise kind(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
             described = sorted(
                 cameras, key=lambda name: int(file[f"sensors/{name}"].attrs.get("index", 1 << 30))
             )
@@ -103,7 +107,7 @@ class Hdf5Source:
         self._names: tuple[str, ...]
         self._events, self._names = next(fits, (None, ()))
         if self._events is None:
-            raise EventFileError(
+            raise NoEventsError(
                 f"{self._path} has no events/t, x, y and p; known HDF5 files: "
                 "recordings of Neurosim, DSEC, MVSEC, M3ED, Prophesee"
             )
@@ -122,7 +126,7 @@ class Hdf5Source:
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        in_seconds = None
+        unit_us = self._unit_us
         for begin in range(0, self._count, BLOCK_EVENTS):
             end = min(begin + BLOCK_EVENTS, self._count)
             with damage_of(self._path):
@@ -133,9 +137,11 @@ class Hdf5Source:
                     t, x, y, p = (read_rows(self._events[name], begin, end) for name in self._names)
                 if len(t) != end - begin:
                     raise EventFileError(f"{self._path}: fewer events than its index says")
-                in_seconds = are_seconds(t) if in_seconds is None else in_seconds
-                t = np.rint(t * 1e6) if in_seconds else t
-                block = events_of(t + np.int64(self._offset_us), x, y, p)
+                if begin == 0 and unit_us is None and are_seconds(t):
+                    unit_us = 1e6
+                offset = np.int64(self._offset_us)
+                t = in_microseconds(t, unit_us) + in_microseconds(offset, self._unit_us)
+                block = events_of(t, x, y, p)
             yield block
 
 

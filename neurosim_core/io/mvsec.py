@@ -1,7 +1,8 @@
 """Files of MVSEC (HDF5): events, pictures, IMU, depth, flow and poses of the left camera, in one file.
 
 Times are seconds in float64, which tell microseconds apart for 270 years. Names and layouts are those of
-MVSEC's `_data` and `_gt` files: depth that is not known is nan there and inf here; pictures are grey.
+MVSEC's `_data` and `_gt` files: depth that is not known is nan there and inf here; pictures are grey. With a
+file NAME_data.hdf5 comes what is in NAME_gt.hdf5 beside it.
 
 Reference: Zhu et al. (2018), "The Multivehicle Stereo Event Camera Dataset"; the layout: https://daniilidis-group.github.io/mvsec.
 """
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, events_of
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, NoEventsError, events_of
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.hdf5 import import_h5py
@@ -33,18 +34,24 @@ class MvsecSource:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.notes: list[str] = []
-        self._file = open_hdf5(path)
+        truth = path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
+        self._files = [open_hdf5(path)]
         try:
+            if path.stem.endswith("_data") and truth.exists():
+                self._files.append(open_hdf5(truth))
             with damage_of(path):
-                if _GROUP not in self._file:
+                groups = [file[_GROUP] for file in self._files if _GROUP in file]
+                if _GROUP not in self._files[0]:
                     raise EventFileError(f"{path} has no {_GROUP}: it is not a file of MVSEC")
-                self._group = self._file[_GROUP]
+                if "events" not in groups[0]:
+                    raise NoEventsError(f"{path} has no events: ground truth is read with NAME_data.hdf5")
+                self._arrays = {name: array for group in groups[::-1] for name, array in group.items()}
                 shapes = [
-                    self._group[n].shape for n in map(_ROWS.get, ("image", "depth")) if n in self._group
+                    self._arrays[n].shape for n in map(_ROWS.get, ("image", "depth")) if n in self._arrays
                 ]
                 self.size = (int(shapes[0][2]), int(shapes[0][1])) if shapes else None
         except BaseException:
-            self._file.close()
+            self.close()
             raise
 
     def packets(self) -> Iterator[Packet]:
@@ -53,26 +60,27 @@ class MvsecSource:
         Raises:
             EventFileError: The file is damaged.
         """
-        streams = [self._rows(name) for name, array in _ROWS.items() if array in self._group]
+        streams = [self._rows(name) for name, array in _ROWS.items() if array in self._arrays]
         yield from heapq.merge(*streams, key=lambda packet: packet.stamp_ns)
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        for file in self._files:
+            file.close()
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
-        events = self._group.get("events")
-        for begin in range(0, 0 if events is None else len(events), BLOCK_EVENTS):
+        events = self._arrays["events"]
+        for begin in range(0, len(events), BLOCK_EVENTS):
             with damage_of(self._path):
                 x, y, t_s, polarity = np.asarray(events[begin : begin + BLOCK_EVENTS], np.float64).T
                 block = events_of(np.rint(t_s * 1e6), x, y, polarity > 0)
             yield block
 
     def _rows(self, name: str) -> Iterator[Packet]:
-        array = self._group[_ROWS[name]]
+        array = self._arrays[_ROWS[name]]
         with damage_of(self._path):
-            stamps = np.rint(np.asarray(self._group[f"{_ROWS[name]}_ts"]) * 1e9).astype(np.int64).tolist()
+            stamps = np.rint(np.asarray(self._arrays[f"{_ROWS[name]}_ts"]) * 1e9).astype(np.int64).tolist()
         for row, stamp_ns in enumerate(stamps):
             with damage_of(self._path):
                 values = np.asarray(array[row])

@@ -11,7 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
+from neurosim_core.io.event_file import (
+    EventFileError,
+    NoEventsError,
+    events_of,
+    in_microseconds,
+    split_blocks,
+)
 from neurosim_core.packets import EventArrays, join_events
 
 _OTHER_NAMES = {"t": ("ts", "timestamps"), "x": (), "y": (), "p": ("polarity",)}
@@ -21,8 +27,9 @@ _NAMES = {"width", "height", *_OTHER_NAMES, *(other for others in _OTHER_NAMES.v
 class NpzSource:
     """Reads an NPZ file; `polarity` and `ts` or `timestamps` are other names for p and t."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
         self.notes: list[str] = []
+        self.knows_unit = unit_us is not None
         with open(path, "rb"):
             pass  # an OSError from here on comes of what is in it
         try:
@@ -41,14 +48,14 @@ class NpzSource:
         for name, others in _OTHER_NAMES.items():
             key = next((n for n in (name, *others) if n in found), None)
             if key is None:
-                raise EventFileError(f"{path} has no array {name!r}, only {sorted(found)}")
+                raise NoEventsError(f"{path} has no array {name!r}, only {sorted(found)}")
             columns.append(found[key])
         shapes = {column.shape for column in columns}
         if len(shapes) > 1 or columns[0].ndim != 1 or any(c.dtype.kind not in "iub" for c in columns):
             kinds = ", ".join(f"{column.dtype} {column.shape}" for column in columns)
             raise EventFileError(f"{path}: t, x, y and p must be as long, and whole numbers: got {kinds}")
         try:
-            self._events = events_of(*columns)
+            self._events = events_of(in_microseconds(columns[0], unit_us), *columns[1:])
         except ValueError as error:
             raise EventFileError(f"{path}: {error}") from None
         known = [found[name] for name in ("width", "height") if name in found]

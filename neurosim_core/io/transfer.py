@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -13,6 +14,8 @@ from neurosim_core.io.formats import create_events, format_of, open_events
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import Events
 from neurosim_core.record.hdf5 import FORMAT
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -42,6 +45,7 @@ def transfer(
     size: tuple[int, int] | None = None,
     sensor: str = "",
     from_zero: bool = False,
+    time_unit: str | None = None,
     on_block: Callable[[int], None] | None = None,
 ) -> Transfer:
     """Copy the events of a file to a file of another format; ground truth too, where both formats have it.
@@ -57,6 +61,7 @@ def transfer(
         sensor: Event camera, of files that hold several; empty: the first.
         from_zero: Count time from the first event; where there is ground truth, from the whole second before
             it, so that pictures stay at multiples of their period.
+        time_unit: Of `source`, where it does not say it; see `open_events`.
         on_block: Called with the number of events so far.
 
     Raises:
@@ -67,7 +72,7 @@ def transfer(
     name = format_of(out, out_format)
     folder = out.with_name(f".{out.name}.part")
     part = folder / out.name
-    reader = open_events(source, format=format, size=size, sensor=sensor)
+    reader = open_events(source, format=format, size=size, sensor=sensor, time_unit=time_unit)
     done = Transfer(width=reader.width, height=reader.height)
     shift_us: int | None = None if from_zero else 0
     packets = reader.packets
@@ -120,7 +125,8 @@ def as_recording(path: Path) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "events.h5"
-        transfer(path, copy, from_zero=True)
+        for note in transfer(path, copy, from_zero=True).notes:
+            _log.warning("%s: %s", path, note)
         yield copy
 
 

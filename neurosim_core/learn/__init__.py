@@ -12,6 +12,9 @@ from neurosim_core.install import install_hint
 from neurosim_core.lazy import lazy_names
 
 if TYPE_CHECKING:  # isort: off
+    from neurosim_core.learn.dense import DenseNet as DenseNet
+    from neurosim_core.learn.dense_train import load_dense as load_dense
+    from neurosim_core.learn.depth import depth_loss as depth_loss
     from neurosim_core.learn.env import (
         Env as Env,
         make_env as make_env,
@@ -19,6 +22,14 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core.learn.episodes import (
         Randomisation as Randomisation,
         StartConfig as StartConfig,
+    )
+    from neurosim_core.learn.evaluate import (
+        evaluate_policy as evaluate_policy,
+        teacher_actor as teacher_actor,
+    )
+    from neurosim_core.learn.ppo import (
+        Ppo as Ppo,
+        PpoConfig as PpoConfig,
     )
     from neurosim_core.learn.surfaces import (
         Counts as Counts,

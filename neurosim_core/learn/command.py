@@ -162,21 +162,21 @@ def _learn(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         algorithm=arguments.algorithm,
     )
-    student, teacher = config.student, config.teacher
-    if arguments.pixels is not None:
-        config = dataclasses.replace(config, pixels=arguments.pixels)
-    if arguments.worlds is not None:
-        student = dataclasses.replace(student, worlds=arguments.worlds)
-    if arguments.student_iterations is not None:
-        student = dataclasses.replace(student, iterations=arguments.student_iterations)
-    if arguments.teacher_iterations is not None:
-        teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
-    if arguments.randomise is not None:
-        config = dataclasses.replace(config, randomise=arguments.randomise)
+    config = _changed(
+        config,
+        pixels=arguments.pixels,
+        randomise=arguments.randomise,
+        wandb=arguments.wandb,
+        student=_changed(config.student, worlds=arguments.worlds, iterations=arguments.student_iterations),
+        teacher=_changed(config.teacher, iterations=arguments.teacher_iterations),
+    )
+    changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
+    changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
+    if arguments.resume and changed:
+        raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
-    config = dataclasses.replace(config, student=student, teacher=teacher, wandb=arguments.wandb)
     if arguments.ray is not None:
         if arguments.resume:
             raise ValueError("--resume continues one run, and does not go with --ray")
@@ -189,8 +189,13 @@ def _learn(arguments: argparse.Namespace) -> int:
     if arguments.seeds != 1 or arguments.workers != 1:
         raise ValueError("--seeds and --workers need --ray: local, auto or host:port")
     if train(folder, config, resume=arguments.resume):
-        print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+        print(f"wrote {folder}/policy.onnx, evaluation.json and .webp; tensorboard --logdir {folder}")
     return 0
+
+
+def _changed(settings: Any, **given: Any) -> Any:
+    """Return settings with what is given; None: as it is."""
+    return dataclasses.replace(settings, **{name: v for name, v in given.items() if v is not None})
 
 
 def _measure_rate(arguments: argparse.Namespace) -> int:
@@ -221,10 +226,13 @@ def _measure_rate(arguments: argparse.Namespace) -> int:
 
 
 def _learn_dense(arguments: argparse.Namespace) -> int:
+    import logging
+
     import torch
 
     from neurosim_core.learn.dense_train import DenseConfig, train_dense
 
+    logging.getLogger(train_dense.__module__).setLevel(logging.INFO)  # it takes minutes: how far it has come
     device, task = arguments.device or "auto", arguments.what
     if device == "auto":
         device = "cuda:0" if torch.cuda.is_available() else "cpu"
@@ -265,16 +273,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.train import evaluate_run
 
+    film = arguments.run / f"{Path(arguments.scenes).stem}.webp"
     for name, evaluation in evaluate_run(
         arguments.run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
         speed_m_s=arguments.speed,
+        film=film,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
             break
+    print(f"wrote {film}: the first of the episodes")
     return 0
 
 

@@ -33,6 +33,8 @@ _SILENT_S = 120.0
 """Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
 _REMEMBERED = 0.75
 """Share of the sequences of a step that begin with the memory that the step before has left."""
+_TOLD_S = 10.0
+"""How often the log tells how far training has come [s]."""
 _TEST_SEED = 1_000_000
 """Of the first flight that is only tested on."""
 
@@ -268,9 +270,11 @@ def train_dense(
         mirrored=head.mirrored,
         device=config.device if worlds else None,
     )
+    _log.info("waiting for the first windows")
     with _source(pool, config, data, live, worlds, ray) as more:
         fit = _fit(net.to(config.device), pool, config, more)
     constant = head.constant(pool.targets()).cpu()[None]
+    _log.info("testing in scenes that were not trained in" if test is None else f"testing on {test}")
     tested = [*held_out_windows(config, test)]
     net.eval()
     errors = {
@@ -322,30 +326,31 @@ def _source(
 
         fly_device = config.fly_device or config.device
         settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        flown = world_windows(
+        windows = world_windows(
             settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
             renders=config.renders, threshold_spread=config.threshold_spread,
         )  # fmt: skip
-        while len(pool) < min(config.batch, worlds):
-            pool.add(next(flown))
-
-        def due(step: int) -> bool:
-            return pool.window_count * config.reuse < step * config.batch * config.sequence
-
-        def fly_on(step: int) -> None:
-            while due(step):
+        with contextlib.closing(windows) as flown:
+            while len(pool) < min(config.batch, worlds):
                 pool.add(next(flown))
 
-        if fly_device == config.device:
-            yield fly_on
-            return
-        with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
+            def due(step: int) -> bool:
+                return pool.window_count * config.reuse < step * config.batch * config.sequence
 
-            def wait(step: int) -> None:
-                while due(step) and goes_on():
-                    time.sleep(1e-3)
+            def fly_on(step: int) -> None:
+                while due(step):
+                    pool.add(next(flown))
 
-            yield wait
+            if fly_device == config.device:
+                yield fly_on
+                return
+            with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
+
+                def wait(step: int) -> None:
+                    while due(step) and goes_on():
+                        time.sleep(1e-3)
+
+                yield wait
         return
     if data is not None:
         length = config.sequence + head.ahead
@@ -434,6 +439,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
     head, random = config.head, np.random.default_rng(config.seed)
     optimizer = torch.optim.AdamW(net.parameters(), lr=config.rate, weight_decay=1e-4)
     begin_s, steps, waited_s = time.monotonic(), 0, 0.0
+    told_s = begin_s
     memory: Memory | None = None
 
     def share_done() -> float:
@@ -458,7 +464,8 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
         steps += 1
-        if steps % 100 == 0:
+        if time.monotonic() - told_s > _TOLD_S:
+            told_s = time.monotonic()
             told = (steps, 100.0 * share, loss.item(), pool.window_count)
             _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
     fit = _Fit(steps, waited_s / (time.monotonic() - begin_s), _gpus(config.device))

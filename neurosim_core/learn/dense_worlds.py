@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import dataclasses
+import itertools
+from collections.abc import Generator, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import warp as wp
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.learn.dense import Head
+from neurosim_core.learn.dense_plan import PathPlanner
 from neurosim_core.learn.dense_train import Windows
 from neurosim_core.learn.surfaces import Counts, EventSurface, SurfaceConfig, VoxelGrid
 from neurosim_core.sim.model import Model, make_model, refit
@@ -31,11 +34,12 @@ def world_windows(
     window_s: float,
     renders: int | None = None,
     threshold_spread: float = 0.0,
-) -> Iterator[Windows]:
+) -> Generator[Windows]:
     """Yield the windows of all worlds, one of each at a time, for ever; the next overwrites their tensors.
 
     Generated scenes are eight, of the seeds from that of the settings on. When a flight is over, all worlds
-    fly other paths with other thresholds, and one of these scenes has been replaced by the next.
+    fly other paths with other thresholds, and one of these scenes has been replaced by the next. Other
+    processes plan these paths while the worlds fly; close the generator to end them.
 
     Args:
         settings: Of a flight.
@@ -47,14 +51,13 @@ def world_windows(
         threshold_spread: Each world draws its thresholds up to this share above the nominal ones, or below.
 
     Raises:
-        ValueError: A window is not a whole number of control periods.
+        ValueError: A window is not a whole number of control periods, or no path exists.
     """
     base = load_config(dict(settings) if renders is None else _with_renders(settings, renders / window_s))
     steps = round(window_s * base.control.rate_hz)
     if steps < 1 or abs(steps / base.control.rate_hz - window_s) > 1e-9:
         raise ValueError(f"windows must be whole periods of control.rate_hz, got {window_s} s")
     window_ns, first = round(1e9 * window_s), int(settings["seed"])
-    scenes: list[Model] = []
     camera: Any = base.sensors["events"]
     surfaces: list[SurfaceConfig] = [VoxelGrid(bins=bins), *([Counts()] if head.field == "events" else [])]
     drawn = [
@@ -65,11 +68,7 @@ def world_windows(
         for config in surfaces
     ]  # fmt: skip
     end_ns: Any = wp.zeros(worlds, dtype=wp.int64, device=base.device)
-    number = 0
-    while True:
-        count = _SCENES if hasattr(base.scene, "seed") else 1
-        scenes += [make_model(_seeded(base, first + number + k)) for k in range(len(scenes), count)]
-        flown = _simulate(base, scenes, worlds, first + number * _PATHS_MAX, threshold_spread)
+    for number, flown in enumerate(_flights(base, first, worlds, threshold_spread)):
         names = [f"{number} {world}" for world in range(worlds)]
         for start_ns in range(0, flown.model.duration_ns - window_ns + 1, window_ns):
             stamp_ns = start_ns + window_ns
@@ -84,15 +83,6 @@ def world_windows(
             target = head.target(wp.to_torch(value))
             stamps = [start_ns] * worlds, [stamp_ns] * worlds
             yield Windows(names, *stamps, wp.to_torch(drawn[0].array), target)
-        number += 1
-        del scenes[: count > 1]
-
-
-def _seeded(config: SimulationConfig, seed: int) -> SimulationConfig:
-    if not hasattr(config.scene, "seed"):
-        return config
-    scene = config.scene.model_copy(update={"seed": seed})
-    return config.model_copy(update={"scene": scene})
 
 
 def _with_renders(settings: Mapping[str, Any], rate_hz: float) -> dict[str, Any]:
@@ -102,15 +92,40 @@ def _with_renders(settings: Mapping[str, Any], rate_hz: float) -> dict[str, Any]
     return {**settings, "sensors": sensors, "control": control}
 
 
+def _flights(base: SimulationConfig, first: int, worlds: int, spread: float) -> Iterator[Simulation]:
+    """Yield worlds at the begin of their next flight, for ever."""
+    count = _SCENES if hasattr(base.scene, "seed") else 1
+    scenes: list[Model] = []
+
+    def paths_of(number: int) -> list[SimulationConfig]:
+        """Return the settings that each path of a flight is planned by."""
+        configs = []
+        for k in range(min(worlds, _PATHS_MAX)):
+            path = base.path.model_copy(update={"seed": first + number * _PATHS_MAX + k})
+            seed = {"seed": first + number + k % count} if count > 1 else {}
+            scene = base.scene.model_copy(update=seed)
+            configs.append(base.model_copy(update={"scene": scene, "path": path}))
+        return configs
+
+    with PathPlanner() as planner:
+        planner.begin(paths_of(0))
+        for number in itertools.count():
+            configs = paths_of(number)
+            scenes += [make_model(config) for config in configs[len(scenes) : count]]
+            paths = planner.result()
+            planner.begin(paths_of(number + 1))
+            models = [
+                refit(dataclasses.replace(scenes[k % len(scenes)], path=path), config)
+                for k, (config, path) in enumerate(zip(configs, paths, strict=True))
+            ]
+            yield _simulate(base, models, worlds, first + number * _PATHS_MAX, spread)
+            del scenes[: count > 1]
+
+
 def _simulate(
-    base: SimulationConfig, scenes: list[Model], worlds: int, seed: int, spread: float
+    base: SimulationConfig, models: list[Model], worlds: int, seed: int, spread: float
 ) -> Simulation:
-    """Return worlds at the begin of paths of their own."""
-    paths = [base.path.model_copy(update={"seed": seed + k}) for k in range(min(worlds, _PATHS_MAX))]
-    models = [
-        refit(scenes[k % len(scenes)], base.model_copy(update={"path": path}), replan=True)
-        for k, path in enumerate(paths)
-    ]
+    """Return worlds at the begin of the paths of these models."""
     pixel = getattr(base.sensors["events"], "pixel")  # noqa: B009 (of any event camera)
     drawn = (1.0 + spread) ** np.random.default_rng(seed).uniform(-1.0, 1.0, (2, worlds))
     parameters = {

@@ -25,6 +25,7 @@ from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
+from neurosim_core.sim.observation import Observation
 from neurosim_core.sim.scene_table import SceneSource
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
@@ -70,6 +71,7 @@ class Env:
         models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
         randomise: Draw parameters anew in each episode; as the task says, or as told.
         pixels: Width and height of the event camera [px]; None: as the task says.
+        sensors: Further sensors by name, as in settings; what they yield is in `observation`.
         seed: Of world 0; world i has seed + i.
 
     Raises:
@@ -81,6 +83,7 @@ class Env:
         device: Of all tensors.
         sim: The simulator.
         view: What the task sees.
+        observation: What all sensors yielded last.
         episode_steps: Steps after which an episode is truncated.
         action_count: Numbers in an action, each in [-1, 1].
         episode_length: Steps since each episode began, int32, shape [N].
@@ -98,6 +101,7 @@ class Env:
         models: Sequence[Model] | None = None,
         randomise: bool | Randomisation = True,
         pixels: int | None = None,
+        sensors: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
         self.task = task = find_task(task) if isinstance(task, str) else task
@@ -111,7 +115,7 @@ class Env:
         if randomise is False:
             self.randomisation = NO_RANDOMISATION
         self.sim = Simulation(
-            _settings(task, device, sees, wind=self.randomisation.wind_m_s > 0.0),
+            _settings(task, device, sees, sensors or {}, wind=self.randomisation.wind_m_s > 0.0),
             worlds=worlds,
             seeds=seed,
             event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
@@ -136,6 +140,9 @@ class Env:
             self._distances_array = wp.from_torch(self._distances)
         self._rows: Any = wp.zeros((worlds, COLUMN_COUNT), dtype=wp.float32, device=wp_device)
         self._surface: EventSurface | None = None
+        self._thresholds: torch.Tensor | None = None
+        if sees and self.randomisation.threshold_factor != (1.0, 1.0):
+            self._thresholds = wp.to_torch(self.sim.thresholds(CAMERA))
         if sees:
             self._surface = EventSurface(
                 task.surface if surface is None else surface,
@@ -267,18 +274,16 @@ class Env:
         episodes.begin(self._mask_array)
         if self.task.bodies:
             self._throw()
-        drawn = self.randomisation
-        if self._surface is not None and drawn.threshold_factor != (1.0, 1.0):
-            thresholds = self.sim.thresholds(CAMERA)
-            episodes.scale_thresholds(
-                self._mask_array, thresholds, nominal=self.task.threshold, factor=drawn.threshold_factor
-            )
+        drawn, mask = self.randomisation, self._mask[:, None]
+        if self._thresholds is not None:
+            low, high = drawn.threshold_factor
+            chosen = self.task.threshold * (low + (high - low) * view.draws[:, -5:-3].double())
+            self._thresholds.copy_(torch.where(mask, chosen, self._thresholds))
         if drawn.airframes_differ:
             episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )
-        mask = self._mask[:, None]
         for array in (view.action, view.last_action):
             array.masked_fill_(mask, 0.0)
         self._queue = torch.where(mask, self._hover, self._queue)
@@ -332,7 +337,8 @@ class Env:
         length = self._queue.shape[0]
         return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
-    def _look(self, observation: Any) -> None:
+    def _look(self, observation: Observation) -> None:
+        self.observation = observation
         where = {"fields": self.sim.fields, "scene_of_world": self.sim.scene_of_world}
         look_at_vehicles(self._rows, observation, self._episodes, **where, drawn=self.randomisation)
         if self.task.probes:
@@ -377,7 +383,9 @@ make_env = Env
 """The function that users call."""
 
 
-def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, Any]:
+def _settings(
+    task: Task, device: str, sees: bool, sensors: Mapping[str, Any], *, wind: bool
+) -> dict[str, Any]:
     """Return the settings of the simulator for a task, in which there can be wind."""
     rate_hz = task.rate_hz * task.renders_per_step
     camera = {
@@ -397,6 +405,6 @@ def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, A
         "render": {"samples_per_pixel": task.rays_per_pixel},
         "path": {"kind": "hover"},
         "vehicle": vehicle,
-        "sensors": {CAMERA: camera} if sees else {},
+        "sensors": ({CAMERA: camera} if sees else {}) | dict(sensors),
         "bodies": dict(task.bodies),
     }

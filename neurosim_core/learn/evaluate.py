@@ -12,6 +12,9 @@ from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
 from neurosim_core.learn.task import Observations
 
+EPISODE_SEED = 1_000_000
+"""Of the episodes that policies are evaluated in."""
+
 Actor = Callable[[Observations, torch.Tensor], torch.Tensor]
 """Returns actions, given observations and which worlds begin an episode (bool, [N])."""
 
@@ -64,11 +67,11 @@ def teacher_actor(policy: Callable[[torch.Tensor], torch.Tensor], env: Env) -> A
 
 
 @torch.no_grad()
-def evaluate(
+def evaluate_policy(
     env: Env,
     actor: Actor,
     *,
-    seed: int = 1_000_000,
+    seed: int = EPISODE_SEED,
 ) -> Evaluation:
     """Fly the first episode of each world.
 

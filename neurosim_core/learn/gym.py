@@ -6,6 +6,7 @@ that want NumPy; those of PyTorch take `Env` as it is, without copies.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium
@@ -37,12 +38,8 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
         self.num_envs = env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         observations, _ = env.reset()
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            name: Box(-np.inf, np.inf, shape=value.shape[1:], dtype=np.float32)
-            for name, value in self._arrays(observations).items()
-        }
-        self.single_observation_space = Dict(spaces)
-        self.single_action_space = Box(-1.0, 1.0, shape=(env.action_count,), dtype=np.float32)
+        self.single_observation_space = observation_space(observations, self._names)
+        self.single_action_space = action_space(env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -90,6 +87,21 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
             for name, value in observations.items()
             if self._names is None or name in self._names
         }
+
+
+def observation_space(observations: Observations, names: Collection[str] | None) -> Dict:
+    """Return the space of a world for observations of these names; None: of all."""
+    spaces: dict[str, gymnasium.Space[Any]] = {
+        name: Box(-np.inf, np.inf, shape=tuple(value.shape[1:]), dtype=np.float32)
+        for name, value in observations.items()
+        if names is None or name in names
+    }
+    return Dict(spaces)
+
+
+def action_space(env: Env) -> Box:
+    """Return the space of the actions of a world."""
+    return Box(-1.0, 1.0, shape=(env.action_count,), dtype=np.float32)
 
 
 def make_numpy_env(*, task: str, num_envs: int = 1, group: str | None = None, **options: Any) -> NumpyEnv:

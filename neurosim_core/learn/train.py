@@ -2,8 +2,8 @@
 
 A run is a folder: `run.json` (what was asked for), `checkpoint.pt`, TensorBoard's files, `policy.onnx` and
 `evaluation.json`. Training goes in blocks of some iterations. A block begins in all worlds anew, with a seed
-that hangs on the run's seed and the block's number, and ends with a checkpoint: a run that is resumed does
-what it would have done without the interruption, to the bit on a CPU.
+that hangs on the run's seed, the block's number and the process (`ranks`), and ends with a checkpoint: a run
+that is resumed does what it would have done without the interruption, to the bit on a CPU.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from neurosim_core.learn import need, ranks
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.episodes import Randomisation
-from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
+from neurosim_core.learn.evaluate import Evaluation, evaluate_policy, student_actor, teacher_actor
+from neurosim_core.learn.film import film_episode, film_sensors
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
@@ -108,12 +109,12 @@ class Training:
         self.trained_s: dict[str, float] = {}
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
-        drawn = config.make_task().training
+        task = config.make_task()
         randomise: bool | Randomisation = config.randomise != "none"
-        if config.randomise == "training" and drawn is not None:
-            randomise = drawn
+        if config.randomise == "training" and task.training is not None:
+            randomise = task.training
         self.env = make_env(
-            config.make_task(),
+            task,
             worlds=config.student.worlds,
             device=config.device,
             models=models,
@@ -122,7 +123,7 @@ class Training:
             seed=config.seed,
         )
         device = self.env.device
-        self._generator = torch.Generator(device=device).manual_seed(config.seed + ranks.rank())
+        self._generator = torch.Generator(device=device)
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
@@ -177,9 +178,6 @@ class Training:
         _check_layers(file, state, self.student)
         for stage, trainer in self._trainers.items():
             trainer.descent.load_state_dict(state[stage])
-        self._generator.set_state(state["generator"].cpu())
-        if ranks.rank() > 0:
-            self._generator.manual_seed(ranks.rank() + sum(state["done"].values()))
         self._done = state["done"]
 
     def run(self, *, until: tuple[int, int] | None = None) -> None:
@@ -207,7 +205,9 @@ class Training:
         begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
         apart = ranks.rank() * trainer.env.num_envs
-        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart)
+        seed = (self.config.seed * (1 << 11) + offset) * _SEEDS_APART + apart
+        self._generator.manual_seed(seed)
+        trainer.begin(seed)
         end = min(done + self.config.block, whole)
         sums: dict[str, list[float]] = {}
         for iteration in range(done, end):
@@ -233,7 +233,6 @@ class Training:
                 **{stage: trainer.descent.state_dict() for stage, trainer in self._trainers.items()},
                 "shape": self.student.shape,
                 "weights": self.student.state_dict(),
-                "generator": self._generator.get_state(),
                 "done": self._done,
             },
             partial,
@@ -244,7 +243,7 @@ class Training:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
         assert self.teacher is not None
         env = self._trainers["teacher"].env
-        return evaluate(env, teacher_actor(self.teacher, env))
+        return evaluate_policy(env, teacher_actor(self.teacher, env))
 
 
 def prepare_torch() -> None:
@@ -358,6 +357,7 @@ def evaluate_run(
     device: str | None = None,
     worlds: int | None = None,
     speed_m_s: float | None = None,
+    film: Path | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does: first with events (`events`), then without (`blind`).
 
@@ -367,23 +367,25 @@ def evaluate_run(
         device: None: as in the training.
         worlds: Episodes; None: as configured.
         speed_m_s: At which all episodes begin [m/s]; None: as the task says.
+        film: Where to leave a film of the first episode, with events (.webp, .gif); None: none is made.
     """
     config = read_config(folder)
-    worlds = worlds or config.evaluation_worlds
-    task = config.make_task()
-    if speed_m_s is not None:
-        task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
-    env = make_env(
-        task,
-        worlds=worlds,
-        device=device or config.device,
-        scenes=scenes if scenes in ("seen", "unseen") else [scenes],  # type: ignore[arg-type]
-        pixels=config.pixels,
-    )
+
+    def make(**options: Any) -> Env:
+        task = config.make_task()
+        if speed_m_s is not None:
+            task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
+        return make_env(task, device=device or config.device, pixels=config.pixels, **options)
+
+    where: Any = scenes if scenes in ("seen", "unseen") else [scenes]
+    env = make(worlds=worlds or config.evaluation_worlds, scenes=where)
     policy = load_student(folder, env.device)
+    if film is not None:
+        filmed = make(worlds=1, models=env.sim.models[:1], sensors=film_sensors(env.task))
+        film_episode(filmed, student_actor(policy, filmed), film)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
-        yield "blind" if blind else "events", evaluate(env, actor)
+        yield "blind" if blind else "events", evaluate_policy(env, actor)
 
 
 def train(
@@ -394,7 +396,7 @@ def train(
     Args:
         folder: Where everything goes.
         config: What to do.
-        resume: Go on with the run in the folder, as it was configured.
+        resume: Go on with the run in the folder, as it was configured; only `config.wandb` counts.
         say: Told what happens, line by line.
 
     Returns:
@@ -406,7 +408,9 @@ def train(
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
     prepare_torch()
-    config = dataclasses.replace(read_config(folder) if resume else config, device=ranks.join(config.device))
+    if resume:
+        config = dataclasses.replace(read_config(folder), wandb=config.wandb)
+    config = dataclasses.replace(config, device=ranks.join(config.device))
     if config.wandb and importlib.util.find_spec("wandb") is None:
         raise ImportError("--wandb needs the package wandb: pip install wandb")
     if ranks.rank() > 0:
@@ -422,7 +426,7 @@ def train(
         say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
-    for name, evaluation in evaluate_run(folder):
+    for name, evaluation in evaluate_run(folder, film=folder / "evaluation.webp"):
         say(f"student, unseen scenes, {name}: {evaluation}")
         found[name] = evaluation
     values = {name: dataclasses.asdict(evaluation) for name, evaluation in found.items()}

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from neurosim_core.learn.env import Env, make_env
-from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate, student_actor
+from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate_policy, student_actor
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.learn.train import load_student, read_config
@@ -75,7 +75,7 @@ def evaluate_transfer(
         if "lost" in changes:
             _lose_events(env, changes["lost"])
         policy = load_student(folder, env.device)
-        yield name, evaluate(env, _late(student_actor(policy, env), env, changes.get("late", 0.0)))
+        yield name, evaluate_policy(env, _late(student_actor(policy, env), env, changes.get("late", 0.0)))
 
 
 def _late(actor: Actor, env: Env, share: float) -> Actor:

@@ -107,7 +107,7 @@ class LiveSession:
         self,
         node: Node,
         simulation: msg.Simulation,
-        outlet: RerunTarget,
+        target: RerunTarget,
         options: ViewOptions,
         *,
         number: Iterator[int],
@@ -118,7 +118,7 @@ class LiveSession:
         Args:
             node: Subscribes.
             simulation: Announcement of the simulator.
-            outlet: Opens recordings.
+            target: Opens recordings.
             options: What to show.
             number: Numbers of recordings.
             say: Called with what a user should know.
@@ -132,7 +132,7 @@ class LiveSession:
         self.phase = ""
         self._rotor_counts = {n: config.of(n).vehicle.airframe().rotor_count for n in config.vehicles}
         self._node = node
-        self._outlet = outlet
+        self._target = target
         self._number = number
         self._options = options
         self._say = say
@@ -177,17 +177,17 @@ class LiveSession:
     def __exit__(self, *_: object) -> None:
         for stream in self._streams:
             stream.subscriber.close()
-        self._outlet.close_recording(self._logger)
+        self._target.close_recording(self._logger)
 
     def _open(self) -> RerunLogger:
         number = next(self._number)
         logger = RerunLogger(
-            self._outlet.open(f"flight {number}"),
+            self._target.open(f"flight {number}"),
             vehicles=self._vehicles,
             scene=self._shapes,
             event_window_ns=self._options.event_window_ns,
             image_rate_max_hz=self._options.image_rate_hz,
-            compress=self._outlet.compress,
+            compress=self._target.compress,
             live=True,
             keep_layout=number > 1,
         )
@@ -198,7 +198,7 @@ class LiveSession:
     def _begin_again(self) -> None:
         self._command_ns.clear()
         self._rates = SensorRates()
-        self._outlet.close_recording(self._logger)
+        self._target.close_recording(self._logger)
         self._logger = self._open()
         self._say("the simulator has begun again: a new recording")
 

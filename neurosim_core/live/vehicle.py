@@ -165,7 +165,7 @@ class VehicleNode:
         return sim.make_state(
             self.model,
             in_flight=1,
-            flight_lane_count=pending,
+            render_backlog=pending,
             borrow_pictures=self._lockstep,
             make_room=self.publisher.acquire_buffer if self._writes_in_place else None,
             seed=seed,
@@ -208,7 +208,7 @@ class VehicleNode:
             drop: Late frames are dropped: the flight may go on for some more periods.
         """
         spare = 0 if drop else self._batches_per_period * _SPARE_PERIODS
-        return sim.free_lanes(self.state) >= self._batches_per_period + spare
+        return sim.render_backlog_left(self.state) >= self._batches_per_period + spare
 
     def fly(self, stamp_ns: int) -> list[Batch]:
         """Fly the control period that begins at a tick [ns]; return what remains to be rendered.

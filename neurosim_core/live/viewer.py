@@ -91,12 +91,12 @@ def view(
     options = ViewOptions(only=only, event_window_ns=round(event_window_s * 1e9), image_rate_hz=image_rate_hz)
     stop = threading.Event()
     with stop_at_signals(stop), contextlib.ExitStack() as stack:
-        outlet: RerunTarget
+        target: RerunTarget
         if save is not None:
-            outlet = FileTarget(save, say)
+            target = FileTarget(save, say)
         else:
             viewer = stack.enter_context(RerunViewer(web=web, waiting=lambda: not stop.is_set()))
-            outlet = ViewerTarget(viewer)
+            target = ViewerTarget(viewer)
         node = stack.enter_context(Node("viewer"))
         if web:
             page = stack.enter_context(ControlPage(node, viewer.page_url, port=port))
@@ -104,7 +104,7 @@ def view(
             if open_browser and has_display():
                 webbrowser.open(page.url)
         try:
-            status = watch(node, outlet, options, stop=stop, say=say, to_the_end=save is not None)
+            status = watch(node, target, options, stop=stop, say=say, to_the_end=save is not None)
         except ViewerEnded as error:
             if web:
                 raise
@@ -114,7 +114,7 @@ def view(
 
 def watch(
     node: Node,
-    outlet: RerunTarget,
+    target: RerunTarget,
     options: ViewOptions,
     *,
     stop: threading.Event,
@@ -125,7 +125,7 @@ def watch(
 
     Args:
         node: Subscribes.
-        outlet: Opens recordings.
+        target: Opens recordings.
         options: What to show.
         stop: Ends it.
         say: Called with what a user should know.
@@ -147,7 +147,7 @@ def watch(
     with contextlib.ExitStack() as stack:
         while not stop.wait(POLL_S):
             now_s = time.monotonic()
-            if not outlet.check():
+            if not target.check():
                 return 0
             found = _receive(announcements, say)
             if found is not None and (found[1] != source or _bodies_of(found[0]) != bodies):
@@ -156,7 +156,7 @@ def watch(
                 stack.close()
                 session, present = None, True
                 try:
-                    session = LiveSession(node, simulation, outlet, options, number=number, say=say)
+                    session = LiveSession(node, simulation, target, options, number=number, say=say)
                 except ConfigError as error:
                     say(f"cannot read the settings of this simulator (version {simulation.version}): {error}")
                     continue

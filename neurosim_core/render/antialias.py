@@ -48,7 +48,6 @@ from neurosim_core.render.coverage import (
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import RADIANCE, RenderOutputs, allocated_radiance_writer
-from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
@@ -57,7 +56,6 @@ from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, til
 
 _SIDE = 4
 _LANES = _SIDE * _SIDE
-_QUARTER = 0x33  # bits of 2 x 2 of them
 
 
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
@@ -248,14 +246,50 @@ def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
     return wp.func_native(code)(shade_block)
 
 
+@cache
+def _pixel_caster(terms: RenderTerms) -> Any:
+    """Return the Warp function, for CPU kernels only, that renders those of 4 x 4 pixels that have a bit."""
+
+    def cast_pixels(
+        scene: SceneData,
+        view: ViewData,
+        rays: wp.array2d[wp.vec4],
+        first_pixel: int,
+        far_m: float,
+        instant: int,
+        top: int,
+        left: int,
+        rows: int,
+        columns: int,
+        unresolved: int,
+        radiance_out: wp.array[wp.vec3],
+    ): ...
+
+    if terms.textured:
+        cast_pixels.__name__ = cast_pixels.__qualname__ = "cast_textured_pixels"
+    code = read_native(
+        __file__,
+        "cast_pixels",
+        SAMPLES=RAY_COUNT,
+        WIDTH=terms.embree,
+        N=_LANES,
+        SIDE=_SIDE,
+        TEXTURED=terms.textured,
+        EMISSIVE=terms.emissive,
+        TIMED=terms.timed,
+        UNIT=False,
+        LIGHT_WITHIN=False,
+        APART=0,
+    )
+    return wp.func_native(code)(cast_pixels)
+
+
 def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_radiance = allocated_radiance_writer()
-    cast_packet = packet_caster(terms.embree, origins=True)
-    find_pose = pose_finder(terms)
     shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
-    shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
+    cast_pixels = _pixel_caster(terms)
 
     @wp.kernel(module="unique", enable_backward=False)
     def average_blocks(
@@ -301,46 +335,20 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         )
         unresolved = unresolved_bits[0]
         if unresolved != 0:
-            origins = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            ray = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            face = wp.zeros(shape=(_LANES,), dtype=int)
-            t = wp.zeros(shape=(_LANES,), dtype=float)
-            u = wp.zeros(shape=(_LANES,), dtype=float)
-            v = wp.zeros(shape=(_LANES,), dtype=float)
-            normal = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
-            light = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            packets = int(RAY_COUNT)  # of 2 x 2 pixels; a variable: the loop is not unrolled
-            for packet in range(packets):
-                quarter = packet % 4
-                corner = quarter // 2 * 2 * _SIDE + quarter % 2 * 2
-                if (unresolved >> corner) & _QUARTER == 0:
-                    continue
-                for lane in range(_LANES):
-                    pixel = corner + lane % 4 // 2 * _SIDE + lane % 2
-                    x = pixel % _SIDE
-                    y = pixel // _SIDE
-                    ray[lane] = wp.vec3(0.0)
-                    light[lane] = wp.vec3(0.0)
-                    if (unresolved >> pixel) & 1 == 1 and x < columns and y < rows:
-                        point = ray_point(packet // 4 * 4 + lane // 4)
-                        at = first_ray + y * view.width + x
-                        sum_C = rays[0, at] + point[0] * rays[1, at] + point[1] * rays[2, at]
-                        toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
-                        pose = find_pose(instant, 0, (top + y) * view.width + left + x, view)
-                        origins[lane] = view.p_WC[pose]
-                        ray[lane] = wp.quat_rotate(view.q_WC[pose], toward)
-                        spread_rad[lane] = RAY_WIDTH * rays[0, at][3]
-                cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
-                )
-                shade_packet(scene, ray, spread_rad, face, t, u, v, normal, light)
-                for lane in range(_LANES):
-                    total[corner + lane % 4 // 2 * _SIDE + lane % 2] += light[lane]
-            for lane in range(_LANES):
-                if (unresolved >> lane) & 1:
-                    radiance[lane] = total[lane] / float(RAY_COUNT)
+            cast_pixels(
+                scene,
+                view,
+                rays,
+                first_ray,
+                FAR_M,
+                instant,
+                top,
+                left,
+                rows,
+                columns,
+                unresolved,
+                radiance,
+            )
         for y in range(rows):
             for x in range(columns):
                 write_radiance(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)

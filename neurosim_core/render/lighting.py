@@ -31,7 +31,7 @@ from neurosim_core.render.config import LightingConfig
 from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_width
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.light_cache import cached_arrays
-from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.scene import Scene, extent
 
 wp.set_module_options({"enable_backward": False})
 
@@ -115,10 +115,10 @@ def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> Ref
     faces, origin = scene.faces, np.arange(len(scene.faces), dtype=np.int32)
     short: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
     while edge_max_m is not None and len(faces):
-        tips = vertices[faces]
-        sides = tips[:, (1, 2, 0)] - tips  # side k goes from corner k to corner k + 1
+        tips = vertices.take(faces, axis=0)
+        sides = np.roll(tips, -1, axis=1) - tips  # side k goes from corner k to corner k + 1
         long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
-        split = long.any(axis=1)
+        split = long[:, 0] | long[:, 1] | long[:, 2]
         added_count_max -= int(long.sum())
         if added_count_max < 0:
             return None
@@ -322,9 +322,8 @@ def _hemisphere(count: int) -> NDArray[np.float32]:
     radius2 = (k + 0.5) / count
     angle = k * _GOLDEN_ANGLE
     radius = np.sqrt(radius2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius2)], 1).astype(
-        np.float32
-    )
+    columns = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius2)
+    return np.stack(columns, axis=1, dtype=np.float32)
 
 
 def _sphere(count: int) -> NDArray[np.float32]:
@@ -332,16 +331,15 @@ def _sphere(count: int) -> NDArray[np.float32]:
     k = spread_order(count)
     z = 1.0 - (2.0 * k + 1.0) / count
     radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z], 1).astype(
-        np.float32
-    )
+    columns = radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z
+    return np.stack(columns, axis=1, dtype=np.float32)
 
 
 def corner_normals(mesh: RefinedMesh) -> NDArray[np.float32]:
     """Return the shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
-    tips = mesh.vertices[mesh.faces]
+    tips = mesh.vertices.take(mesh.faces, axis=0)
     front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-    normals = mesh.normals[mesh.faces]
+    normals = mesh.normals.take(mesh.faces, axis=0)
     sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
     return normals * sign[..., None]
 
@@ -353,8 +351,8 @@ def _group_corners(
 
     Places are told apart to 2^-20 of the scene's size, normals to 1/64.
     """
-    low = mesh.vertices.min(axis=0)
-    quantum = max(float((mesh.vertices.max(axis=0) - low).max()) / (1 << 20), 1e-9)
+    low, high = extent(mesh.vertices)
+    quantum = max(float((high - low).max()) / (1 << 20), 1e-9)
     place = np.rint((mesh.vertices - low) / quantum).astype(np.int64)
     _, place_id = np.unique(place[:, 0] << 42 | place[:, 1] << 21 | place[:, 2], return_inverse=True)
     facing = np.rint(normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
@@ -376,15 +374,16 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
         openness: Share of the ambient light, shape [G, 2].
         faces: Groups of the corners of each face, shape [F, 3].
     """
-    ends = np.concatenate([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
-    ends = np.concatenate([ends, ends[:, ::-1]])
+    a, b, c = np.ascontiguousarray(faces.T)
+    one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
     for side in range(2):
         buried = openness[:, side] < _BURIED
-        from_open = ends[buried[ends[:, 0]] & ~buried[ends[:, 1]]]
-        count = np.bincount(from_open[:, 0], minlength=len(light))
+        rim = buried.take(one) & ~buried.take(other)
+        inside, outside = one[rim], other[rim]
+        count = np.bincount(inside, minlength=len(light))
         touched = count > 0
         for channel in range(3):
-            total = np.bincount(from_open[:, 0], light[from_open[:, 1], side, channel], minlength=len(light))
+            total = np.bincount(inside, light[outside, side, channel], minlength=len(light))
             light[touched, side, channel] = total[touched] / count[touched]
 
 
@@ -442,7 +441,7 @@ def bake_light(
     rest = scene.lights, scene.ambient, config, caster, wp.__version__, _source()
     large = wp.get_device(device).is_cpu and len(mesh.faces) >= _KEPT_FACES_MIN
     found = cached_arrays((*inputs, *rest), compute) if large else compute()
-    per_corner = found["light"][found["group"]]
+    per_corner = found["light"].take(found["group"], axis=0)
     return np.ascontiguousarray(np.moveaxis(per_corner, 1, 0)).reshape(2, -1, 3, 3)
 
 

@@ -24,7 +24,7 @@ from neurosim_core.render.body_arrays import join_bodies
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.lighting import RefinedMesh, bake_light, refine
-from neurosim_core.render.scene_arrays import auto_exposure
+from neurosim_core.render.scene_arrays import areas_m2, auto_exposure
 from neurosim_core.scene.bodies import Body, BodyPoses, body_poses
 from neurosim_core.scene.materials import mean_albedo, pack_textures
 from neurosim_core.scene.scene import Material, Scene
@@ -99,7 +99,7 @@ def upload_pyrender_scene(
     material_of = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
-        exposure = auto_exposure(mesh, light, albedo[material_of])
+        exposure = auto_exposure(areas_m2(mesh), light, albedo[material_of])
     nodes = pyrender.Scene(
         bg_color=[*_to_display(exposure * np.array(scene.sky)), 1.0], ambient_light=[1.0] * 3
     )

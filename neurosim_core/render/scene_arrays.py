@@ -82,6 +82,7 @@ def upload_scene(
     )
     materials = (*scene.materials, *joined.materials)
     light: NDArray[np.float32] | None = None
+    data = SceneData()
     wp.zeros(1, device=device)  # Warp makes a device's streams at its first use, which must be in one thread
     with ThreadPoolExecutor(max_workers=3) as aside:
         packing = aside.submit(pack_textures, materials)
@@ -89,17 +90,25 @@ def upload_scene(
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
         building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
+
+        def cover() -> tuple[PackedTextures, RenderTerms, NDArray[np.float64]]:
+            packed, area_m2 = packing.result(), areas_m2(mesh)
+            terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
+            _upload_surfaces(data, scene, mesh, area_m2, joined, packed, terms, device)
+            if connecting is not None:
+                _upload_wholes(data, scene, mesh, connecting.result(), device)
+            return packed, terms, area_m2
+
+        covering = aside.submit(cover)
         if baked or config.exposure == "auto":
             light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
-        packed = packing.result()
+        packed, terms, area_m2 = covering.result()
         tree, embree = building.result()
-    terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
     material = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
-        exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
-    data = SceneData()
+        exposure = auto_exposure(area_m2, light, mean_albedo(materials, packed)[material])
     data.mesh = tree.id
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
@@ -107,10 +116,7 @@ def upload_scene(
     else:
         data.tree = make_ray_tree(tree)
         data.face_normal = face_normals(tree)
-    _upload_surfaces(data, scene, mesh, joined, packed, terms, device)
     _upload_light(data, scene, mesh, light, config, lamps=bool(bodies) or not baked, device=device)
-    if connecting is not None:
-        _upload_wholes(data, scene, mesh, connecting.result(), device)
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure
@@ -179,6 +185,7 @@ def _upload_surfaces(
     data: SceneData,
     scene: Scene,
     mesh: RefinedMesh,
+    area_m2: NDArray[np.float64],
     joined: JoinedBodies,
     packed: PackedTextures,
     terms: RenderTerms,
@@ -195,9 +202,9 @@ def _upload_surfaces(
     if terms.textured:
         data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
     if len(packed.levels):
-        surfaces = ((mesh, material), (joined.mesh, joined.material))
-        density = np.concatenate([_texel_density(m, owner, packed) for m, owner in surfaces])
-        uv = np.concatenate([m.uv[m.faces].reshape(-1, 2) for m, _ in surfaces])
+        surfaces = ((mesh, area_m2, material), (joined.mesh, areas_m2(joined.mesh), joined.material))
+        density = np.concatenate([_texel_density(*surface, packed) for surface in surfaces])
+        uv = np.concatenate([m.uv.take(m.faces, axis=0).reshape(-1, 2) for m, *_ in surfaces])
         data.face_lod = wp.array(density, dtype=float, device=device)
         data.corner_uv = wp.array(uv, dtype=wp.vec2, device=device)
         data.levels = wp.array(packed.levels, dtype=wp.vec3i, device=device)
@@ -260,7 +267,7 @@ def _upload_wholes(
     first = np.searchsorted(mesh.origin, np.arange(len(scene.faces) + 1)).astype(np.int32)
     data.whole_of_face = wp.array(mesh.origin, dtype=int, device=device)
     data.whole_first = wp.array(first, dtype=int, device=device)
-    corners = scene.vertices[scene.faces].reshape(-1, 3).astype(np.float32)
+    corners = scene.vertices.take(scene.faces, axis=0).reshape(-1, 3).astype(np.float32)
     data.whole_corner = wp.array(corners, dtype=wp.vec3, device=device)
     data.whole_neighbor = wp.array(neighbor, dtype=int, device=device)
     data.whole_surface = wp.array(surface, dtype=int, device=device)
@@ -279,14 +286,14 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     material, vertices = scene.face_material, np.ascontiguousarray(scene.vertices, dtype=np.float32)
     mesh = scene
     count = len(mesh.faces)
-    tips = mesh.vertices[mesh.faces]
+    tips = mesh.vertices.take(mesh.faces, axis=0)
     bits = (vertices + np.float32(0.0)).view(np.int32).astype(np.int64)  # + 0 makes -0 equal to 0
     plan, up = bits[:, 0] << 32 | (bits[:, 1] & 0xFFFFFFFF), bits[:, 2]
     order = np.lexsort((up, plan))
     place = np.zeros(len(vertices), dtype=np.int64)
     place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
-    corner, others = place[mesh.faces], ((1, 2), (2, 0), (0, 1))
-    first, last = corner[:, (1, 2, 0)].reshape(-1), corner[:, (2, 0, 1)].reshape(-1)
+    corner = place.take(mesh.faces)
+    first, last = np.roll(corner, -1, axis=1).reshape(-1), np.roll(corner, 1, axis=1).reshape(-1)
     key = edge_keys(first, last)
     order = np.argsort(key, kind="stable")
     same = key[order[1:]] == key[order[:-1]]
@@ -296,43 +303,51 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
     normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    uv = mesh.uv[mesh.faces][:, others].reshape(-1, 2, 2)
-    uv = np.where((first > last)[:, None, None], uv[:, ::-1], uv)
-    joined = (material[one // 3] == material[other // 3]) & (uv[one] == uv[other]).all(axis=(1, 2))
-    joined &= np.einsum("ec,ec->e", normal[one // 3], normal[other // 3]) > _PLANE_COSINE
+    uv = mesh.uv.take(mesh.faces, axis=0)  # of the ends of each edge, the one of the lower number first:
+    ends = np.roll(uv, -1, axis=1).reshape(-1, 2), np.roll(uv, 1, axis=1).reshape(-1, 2)
+    turned = (first > last)[:, None]
+    joined = material[one // 3] == material[other // 3]
+    for end in (np.where(turned, *ends[::-1]), np.where(turned, *ends)):
+        u, v = (end.take(one, axis=0) == end.take(other, axis=0)).T
+        joined &= u & v
+    sides = (normal.take(edges // 3, axis=0) for edges in (one, other))
+    joined &= np.einsum("ec,ec->e", *sides) > _PLANE_COSINE
     pairs = (one[joined] // 3, other[joined] // 3)
     graph = scipy.sparse.coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
     return neighbor, scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
 
 
-def _areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:
-    tips = mesh.vertices[mesh.faces].astype(np.float64)
+def areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:
+    """Return the area of each face [m^2], shape [F]."""
+    tips = mesh.vertices.take(mesh.faces, axis=0).astype(np.float64)
     normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
     return 0.5 * np.asarray(np.linalg.norm(normal, axis=1))
 
 
 def _texel_density(
-    mesh: RefinedMesh, material: NDArray[np.int32], packed: PackedTextures
+    mesh: RefinedMesh, area_m2: NDArray[np.float64], material: NDArray[np.int32], packed: PackedTextures
 ) -> NDArray[np.float32]:
     """Return log2 of texels of level 0 per metre on each face: half the log2 of texels per square metre."""
-    u, v = np.moveaxis(mesh.uv[mesh.faces].astype(np.float64), -1, 0)
+    u, v = np.moveaxis(mesh.uv.take(mesh.faces, axis=0).astype(np.float64), -1, 0)
     uv_area = 0.5 * np.abs(
         (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
     )
     sizes = np.array([packed.size_px(k) for k in range(len(packed.material_texture))], dtype=np.float64)
     texels = uv_area * sizes.prod(axis=1)[material]
-    return (0.5 * np.log2(np.maximum(texels, 1e-12) / np.maximum(_areas_m2(mesh), 1e-12))).astype(np.float32)
+    return (0.5 * np.log2(np.maximum(texels, 1e-12) / np.maximum(area_m2, 1e-12))).astype(np.float32)
 
 
-def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray[np.float32]) -> float:
+def auto_exposure(
+    area_m2: NDArray[np.float64], light: NDArray[np.float32], albedo: NDArray[np.float32]
+) -> float:
     """Return an exposure that shows the mean surface as middle grey and nine tenths of all below white.
 
     The mean is that of log luma; faces count by area and with their brighter side: the other one is
     often the inside of a wall.
     """
-    luma = np.maximum((light.max(axis=0).mean(axis=1) * albedo) @ _LUMA, 1e-4)
-    area = _areas_m2(mesh)
+    one, two, three = np.moveaxis(light.max(axis=0), 1, 0)
+    luma = np.maximum(((one + two + three) / np.float32(3.0) * albedo) @ _LUMA, 1e-4)
     order = np.argsort(luma)
-    share = np.cumsum(area[order]) / area.sum()
+    share = np.cumsum(area_m2[order]) / area_m2.sum()
     bright = luma[order[np.searchsorted(share, 0.9)]]
-    return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area)), _BRIGHT / bright))
+    return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area_m2)), _BRIGHT / bright))

@@ -30,11 +30,11 @@ _PLACES_MAX = 64
 """Most addresses that copies of one array go to and that are remembered."""
 
 _POOLED_BYTES_MAX = 256 << 20
-"""Most memory of one kind that is lent out in more than a few blocks: pages that are pinned are nobody
+"""Most memory of one kind that readers hold in more than a few blocks: pages that are pinned are nobody
 else's."""
 
 _POOLED_COUNT_MIN = 3
-"""So many blocks are lent however large they are: who reads one after the other holds two."""
+"""So many blocks readers may hold however large they are: who reads one after the other holds two."""
 
 
 def size_class(size: int) -> int:
@@ -263,7 +263,7 @@ class HostCopy:
 
 
 class PooledBuffer:
-    """Memory of the host that the device copies to, pinned on CUDA, and that is lent to who reads it."""
+    """Memory of the host that the device copies to, pinned on CUDA, and that its readers hold."""
 
     def __init__(self, size: int, device: Any) -> None:
         self.size = size

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -23,13 +22,12 @@ from numpy.typing import NDArray
 
 from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
 from neurosim_core.scene.materials import srgb_to_linear
-from neurosim_core.scene.scene import Material
+from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Lamp,
     Part,
     SceneError,
     Source,
-    TextureStore,
     decode_picture,
     rgb,
     unique_name,
@@ -46,7 +44,8 @@ def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> 
     Args:
         path: The .gltf or .glb file.
         textures_required: Whether a texture file that is not there is an error, or noted and left out.
-        pictures: Decode textures now, or when they are first looked at.
+        pictures: Decode textures from now on in threads: the first look at one waits for it, and raises what
+            is wrong with it. Else they are decoded at that first look, if ever.
 
     Raises:
         SceneError: If the file is truncated, malformed, or needs an extension that is not read.
@@ -65,13 +64,6 @@ def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> 
         else:
             wrong = f"an entry of it has the wrong form ({error})"
         raise SceneError(f"{path}: malformed glTF, {wrong}; a glTF 2.0 validator says where") from error
-
-
-def _picture_of(path: Path, index: int) -> NDArray[np.uint8]:
-    """Return the texels of a picture of a file that has been read before."""
-    texels = _Reader(path, textures_required=True, pictures=True).decoded(index)
-    assert texels is not None, "a required picture that is missing is an error"
-    return texels
 
 
 class _Reader:
@@ -106,24 +98,26 @@ class _Reader:
             )
         return name, data
 
-    def decoded(self, index: int) -> NDArray[np.uint8] | None:
-        """Return the texels of a picture; None: its file is not there."""
-        name, data = self._image(index)
-        return None if data is None else decode_picture(data, file=str(self.path), name=name)
-
-    def _later(self, index: int) -> Callable[[], NDArray[np.uint8]] | None:
-        """Return what reads the file again and decodes a picture; None: its file is not there."""
-        return None if self._image(index)[1] is None else partial(_picture_of, self.path, index)
-
-    def _pictures(self, wanted: set[int]) -> dict[int, NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]]:
-        """Decode images, several at once: Pillow releases the interpreter lock."""
-        order = sorted(wanted)
-        with ThreadPoolExecutor(max_workers=4) as pool:
-            found = list(pool.map(self.decoded if self.pictures else self._later, order))
-        missing = sum(picture is None for picture in found)
-        if missing:
-            self.source.notes.append(f"{missing} texture files are missing; base colours are used alone.")
-        return {index: picture for index, picture in zip(order, found, strict=True) if picture is not None}
+    def _textures(self, wanted: set[int]) -> dict[int, Texture]:
+        """Return the textures of pictures, one for pictures of the same bytes; see `read_gltf`."""
+        found: dict[bytes, Texture] = {}
+        textures: dict[int, Texture] = {}
+        threads = ThreadPoolExecutor()  # Pillow releases the interpreter lock
+        for index in sorted(wanted):
+            name, data = self._image(index)
+            if data is None:
+                continue
+            if data not in found:
+                decode = partial(decode_picture, data, file=str(self.path), name=name)
+                texels = threads.submit(decode).result if self.pictures else decode
+                found[data] = Texture(name=name, srgb=texels)
+            textures[index] = found[data]
+        threads.shutdown(wait=False)
+        if len(textures) < len(wanted):
+            self.source.notes.append(
+                f"{len(wanted) - len(textures)} texture files are missing; base colours are used alone."
+            )
+        return textures
 
     def _materials(self) -> list[dict[str, Any]]:
         """Fill the materials; return for each how its texture coordinates are found."""
@@ -144,26 +138,21 @@ class _Reader:
         index_of = {
             id(info): self._image_index(info) for info in [*(base[1] for base in bases), *emissives] if info
         }
-        pictures = self._pictures({index for index in index_of.values() if index >= 0})
-        store = TextureStore()
-        names = {index: self.file.tree["images"][index].get("name") or f"image {index}" for index in pictures}
+        textures = self._textures({index for index in index_of.values() if index >= 0})
         taken: set[str] = set()
         coordinates = []
         see_through = metallic = glowing = transformed = clamped = 0
         for index, (entry, (factor, info), emissive) in enumerate(
             zip(entries, bases, emissives, strict=True)
         ):
-            picture = pictures.get(index_of.get(id(info), -1)) if info else None
-            texture = None
-            if picture is not None:
-                texture = store.add(picture, name=names[index_of[id(info)]])
+            texture = textures.get(index_of.get(id(info), -1)) if info else None
             glow = np.asarray(entry.get("emissiveFactor", [0, 0, 0]), dtype=np.float64)
             glow = glow * entry.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get(
                 "emissiveStrength", 1.0
             )
-            glow_picture = pictures.get(index_of.get(id(emissive), -1)) if emissive else None
-            if glow_picture is not None and not callable(glow_picture) and glow.any():
-                glow = glow * srgb_to_linear(glow_picture).mean(axis=(0, 1), dtype=np.float64)
+            glowing_texture = textures.get(index_of.get(id(emissive), -1)) if emissive else None
+            if glowing_texture is not None and self.pictures and glow.any():
+                glow = glow * srgb_to_linear(glowing_texture.srgb).mean(axis=(0, 1), dtype=np.float64)
                 glowing += 1
             self.source.materials.append(
                 Material(

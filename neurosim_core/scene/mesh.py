@@ -14,10 +14,10 @@ from pydantic import Field
 from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
-from neurosim_core.scene.lamps import hang_lamps, scaled_lights
+from neurosim_core.scene.lamps import lights_of
 from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.normals import smooth_normals
-from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture
+from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
 from neurosim_core.scene.source import (
     Axis,
     Part,
@@ -108,7 +108,10 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         part["positions"] = part["positions"] @ turn.T + config.position_m
         if part["normals"] is not None:
             part["normals"] = part["normals"] @ _TURN[axis].T
-    origin = _origin(parts)
+    boxes = np.stack(
+        [extent(part["positions"].take(part["faces"], axis=0)) for part in parts if len(part["faces"])]
+    )
+    origin = _origin(boxes)
     for part in parts:
         part["positions"] = part["positions"] - origin
     if origin.any():
@@ -116,17 +119,26 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
             f"The scene lies far from the origin: {origin.tolist()} m was subtracted from its coordinates; "
             "all places in settings and recordings count from there."
         )
-    _check_extent(parts, path)
+    _check_extent(boxes - origin, path)
 
     arrays = _assembled(parts, source, notes, path)
-    triangles = arrays["vertices"][arrays["faces"]].astype(np.float64)
-    size = np.ptp(triangles, axis=(0, 1))
+    triangles = arrays["vertices"].take(arrays["faces"], axis=0).astype(np.float64)
+    low, high = extent(triangles)
+    size = high - low
     if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
         across = f"{size.max():,.0f}" if size.max() > 1.0 else f"{size.max():.3g}"
         notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")
-    return Scene(
+    scene = Scene(
         name=path.stem,
-        lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
+        lights=lights_of(
+            source,
+            config.light_scale,
+            triangles,
+            notes,
+            turn=turn,
+            shift_m=np.array(config.position_m) - origin,
+            path=path,
+        ),
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
         instance_names=tuple(source.instance_names),
         instance_labels=source.instance_labels,
@@ -135,6 +147,10 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),
         **arrays,
     )
+    for texture in (material.texture for material in scene.materials if pictures):
+        if texture is not None:
+            texture.decode()
+    return scene
 
 
 def _read(path: Path, config: MeshSceneConfig, pictures: bool) -> Source:
@@ -212,14 +228,13 @@ def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
     or more, which a lone box has not. Upright surface faces both other axes, at least half of one full wall
     each, which a stage set, a hill or a ball on a plane has not.
     """
-    triangles = unit_m * np.concatenate(
-        [part["positions"][part["faces"]].reshape(-1, 3, 3) for part in parts]
-    )
-    extent = np.ptp(triangles, axis=(0, 1))
-    axis = int(np.argmin(extent))
+    triangles = unit_m * np.concatenate([part["positions"].take(part["faces"], axis=0) for part in parts])
+    lowest, highest = extent(triangles)
+    size = highest - lowest
+    axis = int(np.argmin(size))
     first, second = (other for other in range(3) if other != axis)
     low, high = _STOREY_M
-    if axis == 0 or not low <= extent[axis] <= min(high, 0.6 * extent[first], 0.6 * extent[second]):
+    if axis == 0 or not low <= size[axis] <= min(high, 0.6 * size[first], 0.6 * size[second]):
         return None
     cross = 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(cross, axis=1)
@@ -229,8 +244,8 @@ def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
     walls = (cross[upright] ** 2 / area[upright, None]).sum(axis=0)  # area times the squared cosine
     if (
         int(np.argmax(amount)) != axis
-        or walls[first] < 0.5 * extent[axis] * extent[second]
-        or walls[second] < 0.5 * extent[axis] * extent[first]
+        or walls[first] < 0.5 * size[axis] * size[second]
+        or walls[second] < 0.5 * size[axis] * size[first]
     ):
         return None
     level = facing[:, axis]
@@ -241,17 +256,15 @@ def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
     return ("x", "y", "z")[axis] if (floors > 0.002 * amount[axis]).sum() >= 3 else None
 
 
-def _origin(parts: list[dict[str, Any]]) -> NDArray[np.float64]:
-    """Return whole metres to subtract along axes on which the scene is far from 0, shape [3]."""
-    used = [part["positions"][part["faces"].reshape(-1)] for part in parts if len(part["faces"])]
-    low = np.min([rows.min(axis=0) for rows in used], axis=0)
-    high = np.max([rows.max(axis=0) for rows in used], axis=0)
+def _origin(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return whole metres to subtract along axes on which parts [P, 2, 3] are far from 0, shape [3]."""
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     away = np.maximum(low, -high)  # negative where 0 is within
     return np.asarray(np.where(away > _FAR_M, np.rint(0.5 * (low + high)), 0.0))
 
 
-def _check_extent(parts: list[dict[str, Any]], path: Path) -> None:
-    far = max(float(np.abs(part["positions"][part["faces"]]).max()) for part in parts if len(part["faces"]))
+def _check_extent(boxes: NDArray[np.float64], path: Path) -> None:
+    far = float(np.abs(boxes).max())
     if far > _EXTENT_MAX_M:
         raise SceneError(
             f"{path}: reaches {far:,.0f} m from the origin, allowed are {_EXTENT_MAX_M:,.0f} m; declare "
@@ -263,8 +276,9 @@ def _placed(parts: list[Part], path: Path) -> list[dict[str, Any]]:
     """Return parts with their transforms applied, in file units and axes."""
     placed = []
     for part in parts:
-        used = part.positions[part.faces.reshape(-1)]
-        bad = int((~np.isfinite(used).all(axis=1)).sum())
+        bad = 0
+        if not np.isfinite(part.positions).all():  # those in no face may be anything
+            bad = int((~np.isfinite(part.positions[part.faces.reshape(-1)]).all(axis=1)).sum())
         if bad or not np.isfinite(part.matrix).all():
             what = f"{bad} corners of its faces" if bad else "its transform"
             raise SceneError(
@@ -293,7 +307,7 @@ def _placed(parts: list[Part], path: Path) -> list[dict[str, Any]]:
             {
                 "positions": positions,
                 "faces": faces,
-                "thin": _is_thin(part.positions[part.faces]),
+                "thin": _is_thin(part.positions.take(part.faces, axis=0)),
                 "normals": normals,
                 "uv": part.uv,
                 "color": color,
@@ -307,7 +321,8 @@ def _placed(parts: list[Part], path: Path) -> list[dict[str, Any]]:
 def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which triangles [F, 3, 3] are lower than 1e-7 of their longest edge: lines to float32."""
     edge = np.roll(corner, -1, axis=1) - corner
-    longest_squared = np.einsum("fcx,fcx->fc", edge, edge).max(axis=1)
+    one, two, three = np.einsum("fcx,fcx->fc", edge, edge).T
+    longest_squared = np.maximum(np.maximum(one, two), three)
     cross = np.cross(edge[:, 0], edge[:, 1])
     return np.asarray(np.einsum("fx,fx->f", cross, cross) <= (1e-7 * longest_squared) ** 2)
 
@@ -323,7 +338,7 @@ def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], pa
     owner = np.repeat(np.arange(len(parts)), np.diff(start))
 
     # in the file's numbers, where a line is still exactly one, and as the scene stores them
-    thin = np.concatenate([part["thin"] for part in parts]) | _is_thin(positions[faces])
+    thin = np.concatenate([part["thin"] for part in parts]) | _is_thin(positions.take(faces, axis=0))
     if thin.any():
         notes.append(f"{int(thin.sum())} of {len(faces)} faces have no area and are dropped.")
     if thin.all():
@@ -344,7 +359,7 @@ def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], pa
     normals = normals / np.where(given, length, 1.0)[:, None]
 
     corner_vertex, corner_normal = faces.reshape(-1), np.full(faces.size, -1, dtype=np.int64)
-    lacking = ~given[faces].all(axis=1)
+    lacking = ~given.take(faces.T).all(axis=0)
     computed = np.zeros((0, 3))
     if lacking.any():
         computed, label = smooth_normals(positions, faces[lacking], owner)
@@ -379,7 +394,8 @@ def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], pa
     if color_uv is not None:
         final_uv = np.where(apart[first][:, None], color_uv[first], final_uv)
 
-    used, face_material = np.unique(material, return_inverse=True)
+    used = np.flatnonzero(np.bincount(material))
+    face_material = np.searchsorted(used, material)
     return {
         "vertices": positions[vertex].astype(np.float32),
         "faces": index.reshape(-1, 3).astype(np.int32),
@@ -459,38 +475,3 @@ def _patches(color: NDArray[np.float64], name: str) -> tuple[Texture, NDArray[np
     uv = at / [width, height]
     uv[:, :, 1] = 1.0 - uv[:, :, 1]
     return Texture(name=f"{name} (vertex colours)", srgb=linear_to_srgb8(image)), uv
-
-
-def _lights(
-    config: MeshSceneConfig,
-    source: Source,
-    turn: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    triangles: NDArray[np.float64],
-    notes: list[str],
-) -> Any:
-    if not source.lamps:
-        if config.light_scale is not None:
-            raise SceneError(
-                f"light_scale = {config.light_scale:g} scales the lights of the file, and {config.file} has "
-                "none: leave it out"
-            )
-        places, sentence = hang_lamps(triangles)
-        notes.append(f"The file has no lights; {len(places)} are {sentence}.")
-        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    away = 20.0 * float(np.linalg.norm(high - low))
-    positions, intensities = [], []
-    for lamp in source.lamps:
-        vector = turn @ lamp.vector
-        if lamp.kind == "directional":  # a point light so far off that its rays are parallel
-            vector = vector / np.linalg.norm(vector)
-            positions.append((low + high) / 2.0 - away * vector)
-            intensities.append(rgb(np.asarray(lamp.intensity) * away**2))
-        else:
-            positions.append(vector + shift)
-            intensities.append(lamp.intensity)
-    lights, factor = scaled_lights(positions, intensities, triangles, factor=config.light_scale)
-    how = "as declared" if config.light_scale is not None else "so that the median surface is well lit"
-    notes.append(f"{len(lights)} lights of the file, their intensities (cd, lx) times {factor:.3g}, {how}.")
-    return lights

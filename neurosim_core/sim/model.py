@@ -105,7 +105,7 @@ def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Mo
         model.scene,
         model.bodies,
         model.free_space,
-        _plan(config, model.free_space) if replan else model.path,
+        plan_path(config, model.free_space) if replan else model.path,
         model.scene_on_device,
         model.setup_s,
     )
@@ -145,7 +145,7 @@ def make_fleet(
         with phase("free space"):
             free_space = make_free_space(scene, config.free_space, device=device)
         with phase("path"):
-            paths = {name: _plan(member, free_space) for name, member in members.items()}
+            paths = {name: plan_path(member, free_space) for name, member in members.items()}
 
         def model_of(name: str, config: SimulationConfig, scene_on_device: Any) -> Model:
             return _make_member(
@@ -175,10 +175,15 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
     members = {name: config.of(name) for name in (vehicles or config.vehicles)}
     scene = config.scene.load(pictures=False)
     free_space = make_free_space(scene, config.free_space, device=find_device(config.device))
-    return {name: _plan(member, free_space) for name, member in members.items()}
+    return {name: plan_path(member, free_space) for name, member in members.items()}
 
 
-def _plan(config: SimulationConfig, free_space: FreeSpace) -> Path:
+def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
+    """Return the path of the only vehicle.
+
+    Raises:
+        ValueError: No path exists, or it begins inside a solid.
+    """
     path = make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
     if not isinstance(config.path, CollisionFreeConfig):  # those begin in free space
         free_space.check_start(path.evaluate([0]).position[0])

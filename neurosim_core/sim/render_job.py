@@ -32,7 +32,7 @@ _SLOT_LISTS_MAX = 256
 class Instants:
     """What a group sees in one batch."""
 
-    lane: int
+    buffer_index: int
     """Which of the batches in flight it is."""
     stamps_ns: tuple[int, ...]
     """Stamps of the instants, at least one."""
@@ -117,7 +117,7 @@ def plan_render(
     slots: Sequence[int],
     stamps_ns: Sequence[int],
     *,
-    lane: int,
+    buffer_index: int,
     wanted: Collection[str],
     active: Any = None,
 ) -> RenderJob:
@@ -128,7 +128,7 @@ def plan_render(
         trace: Where the states of the batch are.
         slots: Slots of the instants in the trace, at least one.
         stamps_ns: Their stamps, of the clock that all worlds share.
-        lane: Which of the batches in flight it is; the one that had its buffers before has been read.
+        buffer_index: Which of the batches in flight it is; the one that had its buffers before has been read.
         wanted: Names of the cameras that look.
         active: 0 where a world is not rendered, device array of int32, shape [world]; None: all are.
     """
@@ -144,16 +144,18 @@ def plan_render(
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = tuple(slots), tuple(image_slots)
-    key: Hashable | None = (id(group), lane, posed, placed)
+    key: Hashable | None = (id(group), buffer_index, posed, placed)
     if group.world_count > 1:  # shared walks look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
-    buffers, chosen = group.buffers[lane], None
+    buffers, chosen = group.buffers[buffer_index], None
     if group.rule is not None:
         key, chosen = None, buffers.chosen_slots
         assert chosen is not None
         chosen.rows[: len(slots)] = slots
-    from_slots = _on_device(group, (lane, "from", posed), lambda: posed) if chosen is None else chosen.array
-    to_slots = _on_device(group, (lane, "to", placed), lambda: _image_slots(group, placed))
+    from_slots = (
+        _on_device(group, (buffer_index, "from", posed), lambda: posed) if chosen is None else chosen.array
+    )
+    to_slots = _on_device(group, (buffer_index, "to", placed), lambda: _image_slots(group, placed))
     p_WC, q_WC, stamps, bodies = buffers.p_WC, buffers.q_WC, buffers.stamps, buffers.bodies
 
     def render() -> tuple[Any, Any]:
@@ -193,7 +195,7 @@ def plan_render(
         return from_slots, to_slots
 
     instants = Instants(
-        lane=lane,
+        buffer_index=buffer_index,
         stamps_ns=tuple(stamps_ns),
         pictures=tuple(pictures),
         frames=tuple(name for name in group.frames if name in wanted),
@@ -208,7 +210,7 @@ def acquire_room(job: RenderJob) -> None:
         return
     for stamp_ns, slot, name in instants.pictures:
         if (name, stamp_ns) not in instants.rooms:
-            picture = group.buffers[instants.lane].copies[group.images[name].source].view(slot, 1)[0]
+            picture = group.buffers[instants.buffer_index].copies[group.images[name].source].view(slot, 1)[0]
             room = group.make_room(name, stamp_ns, picture)
             if room is not None:
                 instants.rooms[name, stamp_ns] = room
@@ -239,7 +241,7 @@ def leave_out(group: RenderGroupState, stamps_ns: Iterable[int], wanted: Collect
 
 def scan_frames(group: RenderGroupState, instants: Instants) -> None:
     """Let the frame sensors see the instants just rendered."""
-    frames = group.buffers[instants.lane].renderer.log_radiance
+    frames = group.buffers[instants.buffer_index].renderer.log_radiance
     for name in instants.frames:
         group.frames[name].see(frames, instants.stamps_ns)
 
@@ -260,7 +262,7 @@ def flush_frames(group: RenderGroupState, *, until_ns: int) -> list[Packet]:
 def _bring(group: RenderGroupState, instants: Instants) -> None:
     """Launch the copies of pictures to the host: to the room that there is, or as usual."""
     for stamp_ns, slot, name in instants.pictures:
-        copy = group.buffers[instants.lane].copies[group.images[name].source]
+        copy = group.buffers[instants.buffer_index].copies[group.images[name].source]
         room = instants.rooms.get((name, stamp_ns))
         if room is None:
             copy.fetch(slot, 1)
@@ -283,7 +285,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         room = instants.rooms.pop((name, stamp_ns), None)
         if room is not None:
             return room
-        picture: NDArray[Any] = group.buffers[instants.lane].copies[image.source].view(slot, 1)[0]
+        picture: NDArray[Any] = group.buffers[instants.buffer_index].copies[image.source].view(slot, 1)[0]
         if borrow:
             return picture
         key = (image.source, slot)  # cameras that take the same picture share the copy

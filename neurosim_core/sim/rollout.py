@@ -52,7 +52,7 @@ def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = N
 def run_model(model: Model, state: State) -> Iterator[Packet]:
     """Yield every packet from the state's present stamp to the end of the run; see `run`.
 
-    Where the state has several lanes, the vehicle is up to as many batches ahead of the packets.
+    Where the state keeps several batches in flight, the vehicle is up to as many ahead of the packets.
     """
     if state.launched_count == 0:
         yield from start(model, state)
@@ -134,8 +134,8 @@ def acquire_rooms(state: State) -> None:
 
 def settle(state: State) -> None:
     """Wait until the device has written all pictures that were handed out (`make_state`, `make_room`)."""
-    for lane in state.batch_done:
-        lane.wait()
+    for done in state.batch_done:
+        done.wait()
 
 
 def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
@@ -173,7 +173,7 @@ def integrate_period(
         look at: each batch goes to `render_batch` or `skip_batch`, in order, from one thread at a time.
 
     Raises:
-        RuntimeError: More batches wait for the cameras than there are lanes: see `free_lanes`.
+        RuntimeError: More batches wait for the cameras than may: see `render_backlog_left`.
         ValueError: The command is of a wrong shape or not finite.
         DynamicsError: The integration has failed before; what was measured until then has been returned.
     """
@@ -183,14 +183,14 @@ def integrate_period(
     batches: list[Batch] = []
 
     def fly(stretch: Sequence[Boundary]) -> None:
-        if free_lanes(state) < 1:
+        if render_backlog_left(state) < 1:
             raise RuntimeError(
-                f"{state.flight_lane_count} batches wait for render_batch() or skip_batch(): no lane is free"
+                f"{state.render_backlog} batches wait for render_batch() or skip_batch(), and no more may"
             )
         batch = plan_batch(state, stretch, closed_loop=False)
         launch_flight(state, batch, *plan_flight(state, batch))
         batches.append(batch)
-        state.flown[batch.number % state.flight_lane_count].wait()
+        state.flown[batch.number % state.render_backlog].wait()
         packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
 
     if state.launched_count == 0:
@@ -203,9 +203,9 @@ def integrate_period(
     return packets, batches
 
 
-def free_lanes(state: State) -> int:
+def render_backlog_left(state: State) -> int:
     """Return how many batches `integrate_period` can fly before one of those that wait was looked at."""
-    return state.flight_lane_count - (state.launched_count - state.rendered_count)
+    return state.render_backlog - (state.launched_count - state.rendered_count)
 
 
 def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:

@@ -123,7 +123,7 @@ class State:
     """Seed of each world, device array of uint64."""
     batch_done: Sequence[Fence]
     """For each batch that cameras may render, the point where the device has finished it."""
-    flight_lane_count: int
+    render_backlog: int
     """The most batches that may be flown and not rendered."""
     borrow_pictures: bool
     """Pictures are views that the next batch with the same buffers overwrites."""
@@ -184,7 +184,7 @@ def make_state(
     model: Model,
     *,
     in_flight: int | None = None,
-    flight_lane_count: int | None = None,
+    render_backlog: int | None = None,
     borrow_pictures: bool = False,
     make_room: MakeRoom | None = None,
     seed: int | None = None,
@@ -197,7 +197,7 @@ def make_state(
         model: What does not change.
         in_flight: How many batches `run_model` keeps in flight. By default 3 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
-        flight_lane_count: How many batches of `integrate_period` may wait for `render_batch`; by default
+        render_backlog: How many batches of `integrate_period` may wait for `render_batch`; by default
             `in_flight`.
         borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
             or `render_batch`; those that a step would overwrite itself are copied.
@@ -211,17 +211,13 @@ def make_state(
         ValueError: The start is of a wrong shape or not finite.
     """
     config, device = model.config, model.device
-    is_cuda = wp.get_device(device).is_cuda
     on_host = worlds is None
     if worlds is None:
         worlds = _single_world(model, seed)
-    if in_flight is None:
-        in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
-    if any(getattr(sensor, "remembers", False) for sensor in config.sensors.values()):
-        in_flight = 1
+    in_flight = _in_flight(model, in_flight, on_host=on_host)
     count = len(worlds.seeds)
-    flight_lane_count = max(in_flight, flight_lane_count or 0)
-    slot_count = flight_lane_count * worlds.slot_count
+    render_backlog = max(in_flight, render_backlog or 0)
+    slot_count = render_backlog * worlds.slot_count
     seeds: Any = wp.array(np.array(worlds.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
     vehicle: Any = _make_vehicle(model, worlds, seeds)
     carried = isinstance(vehicle, Carrier)
@@ -284,9 +280,9 @@ def make_state(
         },
         seeds=seeds,
         overlaps=on_host
-        and (in_flight > 1 or make_room is not None or not is_cuda or bool(model.schedule.sparse)),
+        and (in_flight > 1 or make_room is not None or not _is_cuda(model) or bool(model.schedule.sparse)),
         batch_done=[Fence(device) for _ in range(in_flight)],
-        flight_lane_count=flight_lane_count,
+        render_backlog=render_backlog,
         borrow_pictures=borrow_pictures,
         pictures_in_place=make_room is not None,
         wanted=frozenset(name for group in model.groups for name in group.names),
@@ -296,12 +292,26 @@ def make_state(
         choice_stream=make_stream(device, high_priority=True)
         if in_flight > 1 and model.schedule.sparse
         else None,
-        flown=[Fence(device) for _ in range(flight_lane_count)],
+        flown=[Fence(device) for _ in range(render_backlog)],
         rendered=Fence(device),
         graphs=GraphCache(device),
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
+
+
+def _in_flight(model: Model, asked: int | None, *, on_host: bool) -> int:
+    """Return how many batches are kept in flight; `asked`: see `make_state`."""
+    if any(getattr(sensor, "remembers", False) for sensor in model.config.sensors.values()):
+        return 1
+    if asked is not None:
+        return asked
+    overlap = on_host and _is_cuda(model) and model.config.renderer.kind != "pyrender"
+    return _IN_FLIGHT_ON_CUDA if overlap else 1
+
+
+def _is_cuda(model: Model) -> bool:
+    return bool(wp.get_device(model.device).is_cuda)
 
 
 def _path_controller(model: Model, worlds: WorldSettings) -> Controller:

@@ -23,26 +23,36 @@ _CLOSED = wp.constant(-2)
 
 @wp.func
 def _settle(
-    key: wp.array[wp.float32], heap: wp.array[wp.int32], place: wp.array[wp.int32], node: int, slot: int
+    # In:
+    node: int,
+    key: float,
+    slot: int,
+    # In/out:
+    heap: wp.array[wp.int32],
+    keys: wp.array[wp.float32],
+    place: wp.array[wp.int32],
 ) -> None:
     """Move a node from a slot towards the root until its parent is not larger."""
     here = slot + 0  # a variable of the loop, not the argument
     while here > 0:
         above = (here - 1) // 2
-        other = heap[above]
-        if key[other] <= key[node]:
+        if keys[above] <= key:
             break
+        other = heap[above]
         heap[here] = other
+        keys[here] = keys[above]
         place[other] = here
         here = above
     heap[here] = node
+    keys[here] = key
     place[node] = here
 
 
 @wp.kernel
 def _search(
     # Model:
-    slowness: wp.array3d[wp.float32],
+    slowness: wp.array[wp.float32],
+    shape: wp.vec3i,
     voxel_m: float,
     # In:
     start: int,
@@ -51,80 +61,72 @@ def _search(
     # Out:
     cost_out: wp.array[wp.float32],
     parent_out: wp.array[wp.int32],
-    key: wp.array[wp.float32],
     heap: wp.array[wp.int32],
+    keys: wp.array[wp.float32],
     place: wp.array[wp.int32],
 ) -> None:
-    nx = slowness.shape[0]
-    ny = slowness.shape[1]
-    nz = slowness.shape[2]
+    ny = shape[1]
+    nz = shape[2]
     goal_z = goal % nz
     goal_y = (goal // nz) % ny
     goal_x = goal // (nz * ny)
     cost_out[start] = 0.0
-    key[start] = 0.0
     heap[0] = start
+    keys[0] = 0.0
     place[start] = 0
     count = wp.int32(1)
     while count > 0:
         node = heap[0]
         place[node] = _CLOSED
-        if node == goal or key[node] > cost_max_m:
+        if node == goal or keys[0] > cost_max_m:
             break
         count -= 1
         if count > 0:  # the last node sinks from the root
             last = heap[count]
+            last_key = keys[count]
             here = wp.int32(0)
             while True:
                 child = 2 * here + 1
                 if child >= count:
                     break
                 if child + 1 < count:  # noqa: SIM102 (Warp's `and` evaluates both sides: out of range)
-                    if key[heap[child + 1]] < key[heap[child]]:
+                    if keys[child + 1] < keys[child]:
                         child += 1
-                if key[heap[child]] >= key[last]:
+                if keys[child] >= last_key:
                     break
                 heap[here] = heap[child]
+                keys[here] = keys[child]
                 place[heap[here]] = here
                 here = child
             heap[here] = last
+            keys[here] = last_key
             place[last] = here
-        z = node % nz
-        y = (node // nz) % ny
-        x = node // (nz * ny)
-        here_slowness = slowness[x, y, z]
-        for side in range(27):
-            dx = side // 9 - 1
-            dy = (side // 3) % 3 - 1
-            dz = side % 3 - 1
-            ax = x + dx
-            ay = y + dy
-            az = z + dz
-            if ax < 0 or ay < 0 or az < 0 or ax >= nx or ay >= ny or az >= nz:
-                continue
-            there_slowness = slowness[ax, ay, az]
-            if there_slowness <= 0.0:
-                continue
-            other = (ax * ny + ay) * nz + az
-            if place[other] == _CLOSED:
-                continue
-            step = wp.sqrt(float(dx * dx + dy * dy + dz * dz)) * voxel_m
-            cost = cost_out[node] + 0.5 * step * (here_slowness + there_slowness)
-            if cost < cost_out[other]:
-                ahead = 0.0 * step
-                if goal >= 0:
-                    gx = float(goal_x - ax)
-                    gy = float(goal_y - ay)
-                    gz = float(goal_z - az)
-                    ahead = 0.9999 * voxel_m * wp.sqrt(gx * gx + gy * gy + gz * gz)
-                cost_out[other] = cost
-                key[other] = cost + ahead
-                parent_out[other] = node
-                slot = place[other]
-                if slot == _UNSEEN:
-                    slot = count
-                    count += 1
-                _settle(key, heap, place, other, slot)
+        here_cost = cost_out[node]
+        here_slowness = slowness[node]
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                half_step = 0.5 * wp.sqrt(float(dx * dx + dy * dy + 1)) * voxel_m
+                half_middle = 0.5 * wp.sqrt(float(dx * dx + dy * dy)) * voxel_m
+                row = node + (dx * ny + dy) * nz
+                for dz in range(-1, 2):
+                    other = row + dz
+                    half = wp.where(dz == 0, half_middle, half_step)
+                    cost = here_cost + half * (here_slowness + slowness[other])
+                    if cost < cost_out[other]:  # noqa: SIM102 (as above: the second is rarely needed)
+                        if place[other] != _CLOSED:
+                            key = cost
+                            if goal >= 0:
+                                gx = float(goal_x - other // (nz * ny))
+                                gy = float(goal_y - (other // nz) % ny)
+                                gz = float(goal_z - other % nz)
+                                key += 0.9999 * voxel_m * wp.sqrt(gx * gx + gy * gy + gz * gz)
+                            cost_out[other] = cost
+                            parent_out[other] = node
+                            slot = place[other]
+                            if slot == _UNSEEN:
+                                slot = count
+                                count += 1
+                            _settle(other, key, slot, heap, keys, place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +136,16 @@ class Search:
     cost: NDArray[np.float32]
     """Length of the best way, weighted by slowness [m], shape [nx, ny, nz]; inf where none was found."""
     parent: NDArray[np.int32]
-    """Flat index of the voxel before, shape [nx ny nz]; -1 at the start."""
+    """Index of the voxel before in a flat grid that has one more voxel all around; -1: there is none."""
 
     def way(self, goal: tuple[int, int, int]) -> NDArray[np.int64]:
         """Return the voxels from the start to a goal whose cost is finite, shape [n, 3]."""
-        node = int(np.ravel_multi_index(goal, self.cost.shape))
+        shape = tuple(n + 2 for n in self.cost.shape)
+        node = _flat(goal, shape)
         nodes = [node]
         while (node := int(self.parent[node])) >= 0:
             nodes.append(node)
-        return np.stack(np.unravel_index(np.array(nodes[::-1]), self.cost.shape), axis=1)
+        return np.stack(np.unravel_index(np.array(nodes[::-1]), shape), axis=1) - 1
 
 
 def search(
@@ -162,7 +165,9 @@ def search(
         goal: Voxel at which to stop (A*); None: find the ways to all voxels (Dijkstra).
         cost_max_m: Ways that cost more need not be found [m].
     """
-    size = slowness.size
+    # Nothing is cheaper than what goes through a voxel of infinite slowness: such a border, and no bounds.
+    walls = np.pad(np.where(slowness > 0.0, slowness, np.inf), 1, constant_values=np.inf)
+    size = walls.size
     empty = {"dtype": wp.int32, "device": "cpu"}
     cost: Any = wp.full(size, value=np.inf, dtype=wp.float32, device="cpu")
     parent: Any = wp.full(size, value=-1, **empty)
@@ -170,17 +175,23 @@ def search(
         _search,
         dim=1,
         inputs=[
-            wp.array(slowness, dtype=wp.float32, device="cpu", copy=False),
+            wp.array(walls.reshape(-1), dtype=wp.float32, device="cpu", copy=False),
+            wp.vec3i(*walls.shape),
             voxel_m,
-            int(np.ravel_multi_index(start, slowness.shape)),
-            -1 if goal is None else int(np.ravel_multi_index(goal, slowness.shape)),
+            _flat(start, walls.shape),
+            -1 if goal is None else _flat(goal, walls.shape),
             cost_max_m,
             cost,
             parent,
-            wp.empty(size, dtype=wp.float32, device="cpu"),
             wp.empty(size, **empty),
+            wp.empty(size, dtype=wp.float32, device="cpu"),
             wp.full(size, value=-1, **empty),
         ],
         device="cpu",
     )
-    return Search(cost.numpy().reshape(slowness.shape), parent.numpy())
+    return Search(cost.numpy().reshape(walls.shape)[1:-1, 1:-1, 1:-1], parent.numpy())
+
+
+def _flat(voxel: tuple[int, int, int], shape: tuple[int, ...]) -> int:
+    """Return the index of a voxel in a flat array that has one more voxel all around."""
+    return int(np.ravel_multi_index([k + 1 for k in voxel], shape))

@@ -2,7 +2,9 @@
 
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig
 from neurosim_core.vehicle.arrays import MultirotorArrays
+from neurosim_core.vehicle.config import VehicleConfig, VehicleContext
 from neurosim_core.vehicle.ground import GroundConfig
+from neurosim_core.vehicle.host_vehicle import HostVehicle
 from neurosim_core.vehicle.multirotor import (
     Acceleration,
     DynamicsError,
@@ -21,11 +23,14 @@ __all__ = [
     "Effort",
     "GroundConfig",
     "GustConfig",
+    "HostVehicle",
     "Integrator",
     "Multirotor",
     "MultirotorArrays",
     "MultirotorConfig",
     "MultirotorState",
     "TurbulenceConfig",
+    "VehicleConfig",
+    "VehicleContext",
     "preset",
 ]

@@ -16,10 +16,12 @@ from rosbags.rosbag2 import Reader
 from runtime_directory import own_directory
 
 from cortex import messages as msg
+from cortex.log import open_log
 from cortex_ros2_bridge.backend.bag import BagBackend, bag_directory, stamp_reader
 from cortex_ros2_bridge.backend.base import BackendError, Qos
 from cortex_ros2_bridge.backend.choose import open_backend
 from cortex_ros2_bridge.bag_file import BagReader, BagWriter
+from cortex_ros2_bridge.cli import main
 from cortex_ros2_bridge.routes import look
 from cortex_ros2_bridge.typestore import type_hash, typestore
 
@@ -309,3 +311,31 @@ def test_the_bridge_records_the_commands_of_others(monkeypatch: pytest.MonkeyPat
                 (told,) = rig.update_until(target.messages)
         assert (told.type_mask, told.thrust, told.body_rate.y) == (128, 0.5, -2.0)
         assert told.header.frame_id == "drone/base_link"
+
+
+def test_a_bag_becomes_a_log_and_the_log_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Commands, IMU and pictures, with their times; what Cortex has no type for is named."""
+    picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    sent = {
+        "/drone/imu": msg.Imu(5_000_000_000, THREE, 2 * THREE),
+        "/drone/rgb": msg.Image(5_000_000_001, picture, "rgb8", "drone/rgb"),
+        **{f"/drone/command/{mode}": command for mode, command in COMMANDS.items()},
+    }
+    times_ns = {topic: 7_000_000_000 + index for index, topic in enumerate(sent)}
+    with contextlib.closing(BagWriter(tmp_path / "one.bag")) as bag:
+        for topic, message in sent.items():
+            assert bag.write(topic, message, at_ns=times_ns[topic]) == 1
+        bag.write("/clock", msg.Clock(6_000_000_000, 0), at_ns=8_000_000_000)
+    for source, target in (("one.bag", "one.mcap"), ("one.mcap", "two.bag"), ("two.bag", "two.mcap")):
+        assert main(["--convert", str(tmp_path / source), str(tmp_path / target)]) == 0
+        printed = capsys.readouterr()
+        assert dict(line.split() for line in printed.out.splitlines()) == dict.fromkeys(sent, "1")
+        assert ("/clock" in printed.err) == (source == "one.bag")
+    for name in ("one.mcap", "two.mcap"):
+        with open_log(tmp_path / name) as log:
+            found = {topic: (message, info.log_ns) for topic, message, info in log.messages()}
+        assert {topic: at_ns for topic, (_, at_ns) in found.items()} == times_ns
+        assert np.array_equal(found["/drone/rgb"][0].data, picture)
+        for topic, message in sent.items():
+            assert found[topic][0].stamp_ns == message.stamp_ns
+        assert np.allclose(found["/drone/imu"][0].angular_rate, 2 * THREE)

@@ -160,9 +160,9 @@ def node_maker(context):
 
 
 @contextlib.contextmanager
-def serving(**options):
+def serving(domain=0, **options):
     """A registry in a thread."""
-    registry = Registry(0, **options)
+    registry = Registry(domain, **options)
     thread = threading.Thread(target=registry.run)
     thread.start()
     try:

@@ -1,18 +1,15 @@
 """Decode damaged bodies, and demand that each one is decoded or rejected, the same way by all decoders.
 
-The short cuts must agree with the general decoder on every body, and on every twentieth with the reading of
-WIRE.md in `wire_oracle`.
+C must agree with the general decoder in Python on every body.
 """
 
 from __future__ import annotations
 
-import json
 import random
 from collections import Counter
 from typing import Any
 
 import numpy as np
-import wire_oracle
 from wire_vectors import load_vectors
 
 from cortex.codec import Codec, MalformedMessage, codec_of
@@ -32,7 +29,6 @@ class Target:
     def __init__(self, name: str, vector: dict[str, Any]) -> None:
         self.name = name
         self.codec: Codec = codec_of(type_from_schema(Schema.from_json(vector["schema"])))
-        self.schema = json.loads(vector["schema"])
         self.bodies = [bytes.fromhex(case["body"]) for case in vector["cases"] + vector["malformed"]]
 
 
@@ -87,7 +83,7 @@ def outcome(decode: Any, *arguments: Any) -> Any:
         return None
 
 
-def check(target: Target, body: bytes, *, with_oracle: bool) -> bool:
+def check(target: Target, body: bytes) -> bool:
     """Decode a body in every way and return whether it was accepted."""
     codec = target.codec
     first = outcome(codec.decode, body)
@@ -104,17 +100,10 @@ def check(target: Target, body: bytes, *, with_oracle: bool) -> bool:
         assert again is not None
         assert again == codec.encode(general, 2**32) == codec.encode(within, 2**32), (target.name, body.hex())
         assert codec.encode(codec.decode(again), 2**32) == again
-    if with_oracle:
-        try:
-            wire_oracle.decode(target.schema, body)
-            expected = True
-        except wire_oracle.Bad:
-            expected = False
-        assert accepted == expected, (target.name, body.hex())
     return accepted
 
 
-def run(count: int, seed: int, oracle_every: int = 20) -> Counter[str]:
+def run(count: int, seed: int) -> Counter[str]:
     """Check so many mutated bodies and return how many were accepted and rejected."""
     rng = random.Random(seed)
     all_targets = targets()
@@ -122,6 +111,6 @@ def run(count: int, seed: int, oracle_every: int = 20) -> Counter[str]:
     for index in range(count):
         target = all_targets[index % len(all_targets)]
         body = mutate(rng, rng.choice(target.bodies))
-        accepted = check(target, body, with_oracle=index % oracle_every == 0)
+        accepted = check(target, body)
         results["accepted" if accepted else "rejected"] += 1
     return results

@@ -13,11 +13,13 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
 import cortex
+import cortex.node
 from cortex import Array, Node, Policy, UInt32
 from cortex.message import message
 
@@ -122,16 +124,23 @@ class Peer:
         return {"ok": self.subscribers[topic].wait_for_publisher(60.0)}
 
     def publish(
-        self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0
+        self,
+        topic: str,
+        count: int,
+        start: int = 0,
+        size: int = 0,
+        rate_hz: float = 0.0,
+        sizes: list[int] | None = None,
     ) -> dict[str, Any]:
         """Publish numbered messages; says how many were delivered, and the longest time that one took."""
+        sizes = sizes or [size]
         publisher = self.publishers[topic]
         delivered, longest_s, begin_s = 0, 0.0, time.monotonic()
         for k in range(count):
             if rate_hz:
                 while time.monotonic() < begin_s + k / rate_hz:
                     time.sleep(100e-6)
-            made = make(publisher.codec.type, start + k, size)
+            made = make(publisher.codec.type, start + k, sizes[k % len(sizes)])
             before_s = time.monotonic()
             delivered += publisher.publish(made)
             longest_s = max(longest_s, time.monotonic() - before_s)
@@ -204,17 +213,25 @@ class Peer:
         return {"count": self.served_count}
 
     def memory(self) -> dict[str, Any]:
-        """Resident memory now, and what a ring may use is part of it."""
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
+        """See `memory`."""
+        return memory()
 
 
-def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = None, **options: Any) -> None:
-    """Does what it is told until its input ends."""
+def memory() -> dict[str, int]:
+    """Resident memory now, and what a ring may use is part of it."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
+
+
+def node_at(name: str, host: str = "", **options: Any) -> Node:
+    """A node, of another host if that is named."""
     if host:
-        import cortex.node
-
         cortex.node.host_id = lambda: host
+    return Node(name, **options)
+
+
+def as_peer(name: str = "peer", limit_file_bytes: int | None = None, **options: Any) -> None:
+    """Does what it is told until its input ends."""
     if limit_file_bytes is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_file_bytes, limit_file_bytes))
     if "keys" in options:
@@ -223,7 +240,7 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
         from cortex.security import load_keys
 
         options["keys"] = load_keys(Path(options["keys"]))
-    with Node(name, **options) as node:
+    with node_at(name, **options) as node:
         peer = Peer(node)
         say(node=node.id)
         for line in sys.stdin:
@@ -231,11 +248,19 @@ def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = N
             say(**getattr(peer, words.pop("do"))(**words))
 
 
-def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float) -> None:
-    """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked."""
-    with Node("endless publisher") as node, node.publisher(topic, Block) as publisher:
+def as_endless_publisher(
+    topic: str, sizes: list[int], rate_hz: float, count_file: str = "", **place: Any
+) -> None:
+    """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked.
+
+    With a file of 8 bytes it begins once somebody reads, and keeps there how many it has published.
+    """
+    with node_at("endless publisher", **place) as node, node.publisher(topic, Block) as publisher:
         say(pid=os.getpid())
         blocks = [make_block(0, size) for size in sizes]
+        counts = np.memmap(count_file, np.uint64) if count_file else np.zeros(1, np.uint64)
+        if count_file:
+            publisher.wait_for_subscribers(timeout_s=60.0)
         number = 0
         next_s = time.monotonic()
         while True:
@@ -246,14 +271,16 @@ def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float) -> None:
             block = blocks[number % len(blocks)]
             publisher.publish(Block(number, block.check, block.data))
             number += 1
+            counts[0] = number
             next_s += 1.0 / rate_hz
             time.sleep(max(next_s - time.monotonic(), 0.0))
 
 
-def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
+def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0, **place: Any) -> None:
     """Receives and checks blocks until its input ends; says what has come when asked."""
     kept: list[Block] = []
-    with Node("endless subscriber") as node, node.subscriber(topic, Block, policy=policy_of(policy)) as sub:
+    node = node_at("endless subscriber", **place)
+    with node, node.subscriber(topic, Block, policy=policy_of(policy)) as sub:
         say(pid=os.getpid())
         torn = count = 0
         while True:
@@ -279,13 +306,25 @@ def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
             del kept[: len(kept) - keep]
 
 
+ROLES: dict[str, Callable[..., None]] = {
+    "peer": as_peer,
+    "endless_publisher": as_endless_publisher,
+    "endless_subscriber": as_endless_subscriber,
+}
+
+
+def forked(role: str, arguments: dict[str, Any], directory: str, *streams: Connection) -> None:
+    """In a process that was forked: what `main` does, with these standard streams."""
+    os.environ["CORTEX_RUNTIME_DIR"] = directory
+    for number, stream in enumerate(streams):
+        os.dup2(stream.fileno(), number)
+        stream.close()
+    sys.stdin, sys.stdout, sys.stderr = (os.fdopen(number, mode) for number, mode in enumerate("rww"))
+    ROLES[role](**arguments)
+
+
 def main() -> None:
-    roles: dict[str, Callable[..., None]] = {
-        "peer": as_peer,
-        "endless_publisher": as_endless_publisher,
-        "endless_subscriber": as_endless_subscriber,
-    }
-    roles[sys.argv[1]](**json.loads(sys.argv[2]))
+    ROLES[sys.argv[1]](**json.loads(sys.argv[2]))
 
 
 if __name__ == "__main__":

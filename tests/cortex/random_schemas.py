@@ -122,18 +122,3 @@ def messages_of(draw: st.DrawFn, schema: Schema) -> Any:
 def any_message(draw: st.DrawFn, of: st.SearchStrategy[Schema] = schemas) -> Any:
     """Messages of any schema."""
     return draw(messages_of(draw(of)))
-
-
-def to_plain(kind: FieldType, value: Any) -> Any:
-    """Return a value as the oracle of the wire format takes it."""
-    if isinstance(kind, Schema):
-        return {field.name: to_plain(field.type, getattr(value, field.name)) for field in kind.fields}
-    if isinstance(kind, OptionalType):
-        return None if value is None else to_plain(kind.item, value)
-    if isinstance(kind, ListType):
-        return [to_plain(kind.item, item) for item in value]
-    if isinstance(kind, EnumType):
-        return value.name
-    if isinstance(kind, ArrayType):
-        return {"dtype": value.dtype.name, "shape": list(value.shape), "items": value.tobytes()}
-    return value

@@ -17,6 +17,7 @@ from cortex import Array, MalformedMessage, Node, TypeMismatch, message, reliabl
 from cortex.body import Body
 from cortex.codec import codec_of
 from cortex.layout import VALUES_MAX
+from cortex.messages import VelocityCommand
 from cortex.schema import Schema, SchemaError, schema_of, type_from_schema
 
 
@@ -134,6 +135,17 @@ def test_back_pressure_ends_when_the_publisher_says(runtime):
         del subscriber
         with pytest.raises(ValueError, match="max_wait_s must be 0 to 86400, got -1"):
             one.publisher("/other", Grid, max_wait_s=-1.0)
+
+
+@pytest.mark.parametrize(("type_", "longest_s"), [(Grid, 1.0), (VelocityCommand, 0.1)])
+def test_a_command_holds_up_its_publisher_for_a_moment_only(runtime, type_, longest_s):
+    """By default; whatever a reader asks for."""
+    with Node("one", registry="off") as node:
+        publisher = node.publisher("/topic", type_)
+        subscriber = node.subscriber("/topic", type_, policy=reliable(timeout_s=3_000_000.0))
+        assert publisher.wait_for_subscribers()
+        assert [reader.timeout_s for reader in publisher._fanout.readers.values()] == [longest_s]
+        subscriber.close()
 
 
 def test_a_c_module_that_cannot_be_loaded_is_no_secret(tmp_path):

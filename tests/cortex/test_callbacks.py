@@ -153,3 +153,19 @@ def test_a_callback_publishes_and_subscribes(node):
     for value in range(1, 100):
         first.publish(Number(0, value))
     wait_for(lambda: received and received[-1].value == 100)
+
+
+def test_coroutine_functions_are_refused(node):
+    """Called, they would give coroutines that nobody awaits: each message would be lost without a word."""
+
+    async def take(message):
+        pass
+
+    for call in (
+        lambda: node.subscriber("/numbers", Number, take),
+        lambda: node.service("/double", Number, Number, take),
+        lambda: node.watch("/**", take),
+    ):
+        with pytest.raises(TypeError, match=r"coroutine function .*take.*, which no loop would run"):
+            call()
+    assert not node.topics()

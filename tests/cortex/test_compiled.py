@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
 import types
 
 import pytest
@@ -30,6 +32,15 @@ def test_a_module_of_another_version_is_left_out(found, caplog):
     assert "there/_native.so is older or newer" in caplog.text
     found.INTERFACE = compiled.INTERFACE
     assert compiled._load() is found
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_without_the_gil_nothing_is_imported(enabled):
+    """Better an error than a message that is lost now and then."""
+    program = f"import sys; sys._is_gil_enabled = lambda: {enabled}; import cortex"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == enabled
+    assert enabled or "cortex needs the GIL: run python with -X gil=1" in done.stderr
 
 
 def test_it_can_be_left_out_on_request(found, monkeypatch):

@@ -25,6 +25,7 @@ from cpp_client import (
 )
 from cpp_messages import OtherScan, Picture, Rich, Scan
 from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
+from directories import serving
 from processes import SOON_S, shared_mappings, wait_for
 from wire_vectors import load_vectors, message_from_plain
 
@@ -37,7 +38,9 @@ from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
 
 MUTATIONS = 3000
-CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+HOSTILE_WRITES = int(os.environ.get("CORTEX_HOSTILE_WRITES", "40000"))
+"""Writes of a peer that writes at random; ten millions take a few minutes."""
+CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0, "cut_off": 0}
 
 __all__ = ["programs", "start"]
 
@@ -83,6 +86,18 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith(f"{len(lines)} bodies, ")
+
+
+def test_a_peer_that_writes_at_random(programs: Path, tmp_path: Path) -> None:
+    """Into a ring and its slots, a page, a bell, a connection: it hurts itself only (ASan, UBSan)."""
+    done = subprocess.run(
+        [programs / "hostile_test", tmp_path, str(HOSTILE_WRITES), "1"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S + 1e-3 * HOSTILE_WRITES,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
 def test_between_threads(programs: Path) -> None:
@@ -299,6 +314,24 @@ def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[.
     assert (published.topic, published.published, published.timeouts) == ("/scan", 10, 0)
     assert published.bytes == 10 * (24 + 40)  # the fixed block and ten floats
     assert (subscribed.topic, subscribed.policy) == ("/other", "reliable(depth=64, timeout_s=60)")
+
+
+def test_the_clock_is_that_of_the_registry(
+    start: Callable[..., Peer], make_node: Callable[..., Node], runtime: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A registry whose host is a minute ahead: what a C++ node tells of its own clock says so."""
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + 60 * 10**9)
+    with serving(1, listen="tcp://127.0.0.1:0") as registry:
+        monkeypatch.setenv("CORTEX_REGISTRY", str(registry.address))
+        node = make_node()
+        start("count", "/other", "reliable", 0, 0)
+
+        def offset_ns() -> int:
+            offsets = [record.clock_offset_ns for record in node.nodes() if record.node != node.id]
+            return offsets[0] if offsets else 0
+
+        wait_for(lambda: abs(offset_ns() - (time.time_ns() - time.monotonic_ns())) < 10**9)
 
 
 def test_killed_cpp_reader_frees_its_slots(

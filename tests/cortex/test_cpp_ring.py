@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import select
 import shutil
 import signal
 import socket
@@ -18,7 +19,7 @@ import zmq
 from cpp_client import Impostor, Peer, make_frame, publishers_in_cpp, subscribers_in_cpp
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs, start
-from processes import SOON_S, wait_for
+from processes import SOON_S, Child, wait_for
 
 import cortex.link
 from cortex import wire
@@ -136,6 +137,31 @@ def test_reader_without_ring(
     for number in range(500):
         assert scans.recv(SOON_S).stamp_ns == number
     assert scans.counters.lost == 0
+
+
+def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(
+    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands still, and holds up a C++ publisher after 8 MB, as one in Python."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.05))
+    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)  # the node does not read either
+    result = result_of(start("fill", "/scan", 200, 250_000))  # 1 MB each
+    # What is on its way besides: in the kernel, and one in the queue of the reader.
+    assert 8 <= result["taken"] <= 12
+
+
+def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
+    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a second, not for one with each large message."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 1.0))
+    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)
+    begin = time.monotonic()
+    result = result_of(start("publish", "/scan", 40, "250000"))
+    assert result["refused"] >= 28
+    assert time.monotonic() - begin < 20.0
 
 
 @pytest.mark.parametrize("others", [0, 2])
@@ -337,6 +363,26 @@ def test_cpp_reader_counts_what_it_had_no_time_for(
     writer.end()
     reader.process.send_signal(signal.SIGCONT)
     wait_for(lambda: counted(watcher) == [sent])
+
+
+def test_cpp_reader_counts_a_stream_that_was_cut_off(
+    start: Callable[..., Peer], start_child: Callable[..., Child], make_node: Callable[..., Node]
+) -> None:
+    """Nobody knows how much of it was lost; one that was closed in order is complete."""
+    reader = start("count", "/scan", "reliable", 0, 0)
+    for orderly in (True, False):
+        child = start_child("peer")
+        child.hear()
+        child.ask(do="publisher", topic="/scan", type="Scan")
+        assert child.ask(do="await_subscribers", topic="/scan")["ok"]
+        child.say(do="leave", topic="/scan", count=10, orderly=orderly)
+    assert select.select([reader.process.stderr], [], [], SOON_S)[0]
+    last = make_node().publisher("/scan", Scan)
+    assert last.wait_for_subscribers(1, SOON_S)
+    last.publish(scan(-1, 0))
+    result = result_of(reader)
+    assert (result["received"], result["lost"], result["cut_off"]) == (20, 0, 1)
+    assert "ended without saying how much it had sent" in reader.end()
 
 
 class RingImpostor(Impostor):

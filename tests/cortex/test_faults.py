@@ -12,9 +12,10 @@ import signal
 import threading
 import time
 
+import numpy as np
 import pytest
 from peer import Block, Number, is_whole, make_block
-from processes import SOON_S, processes_with, wait_for
+from processes import SOON_S, fork_server, processes_with, shared_mappings, wait_for
 
 from cortex import keep_last, latest, reliable
 from cortex.host import REGISTRY_LOCK, runtime_dir
@@ -63,6 +64,12 @@ class Stream:
         self.stop()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forks():
+    """What starts the processes that are killed."""
+    return fork_server()
+
+
 def slots_held(publisher):
     with publisher._pub_sockets.lock:
         return publisher._fanout.ring._ring.leased()
@@ -72,6 +79,13 @@ def goes_on(stream, count=20):
     """The stream publishes more."""
     before = stream.published
     wait_for(lambda: stream.published >= before + count)
+
+
+def left(base, *subscribers):
+    """How many files the nodes have, and how many descriptors and rings this process."""
+    wait_for(lambda: len(list(base.glob("*/*.lock"))) <= 2)  # what a dead process had is swept
+    wait_for(lambda: not any(subscriber._links for subscriber in subscribers))
+    return np.array([len(list(base.glob("*/*"))), len(os.listdir("/proc/self/fd")), len(shared_mappings())])
 
 
 def registry_pid(base):
@@ -85,52 +99,94 @@ def registry_pid(base):
 
 
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(4, 60.0)], ids=str)
-def test_publishers_are_killed(make_node, start_child, runtime, policy):
-    """Whatever it was doing: what has arrived is whole, and stays so; the next publisher is heard."""
+def test_publishers_are_killed(make_node, start_child, runtime, tmp_path, policy):
+    """Whatever it was doing: what has arrived is whole, and stays so; the next publisher is heard.
+
+    A message was published or was not: all that were are received, overtaken or lost.
+    """
     generator = random.Random(str(policy))
     subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    counters = subscriber.counters
+    count_file = tmp_path / "published"
     kept, sources = [], set()
+    before = None
+
+    def accounted():
+        return counters.received + counters.overtaken + counters.lost
+
     for _ in range(max(KILLS // 6, 1)):
-        child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=2000.0)
+        count_file.write_bytes(bytes(8))
+        child = start_child(
+            "endless_publisher",
+            topic="/blocks",
+            sizes=SIZES,
+            rate_hz=2000.0,
+            count_file=str(count_file),
+            forked=True,
+        )
         child.hear()
-        known, came, last = len(sources), 0, -1
+        first, known, last = accounted(), len(sources), -1
         end = None
         while end is None or time.monotonic() < end:
             block, info = subscriber.recv_with_info(SOON_S)
             assert is_whole(block)
             sources.add(info.source)
-            if len(sources) > known:
-                assert block.number > last
-                last, came = block.number, came + 1
-                if came == 3:  # now it runs: any moment within the next cycles is as good as another
-                    end = time.monotonic() + generator.uniform(0.0, 0.05)
+            assert block.number > last
+            last = block.number
+            if end is None and last >= 3:  # any moment within the next cycles is as good as another
+                end = time.monotonic() + generator.uniform(0.0, 0.05)
             if len(block.data) > 100_000:
                 kept = [*kept[-1:], block]
+        assert len(sources) == known + 1
         child.kill()
-        while True:
-            try:
-                assert is_whole(subscriber.recv(0.05))
-            except TimeoutError:
-                break
+        published = int.from_bytes(count_file.read_bytes(), "little")
+        quiet_s = 0.0
+        while accounted() - first < published or quiet_s < 0.01:
+            begin = time.monotonic()
+            with contextlib.suppress(TimeoutError):
+                assert is_whole(subscriber.recv(0.01))
+            quiet_s = time.monotonic() - begin
+        assert accounted() - first in (published, published + 1)  # it died before it wrote that down
         assert all(is_whole(block) for block in kept)
+        child.end()
+        if before is None:
+            kept.clear()
+            before = left(runtime, subscriber)
+    assert counters.rejected == 0
+    assert counters.lost == 0 or not policy.reliable
     assert len(sources) == max(KILLS // 6, 1)
-    assert subscriber.counters.rejected == 0
     assert all(is_whole(block) for block in kept)
+    kept.clear()
+    del block
+    assert (left(runtime, subscriber) <= before).all()
 
 
 @pytest.mark.parametrize("policy", POLICIES, ids=lambda policy: policy[0])
 def test_subscribers_are_killed(make_node, start_child, runtime, policy):
-    """While they hold messages and wait for more: the leases are back at once, the publisher goes on."""
+    """While they hold messages and wait for more: the leases are back at once, the publisher goes on.
+
+    Another reader loses nothing by it.
+    """
     generator = random.Random(policy[0])
-    publisher = make_node().publisher("/blocks", Block)
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    numbers, torn = [], []
+
+    def take(block):
+        numbers.append(block.number)
+        torn.extend([] if is_whole(block) else [block.number])
+
+    witness = node.subscriber("/blocks", Block, take, policy=reliable(64, 60.0))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     freed_s, longest_s = [], []
+    before = None
     with Stream(publisher) as stream:
         for _ in range(max(KILLS // 5, 1)):
-            child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=2)
+            child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=2, forked=True)
             child.hear()
             wait_for(lambda child=child: child.ask()["count"] > 20)
             assert child.ask()["torn"] == 0
-            assert publisher.subscriber_count == 1
+            assert publisher.subscriber_count == 2
             pause_until = time.monotonic() + generator.uniform(0.0, 0.05)
             while time.monotonic() < pause_until:
                 time.sleep(1e-3)
@@ -140,8 +196,17 @@ def test_subscribers_are_killed(make_node, start_child, runtime, policy):
             wait_for(lambda: slots_held(publisher) == 0, every_s=5e-4)
             freed_s.append(time.monotonic() - begin)
             goes_on(stream)
-            wait_for(lambda: publisher.subscriber_count == 0)
+            wait_for(lambda: publisher.subscriber_count == 1)
             longest_s.append(stream.longest_s)
+            child.end()
+            before = left(runtime) if before is None else before
+            came = numbers[:]
+            assert came == list(range(came[0], came[0] + len(came)))
+            del numbers[: len(came) - 1]
+    wait_for(lambda: witness.counters.received == publisher.counters.published)
+    assert (left(runtime) <= before).all()
+    assert not torn
+    assert stream.refused == publisher.counters.timeouts == witness.counters.lost == 0
     assert min(freed_s) < 0.3  # 1 s, if nobody noticed; a busy machine makes some of them late, but not each
     assert min(longest_s) < 0.5
 
@@ -173,9 +238,9 @@ def test_registries_are_killed(make_node, start_child, runtime):
     assert min(found_s) < 4.0  # a busy machine makes some of them late, but not each
     published = child.ask()["published"]
     wait_for(lambda: numbers[-1] >= published - 1)
+    child.finish()  # then no more come
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
-    child.finish()
 
 
 def test_files_of_the_dead_are_removed(make_node, start_child, runtime):

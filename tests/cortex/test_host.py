@@ -236,3 +236,41 @@ def test_a_new_node_sweeps_what_it_finds(base):
     (directory / f"{9:016x}.lossy").touch()
     NodeFiles(0, 1).close()
     assert list(directory.iterdir()) == []
+
+
+OTHER_SYSTEM = """
+import builtins, io, os, pathlib, sys
+
+def refuse(path):
+    if str(path).startswith("/proc"):
+        raise FileNotFoundError(2, "No such file or directory", str(path))
+
+def without_proc(function):
+    return lambda path, *arguments, **options: (refuse(path), function(path, *arguments, **options))[1]
+
+builtins.open = io.open = without_proc(open)
+pathlib.Path.read_text = without_proc(pathlib.Path.read_text)
+os.readlink = without_proc(os.readlink)
+for name in ("memfd_create", "eventfd", "pidfd_open"):
+    if hasattr(os, name):
+        delattr(os, name)
+sys.platform = "darwin"
+"""
+
+
+def test_a_system_without_proc_and_memfd(base, tmp_path):
+    """As macOS is, in every process: all goes through sockets, in Python, and `cortex doctor` says so."""
+    (tmp_path / "sitecustomize.py").write_text(OTHER_SYSTEM)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}",
+        "CORTEX_PURE_PYTHON": "1",
+        "XDG_CONFIG_HOME": str(tmp_path),
+    }
+    command = [sys.executable, "-m", "cortex", "doctor"]
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=SOON_S, check=False
+    )
+    assert (done.stdout.count("WRONG"), done.stderr) == (1, "")  # the C module, which this Linux would have
+    assert "darwin has no memfd" in done.stdout
+    assert done.stdout.splitlines()[-1] == "ok     two processes: they talk by ipc"

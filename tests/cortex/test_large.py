@@ -349,6 +349,22 @@ def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
     wait_for(lambda: is_given_back(after_s=11.0))
 
 
+def test_a_small_body_in_memory_of_a_larger_one_counts_as_that(node, monkeypatch):
+    """What waits for a reliable reader is bounded by the memory that it takes."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
+    large = publisher._fanout.large
+    bodies = [large.acquire(4_000_000) for _ in range(8)]
+    bodies.clear()
+    assert len(large._free) == 8
+    with subscriber._receive_lock:
+        for _ in range(10):
+            publisher.publish(scan(0, 300_000))  # 1.2 MB
+    held = sum(large._lent.values())
+    assert 0 < held <= large.waiting_bytes[True] <= 8 << 20
+    del bodies
+
+
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
 def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     """A reader that reads nothing, large messages, no shared memory: memory does not grow for ever."""
@@ -369,6 +385,36 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     wait_for(has_caught_up)
     assert counters.received > 1
     assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
+
+
+def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch):
+    """Not each large message; it goes on when it reads, and counts what it lost."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
+    waits = []
+    wait = publisher._back_pressure.wait_for
+    monkeypatch.setattr(
+        publisher._back_pressure, "wait_for", lambda *arguments: waits.append(wait(*arguments)) or waits[-1]
+    )
+    with monkeypatch.context() as still:
+        still.setattr(subscriber, "top_up", lambda now_ns: None)
+        delivered = [publisher.publish(scan(number, 250_000)) for number in range(30)]
+    assert delivered == [True] * sum(delivered) + [False] * delivered.count(False)
+    assert waits.count(False) == 1
+    received = []
+
+    def goes_on():
+        if publisher.publish(scan(len(delivered), 250_000)):
+            return True
+        delivered.append(False)
+        received.extend(scan.stamp_ns for scan in iter(lambda: _try(subscriber), None))
+
+    wait_for(goes_on)
+    last = len(delivered)
+    while not received or received[-1] < last:
+        received.append(subscriber.recv(SOON_S).stamp_ns)
+    assert received == sorted(set(received))
+    assert len(received) + subscriber.counters.lost == last + 1
 
 
 def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):

@@ -15,6 +15,7 @@ from processes import SOON_S, wait_for
 
 from cortex import keep_last
 from cortex.codec import codec_of
+from cortex.compiled import native
 from cortex.context import new_socket
 from cortex.link import Link
 from cortex.records import PublisherRecord
@@ -25,6 +26,7 @@ from cortex.wire import (
     LARGE,
     MESSAGE,
     NEXT,
+    SLOT,
     AttachAnswer,
     Header,
     answer_frame,
@@ -42,14 +44,20 @@ _numbers = itertools.count()
 
 
 class Feed:
-    """A raw XPUB socket in a publisher's place, and a subscriber that listens to it."""
+    """A raw XPUB socket in a publisher's place, and a subscriber that listens to it.
+
+    Args:
+        kind: Of the messages.
+        directory: Where a ring is to be had, through which single frames go; None: all go through the socket.
+    """
 
     SOURCE = 0x0123456789ABCDEF
 
-    def __init__(self, kind):
+    def __init__(self, kind, directory=None):
         self.codec = codec_of(kind)
         self.socket = new_socket(zmq.XPUB, high_water_mark=0)
-        address = f"inproc://feed-{next(_numbers)}"
+        address = f"inproc://feed-{next(_numbers)}" if directory is None else f"ipc://{directory}/1.lossy"
+        listener = None if directory is None else native.listen(f"{directory}/1.ring")
         self.socket.bind(address)
         record = PublisherRecord(
             "/feed", self.SOURCE, kind.__name__, self.codec.fingerprint, self.codec.schema.to_json(), False
@@ -62,13 +70,19 @@ class Feed:
             address,
             policy=self.subscriber.policy,
             local=True,
-            shared_memory=False,
+            shared_memory=directory is not None,
             counters=self.subscriber.counters,
             clock_offset_ns=0,
         )
         self.subscriber.connect(self.link)
         self.key = wait_for(self._attach)
         self.answer = answer_frame(self.key, AttachAnswer(0, b""))
+        self.ring = None
+        if listener is not None:
+            connection = native.accept(listener)
+            self.ring = native.Broadcast(self.SOURCE, zmq.Again)
+            self.ring.add(connection, *native.hear(connection)[2:], False, 0, 0)
+            os.close(listener)
         self.socket.send(self.answer)
         assert self.subscriber.wait_for_publisher(SOON_S)
 
@@ -101,7 +115,16 @@ class Feed:
             return [self.header(kind, len(body)), body]
         if kind == NEXT:
             return [self.header(kind, 0)]
+        if kind == SLOT:
+            return [self.header(kind, len(body), aux=value)]
         return [self.answer]
+
+    def send(self, frames):
+        """Send a message, of one frame or more."""
+        if self.ring is None or len(frames) > 1:
+            self.socket.send_multipart(frames)
+        elif frames[0]:  # an empty one ends a ring
+            self.ring.send(frames[0])
 
     def drain(self):
         taken = []
@@ -113,13 +136,15 @@ class Feed:
 
     def still_lives(self, value):
         """The next good messages arrive, one of each kind."""
-        for kind in (MESSAGE, LARGE):
-            self.socket.send_multipart(self.frames(kind, value))
+        for kind in (MESSAGE, LARGE) if self.ring is None else (MESSAGE,):
+            self.send(self.frames(kind, value))
             assert self.drain() == [value], kind
 
     def close(self):
         self.subscriber.close()
         self.socket.close(0)
+        if self.ring is not None:
+            self.ring.close()
 
 
 @pytest.fixture(params=[Number, Scan], ids=lambda kind: kind.__name__)
@@ -216,19 +241,22 @@ def test_a_number_from_nowhere_does_not_end_the_stream(feed, jump):
     assert feed.subscriber.counters.lost < 2**40
 
 
+@pytest.mark.parametrize(
+    "through", ["socket", pytest.param("ring", marks=pytest.mark.skipif(native is None, reason="no C"))]
+)
 @pytest.mark.parametrize("type_", [Number, Scan])
-def test_mutated_frames_never_hurt(runtime, type_):
+def test_mutated_frames_never_hurt(runtime, tmp_path, type_, through):
     """Whatever comes, the next good message arrives."""
-    feed = Feed(type_)
+    feed = Feed(type_, tmp_path if through == "ring" else None)
     generator = np.random.Generator(np.random.Philox(key=[0, len(feed.codec.schema.fields[1].name)]))
-    kinds = (MESSAGE, LARGE, NEXT, ATTACH)
+    kinds = (MESSAGE, LARGE, NEXT, ATTACH) if through == "socket" else (MESSAGE, SLOT, NEXT, ATTACH)
     try:
         for count in range(FRAMES // 4):
             kind = kinds[count % len(kinds)]
             frames = mutate(feed.frames(kind, 5), generator)
             if kind != ATTACH and generator.integers(5) == 0:
                 frames.insert(int(generator.integers(len(frames) + 1)), generator.bytes(8))
-            feed.socket.send_multipart(frames)
+            feed.send(frames)
             feed.drain()
             if count % 8 == 7:
                 feed.still_lives(6)

@@ -22,7 +22,7 @@ from processes import ROOT, SOON_S, wait_for
 
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
 from cortex.log import Log, LogError, Player, Recorder, open_log
-from cortex.log.recorder import CHUNK_BYTES
+from cortex.log.format import CHUNK_BYTES
 from cortex.schema import Schema, schema_of
 
 MakeNode = Callable[..., Node]

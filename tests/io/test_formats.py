@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from neurosim_core import cli
+from neurosim_core.flight import rerun_file
 from neurosim_core.io import FORMATS, EventFileError, create_events, open_events
 from neurosim_core.io.transfer import transfer
 from neurosim_core.packets import EventArrays, Events, Image, ImuSample, Odometry
@@ -381,6 +382,56 @@ def test_mvsec_has_the_ground_truth(tmp_path):
         assert np.array_equal(one.column("cam", "t"), two.column("events", "t"))
 
 
+def test_mvsec_reads_the_ground_truth_beside_its_data(tmp_path):
+    """As it is published: events and pictures in one file, depth and poses in another."""
+    flight(tmp_path / "flight.h5", draw(5000, span_us=1_999_000, begin_us=1))
+    transfer(tmp_path / "flight.h5", tmp_path / "mvsec.h5")
+    data, truth = tmp_path / "indoor1_data.hdf5", tmp_path / "indoor1_gt.hdf5"
+    with h5py.File(tmp_path / "mvsec.h5") as whole, h5py.File(data, "w") as one, h5py.File(truth, "w") as two:
+        for name in whole["davis/left"]:
+            part = two if name.startswith(("depth", "flow", "pose")) else one
+            whole.copy(f"davis/left/{name}", part.require_group("davis/left"))
+    transfer(data, tmp_path / "both.h5")
+    transfer(tmp_path / "mvsec.h5", tmp_path / "back.h5")
+    with Recording(tmp_path / "both.h5") as found, Recording(tmp_path / "back.h5") as expected:
+        assert found.sensors == expected.sensors
+        assert np.array_equal(found.column("depth", "data"), expected.column("depth", "data"))
+        assert np.array_equal(found.column("pose", "position"), expected.column("pose", "position"))
+    with pytest.raises(EventFileError, match=r"has no events: .* NAME_data\.hdf5"):
+        open_events(truth)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz", "a.h5"])
+def test_nanoseconds_that_no_file_tells(name, tmp_path, capsys):
+    """They pass for microseconds, and a note asks; the user's word counts, also for times since 1970."""
+    events = draw(20_000, span_us=4_000_000, begin_us=1_700_000_000_000_000)
+    path, t_ns = tmp_path / name, events.t * 1000 + 7
+    columns = {"t": t_ns, "x": events.x, "y": events.y, "p": events.polarity}
+    if name == "a.csv":
+        np.savetxt(path, np.stack([*columns.values()], 1).astype(np.int64), fmt="%d", delimiter=",")
+    elif name == "a.npz":
+        np.savez(path, **columns)
+    else:
+        with h5py.File(path, "w") as file:
+            file["events/t"], file["t_offset"] = t_ns - t_ns[0], t_ns[0]
+            for key in "xyp":
+                file[f"events/{key}"] = columns[key]
+    assert same(read(path, time_unit="ns"), events)
+    assert cli.main(["convert", str(path), str(tmp_path / "b.raw"), "--from-zero", "--time-unit", "ns"]) == 0
+    assert "note" not in capsys.readouterr().out
+    first_us = 1_700_000_000_000_000 if name == "a.h5" else events.t[0]  # HDF5 may have ground truth
+    assert same(read(tmp_path / "b.raw"), events._replace(t=events.t - first_us))
+    with pytest.raises(EventFileError, match="times of evt3 have a unit"):
+        open_events(tmp_path / "b.raw", time_unit="ns")
+
+
+def test_nanoseconds_from_zero_are_asked_for(tmp_path, capsys):
+    events = draw(20_000, span_us=4_000_000)
+    write(tmp_path / "a.npz", events._replace(t=events.t * 1000))
+    assert cli.main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.raw")]) == 0
+    assert "--time-unit ns" in capsys.readouterr().out
+
+
 def test_the_command(tmp_path, capsys):
     events = draw(3000, span_us=2_000_000, begin_us=7_000_000)
     write(tmp_path / "a.raw", events)
@@ -396,6 +447,20 @@ def test_any_event_file_can_be_viewed(tmp_path):
     write(tmp_path / "a.evt2.raw", draw(3000, span_us=200_000, begin_us=1_700_000_000_000_000))
     assert cli.main(["view", str(tmp_path / "a.evt2.raw"), "--save", str(tmp_path / "a.rrd")]) == 0
     assert (tmp_path / "a.rrd").stat().st_size > 10_000
+
+
+def test_files_of_one_stem_are_not_viewed_as_each_other(tmp_path):
+    """A Rerun file that was made before is that of one file, and of what was in it; a bag is a folder."""
+    pytest.importorskip("rerun")
+    made = []
+    for name in ("a.raw", "a.csv", "a_bag"):
+        write(tmp_path / name, draw(3000, span_us=200_000, seed=len(made)))
+        made.append(rerun_file(tmp_path / name))
+        assert rerun_file(tmp_path / name) == made[-1]
+    assert len(set(made)) == 3
+    before = made[1].stat().st_size
+    write(tmp_path / "a.csv", draw(9000, span_us=600_000))
+    assert rerun_file(tmp_path / "a.csv").stat().st_size > 1.5 * before
 
 
 @pytest.mark.parametrize("name", WRITABLE)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import distributed
 
 import neurosim_core as ns
 from neurosim_core.learn import ranks
@@ -17,8 +18,8 @@ from neurosim_core.learn.ppo import PpoConfig
 from neurosim_core.learn.train import TrainConfig, Training
 
 
-def train(folder: Path, model: ns.Model) -> dict[str, Any]:
-    """Train a little, and return what tells weights and flights apart."""
+def train(folder: Path, model: ns.Model, *, stops: tuple[tuple[int, int], ...] = ()) -> dict[str, Any]:
+    """Train a little, and return what tells weights and flights apart; it is resumed after each stop."""
     torch.set_num_threads(1)
     config = TrainConfig(
         task="hover",
@@ -26,10 +27,14 @@ def train(folder: Path, model: ns.Model) -> dict[str, Any]:
         teacher=PpoConfig(worlds=4, iterations=2, horizon=6, epochs=2, minibatches=2, divergence=1e-9),
         student=DaggerConfig(worlds=4, iterations=2, horizon=6),
         pixels=8,
-        block=2,
+        block=1,
     )
-    training = Training(folder, config, say=lambda line: None, models=[model])
-    training.run()
+    for part, until in enumerate((*stops, None)):
+        training = Training(folder, config, say=lambda line: None, models=[model])
+        if part > 0:
+            distributed.barrier()  # the first process has left its checkpoint
+            training.resume()
+        training.run(until=until)
     digests = [
         hashlib.sha256(
             torch.cat([each.detach().flatten() for each in policy.parameters()]).numpy()
@@ -49,7 +54,10 @@ def main(scene: str, folder: str) -> None:
         "scene": mesh,
         "path": {"kind": "hover"},
     }
-    print(json.dumps(train(Path(folder), ns.make_model(ns.load_config(settings)))), flush=True)
+    model = ns.make_model(ns.load_config(settings))
+    found = train(Path(folder), model)
+    resumed = train(Path(folder, "resumed"), model, stops=((1, 0), (2, 1)))
+    print(json.dumps({**found, "resumed": resumed["digests"]}), flush=True)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn.env import find_task  # noqa: E402
 from neurosim_core.learn.episodes import StartConfig  # noqa: E402
-from neurosim_core.learn.evaluate import evaluate  # noqa: E402
+from neurosim_core.learn.evaluate import evaluate_policy  # noqa: E402
 
 torch.set_num_threads(1)
 
@@ -107,9 +107,9 @@ def test_who_climbs_as_long_as_a_sphere_comes_succeeds(env):
         action[:, 0] = torch.where((observations["threat"] != 0.0).any(1), 0.8, up.clamp(-0.5, 0.5))
         return action
 
-    found = evaluate(env, climb)
+    found = evaluate_policy(env, climb)
     assert found.metrics["hit"] < 0.1
-    assert evaluate(env, lambda *_: torch.zeros(64, 4)).metrics["hit"] == 1.0
+    assert evaluate_policy(env, lambda *_: torch.zeros(64, 4)).metrics["hit"] == 1.0
 
 
 def test_throwing_makes_no_tensor_of_host_numbers(env, host_tensors):

@@ -21,6 +21,10 @@ from neurosim_core.cli import main
         (["learn", "hover", "runs/hover"], "a folder is for `neurosim learn eval`; say --out"),
         (["learn", "juggle", "--out", "{folder}/new"], "unknown task kind 'juggle', known: ["),
         (["learn", "hover", "--out", "{folder}"], "holds a run: give --resume, or another --out"),
+        (
+            ["learn", "hover", "--out", "{folder}", "--resume", "--worlds", "4", "--student-iterations", "9"],
+            "--resume goes on as the run was configured: leave out --worlds, --student-iterations",
+        ),
         (["deploy", "nobody"], "unknown policy 'nobody', known: "),
     ],
 )

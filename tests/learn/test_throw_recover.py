@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
-from neurosim_core.learn.evaluate import evaluate, teacher_actor  # noqa: E402
+from neurosim_core.learn.evaluate import evaluate_policy, teacher_actor  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 
 torch.set_num_threads(1)
@@ -42,10 +42,10 @@ def test_a_teacher_learns_to_right_itself(env):
     torch.manual_seed(0)
     config = PpoConfig(**{**env.task.teacher, "worlds": 128, "iterations": 50})
     teacher = Ppo(env, config, torch.Generator().manual_seed(0))
-    before = evaluate(env, teacher_actor(teacher.policy, env))
+    before = evaluate_policy(env, teacher_actor(teacher.policy, env))
     teacher.begin(1)
     for iteration in range(config.iterations):
         teacher.iterate(iteration / config.iterations)
-    after = evaluate(env, teacher_actor(teacher.policy, env))
+    after = evaluate_policy(env, teacher_actor(teacher.policy, env))
     assert before.metrics["crash"] > 0.9
     assert after.metrics["crash"] < 0.5

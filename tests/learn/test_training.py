@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from processes import ROOT
 
 import neurosim_core as ns
@@ -23,7 +24,7 @@ import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
-from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
+from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate_policy, student_actor, teacher_actor  # noqa: E402
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig  # noqa: E402
@@ -180,10 +181,10 @@ def test_ppo_learns_to_stop(hall):
     config = dataclasses.replace(PpoConfig(), worlds=192, iterations=24)
     env = ns.learn.make_env("hover", worlds=config.worlds, device="cpu", observe=["state"], models=[hall])
     ppo = Ppo(env, config, torch.Generator().manual_seed(0))
-    before = evaluate(env, teacher_actor(ppo.policy, env))
+    before = evaluate_policy(env, teacher_actor(ppo.policy, env))
     ppo.begin(1)
     rewards = [ppo.iterate(i / config.iterations)["reward"] for i in range(config.iterations)]
-    after = evaluate(env, teacher_actor(ppo.policy, env))
+    after = evaluate_policy(env, teacher_actor(ppo.policy, env))
     assert np.mean(rewards[-3:]) > np.mean(rewards[2:6]) + 0.2
     assert after.metrics["speed_m_s"] < before.metrics["speed_m_s"]
 
@@ -245,12 +246,12 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     training = run(tmp_path, hall)
     env = ns.learn.make_env("brief-hover", worlds=6, device="cpu", models=[hall])
     policy = load_student(tmp_path, env.device)
-    first = evaluate(env, student_actor(policy, env))
-    assert first == evaluate(env, student_actor(policy, env))
+    first = evaluate_policy(env, student_actor(policy, env))
+    assert first == evaluate_policy(env, student_actor(policy, env))
     assert first.episodes == 6
     assert set(first.metrics) == {"success", "crash", "speed_m_s"}
     assert first.metrics["success"] == 0.0  # an episode is shorter than the time to hold
-    assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
+    assert first.metrics != evaluate_policy(env, student_actor(policy, env, blind=True)).metrics
     assert "0 % success (0 to 39)" in str(first)  # 1 - 1.96^2 / (6 + 1.96^2) of all might have failed
     del training
 
@@ -265,6 +266,29 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert slow.metrics["speed_m_s"] < 0.7 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
+
+
+def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
+    """The recording that a film is made of begins where the first world does, and goes the same way."""
+    run(tmp_path, hall)
+    scene, file = str(hall.config.scene.file), tmp_path / "flight.h5"
+    (_, evaluation), *_ = evaluate_run(tmp_path, scenes=scene, worlds=1, film=file)
+    with ns.Recording(file) as flight:
+        poses, pictures = (list(flight.packets(name)) for name in ("odometry", "rgb"))
+        assert [packet.stamp_ns for packet in poses] == [20_000_000 * step for step in range(20)]
+        assert len(pictures) == 20
+        assert pictures[0].data.shape == (220, 220, 3)
+        assert np.ptp(pictures[0].data) > 50
+        assert len(flight.events("front", 0.0, 0.4).t) > 20
+    env = ns.learn.make_env("brief-hover", worlds=3, device="cpu", scenes=[scene])
+    env.reset(seed=EPISODE_SEED)
+    np.testing.assert_allclose(poses[0].position, env.view.position[0], atol=1e-6)  # float32
+    speed_m_s = np.linalg.norm(poses[-1].velocity)  # a step before the end: at most 10 m/s2
+    assert evaluation.metrics["speed_m_s"] == pytest.approx(speed_m_s, abs=0.2)
+    film = tmp_path / "film.webp"
+    next(evaluate_run(tmp_path, scenes=scene, worlds=1, film=film))
+    with Image.open(film) as frames:
+        assert frames.n_frames == 4
 
 
 def test_a_policy_is_evaluated_where_it_was_not_trained(tmp_path, hall, monkeypatch):
@@ -298,6 +322,9 @@ def test_weights_and_biases_must_be_there_before_anything_is_set_up(tmp_path, mo
     with pytest.raises(ImportError, match="--wandb needs the package wandb: pip install wandb"):
         train(tmp_path / "run", small(wandb=True))
     assert not (tmp_path / "run").exists()
+    (tmp_path / "run.json").write_text(json.dumps(dataclasses.asdict(small())))
+    with pytest.raises(ImportError, match="--wandb needs the package wandb"):  # asked for by who goes on
+        train(tmp_path, small(wandb=True), resume=True)
 
 
 def test_a_training_may_have_longer_steps(tmp_path, hall):
@@ -406,7 +433,10 @@ def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
 
 
 def test_two_processes_train_one_policy(tmp_path, hall):
-    """They fly in different worlds, end with the same weights, to the bit, and one alone ends with others."""
+    """They fly in different worlds and end with the same weights, to the bit, also if they are resumed.
+
+    One alone ends with others.
+    """
     pytest.importorskip("tensorboard")
     script, scene = str(ROOT / "tests" / "learn" / "rank_process.py"), str(hall.config.scene.file)
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
@@ -421,7 +451,7 @@ def test_two_processes_train_one_policy(tmp_path, hall):
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     first, second = sorted(found, key=lambda each: each["rank"])
     alone = rank_process.train(tmp_path / "alone", hall)
-    assert first["digests"] == second["digests"]
+    assert first["digests"] == second["digests"] == first["resumed"] == second["resumed"]
     assert first["position"] != second["position"]
     assert not set(first["digests"]) & set(alone["digests"])
     assert (tmp_path / "both" / "checkpoint.pt").exists()

@@ -133,25 +133,25 @@ def test_terms_are_those_that_the_kernels_have(settings):
     for walk in (None, {"instants": 4}):
         render = {**settings["render"], "cpu_traversal": "warp", "candidate_lists": walk}
         model = sim.make_model(ns.load_config({**settings, "render": render}))
-        (cast,) = sim.make_state(model).groups
-        found[walk is None] = set(render_group.render_terms(cast))
+        (group,) = sim.make_state(model).groups
+        found[walk is None] = set(render_group.render_terms(group))
     assert found[False] - found[True] == {"candidate_group"} | (
         {"by_tile"} if settings["device"] == "cpu" else set()
     )
     assert not found[True] & {"candidate_group", "by_tile", "fallback"}
 
 
-def test_lanes_share_no_list_of_slots(settings):
-    """A list is uploaded on the stream of one lane, and the streams of the others do not wait for it."""
+def test_batches_in_flight_share_no_list_of_slots(settings):
+    """A list is uploaded on the stream of one batch in flight; those of the others do not wait for it."""
     model = sim.make_model(ns.load_config(settings))
     state = sim.make_state(model, in_flight=2)
     sim.start(model, state)
-    (cast,) = state.groups
+    (group,) = state.groups
     first, again, other = (
         render_job.plan_render(
-            cast, state.trace, [0, 0], [0, 2_000_000], lane=lane, wanted=frozenset(cast.frames)
+            group, state.trace, [0, 0], [0, 2_000_000], buffer_index=index, wanted=frozenset(group.frames)
         ).render()
-        for lane in (0, 0, 1)
+        for index in (0, 0, 1)
     )
     for mine, repeated, theirs, expected in zip(first, again, other, ([0, 0], [-1, -1]), strict=True):
         assert mine is repeated
@@ -362,7 +362,7 @@ def test_cameras_in_another_thread_yield_the_same(outside_model):
     model, command = outside_model, 1.01 * hover(outside_model)
     together = sim.make_state(model)
     expected = [p for _ in range(10) for p in sim.step(model, together, command)]
-    apart = sim.make_state(model, flight_lane_count=32)
+    apart = sim.make_state(model, render_backlog=32)
     packets, waiting = [], []
     for _ in range(10):
         flown, batches = sim.integrate_period(model, apart, command)
@@ -397,8 +397,8 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
             packets += [packet for batch in batches for packet in sim.render_batch(model, state, batch)]
         return packets
 
-    expected = fly_all(sim.make_state(model, flight_lane_count=32))
-    packets = fly_all(sim.make_state(model, flight_lane_count=32, make_room=make_room))
+    expected = fly_all(sim.make_state(model, render_backlog=32))
+    packets = fly_all(sim.make_state(model, render_backlog=32, make_room=make_room))
     assert content(packets) == content(expected)
     pictures = [packet for packet in packets if isinstance(packet, Image)]
     assert len(pictures) == len(asked) > 4
@@ -502,9 +502,9 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
 
 
 def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
-    state = sim.make_state(outside_model, flight_lane_count=3)
+    state = sim.make_state(outside_model, render_backlog=3)
     sim.integrate_period(outside_model, state, None)  # the start and one period
-    assert sim.free_lanes(state) == 1
+    assert sim.render_backlog_left(state) == 1
     sim.integrate_period(outside_model, state, None)
     with pytest.raises(RuntimeError, match="3 batches wait"):
         sim.integrate_period(outside_model, state, None)
@@ -513,7 +513,7 @@ def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
 def test_what_is_left_out_shows(outside_model):
     """Pictures miss in the sequence; a window of events is longer, and what happened in it is not lost."""
     model, command = outside_model, 1.02 * hover(outside_model)
-    state = sim.make_state(model, flight_lane_count=32)
+    state = sim.make_state(model, render_backlog=32)
     packets, left_out = [], 0
     for period in range(24):
         _, batches = sim.integrate_period(model, state, command)
@@ -649,7 +649,7 @@ def test_what_was_measured_before_a_failure_is_returned(outside_model):
     """`step` and `fly_period` return it, and raise when they are asked to go on."""
     model = outside_model
     for fly_on in (sim.step, lambda *a: sim.integrate_period(*a)[0]):
-        state = sim.make_state(model, flight_lane_count=32)
+        state = sim.make_state(model, render_backlog=32)
         fly_on(model, state, None)
         state.vehicle.arrays.body_rate.assign([[1e9, 1e9, 1e9]])
         packets = fly_on(model, state, None)
@@ -730,7 +730,7 @@ def test_where_a_collision_ends_adaptive_events_does_not_depend_on_the_size_of_a
 def test_adaptive_cameras_in_another_thread_yield_the_same(settings):
     config = ns.load_config({**settings, "sensors": ADAPTIVE})
     model = sim.make_model(config)
-    stepped, flown = (sim.make_state(model, flight_lane_count=lanes) for lanes in (1, 8))
+    stepped, flown = (sim.make_state(model, render_backlog=backlog) for backlog in (1, 8))
     speeds = [[460.0, 480.0, 470.0, 455.0]] * 10 + [[450.0, 440.0, 460.0, 470.0]] * 10
     expected = [p for command in speeds for p in sim.step(model, stepped, command)]
     got: list[Packet] = []
@@ -751,7 +751,7 @@ def test_an_adaptive_camera_that_comes_back_sees_the_first_tick(settings):
     """Also if its content has hardly moved since; and a batch that is skipped makes a window longer."""
     model = sim.make_model(ns.load_config({**settings, "sensors": ADAPTIVE}))
     command = 1.05 * hover(model)
-    state = sim.make_state(model, flight_lane_count=32)
+    state = sim.make_state(model, render_backlog=32)
     for _ in range(10):
         sim.step(model, state, command)
     sim.select_cameras(model, state, ())

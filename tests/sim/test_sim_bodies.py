@@ -153,10 +153,10 @@ def test_batches_change_no_bit(room, device, instants):
     assert len(events_of(cut)) > 10_000
 
 
-def test_lanes_and_graphs_change_no_bit(room, device):
-    """On CUDA the second batch of a lane is recorded and replayed from then on: bodies move on in it."""
+def test_batches_in_flight_and_graphs_change_no_bit(room, device):
+    """On CUDA a second batch in the same buffers is recorded, and replayed from then on; bodies move on."""
     model = sim.make_model(ns.load_config(settings(room, device, BUSY, instants_per_launch=5)))
-    one, two = (list(sim.run_model(model, sim.make_state(model, in_flight=lanes))) for lanes in (1, 2))
+    one, two = (list(sim.run_model(model, sim.make_state(model, in_flight=n))) for n in (1, 2))
     assert content(one) == content(two)
     pictures = [p.data.tobytes() for p in one if isinstance(p, Image) and p.sensor == "depth"]
     assert len(set(pictures)) == len(pictures) == 13

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
+import multiprocessing
 import os
 import select
 import signal
@@ -14,8 +16,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PEER = ROOT / "tests" / "cortex" / "peer.py"
@@ -43,23 +49,95 @@ def in_time(action: Callable[[], object], limit_s: float) -> None:
     wait_for(lambda: took_s() < limit_s)
 
 
+@functools.cache
+def fork_server() -> Any:
+    """Starts processes that have imported what `peer.py` needs, in milliseconds: tests kill thousands.
+
+    To be called before `runtime`: it is not to know that directory.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["peer"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", f"{ROOT}:{PEER.parent}:{Path(__file__).parent}")
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")
+        forkserver.ensure_running()
+    return context
+
+
+class _Forked:
+    """What a `Child` uses of a `Popen`, of a process of the fork server."""
+
+    def __init__(self, role: str, arguments: dict[str, Any]) -> None:
+        import peer
+
+        (stdin, mine), (my_out, stdout), (my_err, stderr) = os.pipe(), os.pipe(), os.pipe()
+        self.stdin = os.fdopen(mine, "wb", buffering=0)
+        self.stdout, self.stderr = (os.fdopen(end, "rb", buffering=0) for end in (my_out, my_err))
+        streams = Connection(stdin, writable=False), Connection(stdout), Connection(stderr)
+        directory = os.environ["CORTEX_RUNTIME_DIR"]
+        self._process = fork_server().Process(target=peer.forked, args=(role, arguments, directory, *streams))
+        self._process.start()
+        self.pid, self.code = self._process.pid, None
+        for stream in streams:
+            stream.close()
+
+    def poll(self) -> int | None:
+        if self.code is None:
+            self.code = self._process.exitcode
+        return self.code
+
+    def wait(self, timeout_s: float) -> int | None:
+        if self.code is None:
+            self._process.join(timeout_s)
+        return self.poll()
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def close(self) -> None:
+        """Forget it, once it has ended."""
+        self.code = self.poll()
+        self._process.close()
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+
 class Child:
-    """A process of `peer.py`."""
+    """A process of `peer.py`.
+
+    Args:
+        role: What it does.
+        prefix: A command that runs it.
+        env: Changes of its environment.
+        forked: From a process that has imported everything.
+        **arguments: Of the role.
+    """
 
     def __init__(
-        self, role: str, *, prefix: Sequence[str] = (), env: dict[str, str] | None = None, **arguments: Any
+        self,
+        role: str,
+        *,
+        prefix: Sequence[str] = (),
+        env: dict[str, str] | None = None,
+        forked: bool = False,
+        **arguments: Any,
     ):
         self._started = time.monotonic()
-        self.role = role
-        self.process = subprocess.Popen(
-            [*prefix, sys.executable, str(PEER), role, json.dumps(arguments)],
-            env={**os.environ, "PYTHONPATH": str(ROOT), **(env or {})},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            bufsize=0,
-        )
         self._rest = b""
+        self.role = role
+        self.process: Any = (
+            _Forked(role, arguments)
+            if forked
+            else subprocess.Popen(
+                [*prefix, sys.executable, str(PEER), role, json.dumps(arguments)],
+                env={**os.environ, "PYTHONPATH": str(ROOT), **(env or {})},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+            )
+        )
 
     @property
     def pid(self) -> int:
@@ -138,6 +216,8 @@ class Child:
             if stream is not None:
                 with contextlib.suppress(OSError):
                     stream.close()
+        if isinstance(self.process, _Forked):
+            self.process.close()
 
 
 def processes_with(text: str) -> list[int]:

@@ -67,7 +67,7 @@ int main() {
     CortexMember& member = writer.members[index];
     member.used = member.strict = 1;
     member.page = &pages[static_cast<std::size_t>(index)];
-    member.bell = ::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    member.bell = member.socket = ::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);  // which never ends
     CortexReader reader{};
     reader.ring = writer.ring;
     reader.data = writer.data;

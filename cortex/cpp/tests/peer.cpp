@@ -163,7 +163,7 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
   const auto counters = scans.counters();
   std::cout << "{\"received\": " << received << ", \"wrong\": " << wrong << ", \"lost\": " << counters.lost
             << ", \"rejected\": " << counters.rejected << ", \"overtaken\": " << counters.overtaken
-            << ", \"sequence\": " << sequence << ", \"sources\": " << sources << ", \"last\": " << last << "}"
+            << ", \"cut_off\": " << counters.cut_off << ", \"sequence\": " << sequence << ", \"sources\": " << sources << ", \"last\": " << last << "}"
             << std::endl;
   scans.close();
   for (const auto& old : held) {  // still there, though the publisher may write to the slots again

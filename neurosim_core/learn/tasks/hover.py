@@ -19,21 +19,15 @@ HOLD_S = 2.0
 """For how long, to succeed [s]."""
 
 
-@register("task", "hover")
-class Hover(Task):
-    """Stop and hover.
+class HoverBase(Task):
+    """Come to rest, and stay: what is seen, and when it has succeeded. Start and reward are those of a task.
 
     The student sees event surfaces, a gyroscope, the direction of gravity and its last action: neither
     position nor velocity. The teacher and the critic see the velocity.
     """
 
-    rate_on_cpu_hz: float | None = 25.0
     episode_s = 5.0
-    start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))
-    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 3.0))
-    rate_max_rad_s = (2.0, 2.0, 1.0)
-    thrust_span = 0.4
     camera: Mapping[str, Any] = {"width": 48, "height": 48, "horizontal_fov_rad": 1.6}
     surface = LeakySurface(tau_s=(0.02, 0.06, 0.3))
     mirror: Mapping[str, Sequence[float]] = {
@@ -84,6 +78,25 @@ class Hover(Task):
             "velocity": view.velocity_B,
         }
 
+    def metrics(self, view: View) -> dict[str, torch.Tensor]:
+        """Return success (hovered for 2 s, and never crashed), crash, and the final speed [m/s]."""
+        return {
+            "success": ((self._best_s >= HOLD_S - 1e-6) & ~view.crashed).float(),
+            "crash": view.crashed.float(),
+            "speed_m_s": view.velocity.norm(dim=1),
+        }
+
+
+@register("task", "hover")
+class Hover(HoverBase):
+    """Stop and hover, after a throw that drag does not stop in time."""
+
+    rate_on_cpu_hz: float | None = 25.0
+    start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
+    training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 3.0))
+    rate_max_rad_s = (2.0, 2.0, 1.0)
+    thrust_span = 0.4
+
     def reward(self, view: View) -> torch.Tensor:
         """Pay for slowness; tilt, rates and changes of the action cost something.
 
@@ -94,11 +107,3 @@ class Hover(Task):
         change = (view.action - view.last_action).norm(dim=1)
         cost = 0.4 * speed + 5.0 * tilt + 0.2 * view.body_rate.norm(dim=1) + 0.3 * change
         return 0.5 + torch.exp(-((speed / 0.15) ** 2)) - cost - 20.0 * view.crashed
-
-    def metrics(self, view: View) -> dict[str, torch.Tensor]:
-        """Return success (hovered for 2 s, and never crashed), crash, and the final speed [m/s]."""
-        return {
-            "success": ((self._best_s >= HOLD_S - 1e-6) & ~view.crashed).float(),
-            "crash": view.crashed.float(),
-            "speed_m_s": view.velocity.norm(dim=1),
-        }

@@ -10,21 +10,21 @@ import torch
 from neurosim_core.learn.episodes import NO_RANDOMISATION, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import Observations, View
-from neurosim_core.learn.tasks.hover import Hover
+from neurosim_core.learn.tasks.hover import HoverBase
 from neurosim_core.registry import register
 
 
 @register("task", "hover-paper")
-class HoverPaper(Hover):
+class HoverPaper(HoverBase):
     """Stop and hover, given event surfaces and the whole state: position, velocity, attitude and rates.
 
     Thrust spans 0 to twice the hover thrust; rates are 7, 7 and 5 rad/s; an episode lasts 15 s of 100 steps.
     """
 
-    rate_hz, rate_on_cpu_hz = 100.0, None
+    rate_hz = 100.0
     episode_s = 15.0
     start = StartConfig(clearance_m=0.7, speed_m_s=(0.0, 2.0), tilt_max_rad=0.2, rate_max_rad_s=0.5)
-    randomisation, training = NO_RANDOMISATION, None
+    randomisation = NO_RANDOMISATION
     camera: Mapping[str, Any] = {"width": 32, "height": 32, "horizontal_fov_rad": 1.6}
     surface = LeakySurface(tau_s=(0.01,))
     rate_max_rad_s = (7.0, 7.0, 5.0)

@@ -12,7 +12,7 @@ import torch
 from neurosim_core.learn.episodes import Randomisation, StartConfig
 from neurosim_core.learn.task import View
 from neurosim_core.learn.tasks.hall import hall_settings
-from neurosim_core.learn.tasks.hover import Hover
+from neurosim_core.learn.tasks.hover import HoverBase
 from neurosim_core.registry import register
 
 _HALL_M = (16.0, 16.0, 9.0)
@@ -20,14 +20,12 @@ _BOXES = 24
 
 
 @register("task", "throw-recover")
-class ThrowRecover(Hover):
+class ThrowRecover(HoverBase):
     """Right itself, stop and hover, after it was thrown any way up.
 
     What is seen, and when it has succeeded, is as in `hover`. It takes height to turn over: halls are high.
     """
 
-    rate_on_cpu_hz = None
-    episode_s = 5.0
     start = StartConfig(clearance_m=3.0, speed_m_s=(0.0, 3.0), tilt_max_rad=math.pi, rate_max_rad_s=6.0)
     training: Randomisation | None = Randomisation(thrust_factor=(0.98, 1.02), threshold_factor=(0.7, 2.0))
     rate_max_rad_s = (8.0, 8.0, 3.0)

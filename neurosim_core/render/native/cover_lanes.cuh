@@ -35,12 +35,32 @@ if (even) {
     using Row = float __attribute__((ext_vector_type(SAMPLES)));
     using Bits = bool __attribute__((ext_vector_type(SAMPLES)));
     static_assert(SAMPLES == 32, "a bit of an unsigned for each point");
+    constexpr auto placed = [](auto reversed) { // constants: a vector that is filled one by one is loaded slowly
+        struct {
+            float at[2][SAMPLES];
+        } rows{};
+        for (int sample = 0; sample < SAMPLES; ++sample) {
+            rows.at[0][sample] = ((float)sample + 0.5f) / SAMPLES - 0.5f;
+            rows.at[1][sample] = ((float)reversed(sample) + 0.5f) / SAMPLES - 0.5f;
+        }
+        return rows;
+    }(reversed_bits);
     Row columns_of_points, rows_of_points;
-    for (int sample = 0; sample < SAMPLES; ++sample) {
-        columns_of_points[sample] = points[0][sample];
-        rows_of_points[sample] = points[1][sample];
-    }
+    __builtin_memcpy(&columns_of_points, placed.at[0], sizeof(Row));
+    __builtin_memcpy(&rows_of_points, placed.at[1], sizeof(Row));
 #endif
+    // Bits of the points where a linear function of a lane, of its value at the centre and its slopes, is below 0.
+    auto points_below = [&](const auto& at, int lane) {
+#ifdef __CUDA_ARCH__
+        unsigned below = 0;
+        for (int sample = 0; sample < SAMPLES; ++sample)
+            below |= at[0][lane] + points[0][sample] * at[1][lane] + points[1][sample] * at[2][lane] < 0.0f ? 1u << sample : 0u;
+        return below;
+#else
+        const Row value = at[0][lane] + columns_of_points * at[1][lane] + rows_of_points * at[2][lane];
+        return __builtin_bit_cast(unsigned, __builtin_convertvector(value < 0.0f, Bits));
+#endif
+    };
     int layer_of[MOST], touching = 0;
     unsigned lanes_of[MOST]; // of touching faces: bits of the lanes that they reach
     float plane[MOST][3]; // of touching faces: the nearness [1/m] along a direction is its product with this
@@ -102,15 +122,7 @@ if (even) {
                                      + OVERLAP * (value[0][term][lane] + value[1][term][lane] + value[2][term][lane]);
             for (unsigned rest = crossed[side]; rest; rest &= rest - 1) {
                 const int lane = lowest_of(rest);
-#ifdef __CUDA_ARCH__
-                unsigned outside = 0;
-                for (int sample = 0; sample < SAMPLES; ++sample)
-                    outside |= at[0][lane] + points[0][sample] * at[1][lane] + points[1][sample] * at[2][lane] < 0.0f ? 1u << sample : 0u;
-#else
-                const Row value_of = at[0][lane] + columns_of_points * at[1][lane] + rows_of_points * at[2][lane];
-                const unsigned outside = __builtin_bit_cast(unsigned, __builtin_convertvector(value_of < 0.0f, Bits));
-#endif
-                inside[lane] &= ~outside;
+                inside[lane] &= ~points_below(at, lane);
             }
         }
         for (int axis = 0; axis < 3; ++axis)
@@ -122,37 +134,37 @@ if (even) {
         for (int other = 0; other < touching; ++other) { // which of two shows where both are
             if (layer_of[other] == layer || !(lanes_of[other] & touched)) continue;
             alignas(64) unsigned contested[LANES], undecided[LANES];
-            alignas(64) float nearer[3][LANES];
+            alignas(64) float farther[3][LANES]; // by how much the others are nearer
+            alignas(64) int open[LANES];
             unsigned any = 0;
             for (int lane = 0; lane < LANES; ++lane) any |= contested[lane] = shown[other][lane] & inside[lane];
             if (!any) continue;
             auto difference = [&](int axis, int lane) {
                 if constexpr (TIMED) { // distances to planes that the camera crosses are negative
                     const float own = distance[touching][lane], others = distance[other][lane];
-                    return __builtin_copysignf(others, own) * plane[touching][axis]
-                           - NEARER * __builtin_copysignf(own, others) * plane[other][axis];
+                    return NEARER * __builtin_copysignf(own, others) * plane[other][axis]
+                           - __builtin_copysignf(others, own) * plane[touching][axis];
                 }
-                return plane[touching][axis] - NEARER * plane[other][axis];
+                return NEARER * plane[other][axis] - plane[touching][axis];
             };
             for (int term = 0; term < 3; ++term)
                 for (int lane = 0; lane < LANES; ++lane)
-                    nearer[term][lane] = difference(0, lane) * ray[term][0][lane] + difference(1, lane) * ray[term][1][lane]
+                    farther[term][lane] = difference(0, lane) * ray[term][0][lane] + difference(1, lane) * ray[term][1][lane]
                                          + difference(2, lane) * ray[term][2][lane];
-            any = 0;
             for (int lane = 0; lane < LANES; ++lane) {
-                const float half = 0.5f * (wp::abs(nearer[1][lane]) + wp::abs(nearer[2][lane]));
-                const bool in_front = nearer[0][lane] > half, behind = nearer[0][lane] <= -half;
+                const float half = 0.5f * (wp::abs(farther[1][lane]) + wp::abs(farther[2][lane]));
+                const bool in_front = farther[0][lane] < -half, behind = farther[0][lane] >= half;
                 shown[other][lane] &= in_front ? ~contested[lane] : ALL_POINTS;
                 inside[lane] &= behind ? ~contested[lane] : ALL_POINTS;
-                any |= undecided[lane] = in_front || behind ? 0u : contested[lane];
+                undecided[lane] = in_front || behind ? 0u : contested[lane];
+                open[lane] = undecided[lane] != 0u;
             }
-            for (int lane = 0; any && lane < LANES; ++lane)
-                for (unsigned rest = undecided[lane]; rest; rest &= rest - 1) {
-                    const int sample = lowest_of(rest);
-                    const bool in_front = nearer[0][lane] + points[0][sample] * nearer[1][lane]
-                                              + points[1][sample] * nearer[2][lane] > 0.0f;
-                    (in_front ? shown[other] : inside)[lane] &= ~(rest & -rest);
-                }
+            for (unsigned rest = lanes_where(open); rest; rest &= rest - 1) {
+                const int lane = lowest_of(rest);
+                const unsigned in_front = points_below(farther, lane);
+                shown[other][lane] &= ~(undecided[lane] & in_front);
+                inside[lane] &= ~(undecided[lane] & ~in_front);
+            }
         }
         lanes_of[touching] = touched;
         layer_of[touching++] = layer;

@@ -6,19 +6,33 @@ constexpr int LANES = 16, N = 16;
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 const int* const own_faces = wp::address(faces, instant, top, left);
 alignas(64) int own[LANES];
-for (int lane = 0; lane < LANES; ++lane)
-    own[lane] = own_faces[lane % 4 < columns && lane / 4 < rows ? (lane / 4) * width + lane % 4 : 0];
+const bool all = columns == 4 && rows == 4;
+for (int y = 0; y < 4; ++y)
+    if (all) __builtin_memcpy(own + 4 * y, own_faces + y * width, 4 * sizeof(int));
+    else
+        for (int x = 0; x < 4; ++x) own[4 * y + x] = own_faces[x < columns && y < rows ? y * width + x : 0];
 // Whether the first rays hit one surface in the block and in the ring around it: the same place as in `list_seen_faces.cuh`.
 const int upper = wp::max(wp::min(top - 1, height - 6), 0), leftmost = wp::max(wp::min(left - 1, width - 6), 0);
-int other_surface = 0;
+int other_surface = 0, hit = 0, missed = 0;
 const int surface_here = scene.face_surface.data[wp::max(own[0], 0)];
 for (int y = 0; y < 6; ++y) // the same place at the next instant, which this core renders soon
     __builtin_prefetch(wp::address(faces, instant, wp::min(upper + y, height - 1), leftmost) + (size_t)height * width);
-for (int y = 0; y < 6; ++y)
+for (int y = 0; y < 6; ++y) {
+    const int* const row = wp::address(faces, instant, wp::min(upper + y, height - 1));
     for (int x = 0; x < 6; ++x) {
-        const int part = *wp::address(faces, instant, wp::min(upper + y, height - 1), wp::min(leftmost + x, width - 1));
-        other_surface |= (part < 0) | (scene.face_surface.data[wp::max(part, 0)] ^ surface_here);
+        const int part = row[wp::min(leftmost + x, width - 1)];
+        missed |= part;
+        hit |= ~part;
+        const volatile int& surface = scene.face_surface.data[wp::max(part, 0)]; // volatile: a vector gather takes longer
+        other_surface |= surface ^ surface_here;
     }
+}
+if (hit >= 0) { // all of it is the sky
+    for (int lane = 0; lane < LANES; ++lane) radiance_out.data[lane] = scene.sky;
+    unresolved_out.data[0] = 0;
+    return;
+}
+other_surface |= missed < 0;
 #include "pixel_poses.cuh"
 const wp::vec3 origin(position[0][0], position[1][0], position[2][0]);
 alignas(64) float shift[3][POSES]; // of the positions from `origin`
@@ -26,7 +40,6 @@ for (int lane = 0; lane < POSES; ++lane)
     for (int axis = 0; axis < 3; ++axis) shift[axis][lane] = position[axis][lane] - origin[axis];
 #include "aim_rays.cuh"
 alignas(64) float ray[3][4][LANES]; // direction at the centres of pixels, and its changes across and down; in [0][3] the spread
-const bool all = columns == 4 && rows == 4;
 auto turn_rays = [&](int term) {
     const wp::vec4* const aimed = wp::address(rays, term, first_pixel);
     auto ray_of = [&](int lane) {

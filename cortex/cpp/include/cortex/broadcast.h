@@ -164,7 +164,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, ui
 static inline void cortex_writer_close(CortexWriter *writer);
 static inline int cortex_listen(const char *path);
 static inline int cortex_accept(int listener);
-static inline int cortex_hear(int socket, CortexHello *hello); /* EAGAIN: not yet */
+static inline int cortex_hear(int socket, CortexHello *hello); /* EAGAIN: not yet; EPROTONOSUPPORT: it knows rings of another kind */
 static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number);
 static inline int cortex_reader_welcomed(CortexReader *reader); /* 1 once the publisher has taken the reader in, else 0; -1: but it cannot be mapped */
 static inline int cortex_reader_follow(CortexReader *reader);

@@ -7,6 +7,7 @@
 #if defined(__linux__)
 
 #include <fcntl.h>
+#include <poll.h>
 #include <sched.h>
 #include <stdio.h>
 #include <sys/eventfd.h>
@@ -39,10 +40,10 @@ static inline void cortex_hush_bell(int bell) {
     if (read(bell, &count, sizeof count) < 0) return; /* it did not ring */
 }
 
+/* Not by what can be read: who has said something before it died would be there for ever. */
 static inline int cortex_is_gone(int socket) {
-    char byte;
-    const ssize_t got = recv(socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT);
-    return got == 0 || (got < 0 && errno == ECONNRESET);
+    struct pollfd look = {socket, 0, 0};
+    return poll(&look, 1, 0) > 0;
 }
 
 /* Sealed memory of its own: nobody can change its size, and if `others_read` nobody else can write to it. */
@@ -210,6 +211,15 @@ static inline int cortex_accept(int listener) {
     return -1;
 }
 
+/* Whether this may be rung: a pipe or a socket that nobody reads would send us a signal that ends the process. */
+static inline int cortex_is_bell(int fd) {
+    struct stat status;
+    return fstat(fd, &status) == 0 && !S_ISFIFO(status.st_mode) && !S_ISSOCK(status.st_mode) && fcntl(fd, F_SETFL, O_NONBLOCK) == 0;
+}
+
+/* Whether this is the magic of a ring of an older or newer kind: only the last letter differs. */
+static inline int cortex_is_other_version(uint64_t magic) { return magic != CORTEX_RING_MAGIC && !((magic ^ CORTEX_RING_MAGIC) << 8); }
+
 static inline int cortex_hear(int socket, CortexHello *hello) {
     uint64_t said[3];
     int fds[2];
@@ -219,11 +229,10 @@ static inline int cortex_hear(int socket, CortexHello *hello) {
     hello->socket = socket;
     hello->page = fds[0];
     hello->bell = fds[1];
-    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && fcntl(fds[1], F_SETFL, O_NONBLOCK) == 0)
-        return 0;
+    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && cortex_is_bell(fds[1])) return 0;
     close(fds[0]);
     close(fds[1]);
-    errno = EPROTO;
+    errno = cortex_is_other_version(said[0]) ? EPROTONOSUPPORT : EPROTO;
     return -1;
 }
 

@@ -93,6 +93,9 @@ class Directory {
   // Whether `nodes` has changed since the last call.
   bool take_changed() noexcept { return std::exchange(changed_, false); }
 
+  // CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one, by the quickest of its latest answers; 0: not known.
+  std::int64_t clock_offset_ns() const noexcept { return clock_offset_ns_; }
+
   // This node's record has changed; the next `tick` says so.
   void announce() noexcept { dirty_ = true; }
 
@@ -169,7 +172,8 @@ class Directory {
 
   void beat(std::int64_t now_ns) {
     if (!welcomed_) return say_hello(now_ns, true);
-    if (!try_send(control_frame(records::Heartbeat{own_.node, own_.revision, 0}))) return lose(now_ns);
+    const auto asked_ns = static_cast<std::uint64_t>(monotonic_ns());  // the answer returns it
+    if (!try_send(control_frame(records::Heartbeat{own_.node, own_.revision, 0}, asked_ns))) return lose(now_ns);
     next_ns_ = now_ns + heartbeat_ns;
     warn_of_silence(now_ns);
   }
@@ -220,6 +224,7 @@ class Directory {
     if (frame.is<records::Welcome>()) {
       on_welcome(frame.as<records::Welcome>(), now_ns);
     } else if (frame.is<records::Alive>()) {
+      read_clock(frame.header, now_ns);
       on_alive(frame.as<records::Alive>(), now_ns);
     } else if (frame.is<records::Changed>()) {
       on_changed(frame.as<records::Changed>());
@@ -280,6 +285,16 @@ class Directory {
     if (alive.held != own_.revision) say_hello(now_ns, false);
   }
 
+  void read_clock(const wire::Header& header, std::int64_t now_ns) noexcept {
+    const auto asked_ns = static_cast<std::int64_t>(header.sequence);
+    if (!net::is_tcp(address_) || asked_ns <= 0 || asked_ns > now_ns || header.publish_ns <= 0) return;
+    const std::int64_t trip_ns = now_ns - asked_ns;
+    trip_limit_ns_ += trip_limit_ns_ / 16;  // clocks drift: what was quick once does not count for ever
+    if (trip_ns > trip_limit_ns_) return;
+    trip_limit_ns_ = trip_ns;
+    clock_offset_ns_ = header.publish_ns - (asked_ns + trip_ns / 2);
+  }
+
   void on_changed(records::Changed changed) {
     check(changed.record);
     const std::uint64_t node = changed.record.node;
@@ -324,6 +339,8 @@ class Directory {
   std::uint64_t rejected_ = 0;
   std::int64_t tick_ns_ = 0;
   Nodes nodes_;
+  std::int64_t clock_offset_ns_ = 0;
+  std::int64_t trip_limit_ns_ = 10 * lease_ns;
   const std::string address_;  // of the registry; empty: there is none
   zmq::socket_t socket_;
   std::int64_t next_ns_ = 0;   // when to send the next heartbeat or `Hello`

@@ -40,13 +40,12 @@ struct TypeId {
 class Link {
  public:
   Link(zmq::context_t& context, std::string address, std::uint64_t source, TypeId type, const Policy& policy,
-       bool local, std::int64_t clock_offset_ns, const std::function<void(zmq::socket_t&)>& secure,
+       bool local, const std::function<void(zmq::socket_t&)>& secure,
        std::shared_ptr<SubscriberCounters> counters, std::shared_ptr<net::Complaints> complaints)
       : address_(std::move(address)),
         source_(source),
         type_(type),
         policy_(policy),
-        clock_offset_ns_(clock_offset_ns),
         counters_(std::move(counters)),
         complaints_(std::move(complaints)),
         socket_(net::make_socket(context, zmq::socket_type::sub, net::is_tcp(address_),
@@ -73,6 +72,7 @@ class Link {
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }
+  std::int64_t clock_offset_ns = 0;  // what to add to the publisher's clock to read it on ours
   std::int64_t leaving_ns = 0;  // when the publisher had left and there was still something to read; 0: it is there
 
   // There may be more to read, if the publisher has left or not.
@@ -84,6 +84,9 @@ class Link {
   void end() {
     try {
       if (known_ && expected_ < reached_) advance(reached_, 0);
+      if (!policy_.is_reliable || !known_ || is_told_) return;
+      ++counters_->cut_off;
+      complaints_->once("cut off " + address_, "a publisher at " + address_ + " ended without saying how much it had sent");
     } catch (const MalformedMessage& error) {
       reject(error.what());
     }
@@ -208,6 +211,7 @@ class Link {
       if (policy_.is_reliable) confirm(sequence);  // the publisher may have given us up
     }
     known_ = true;
+    is_told_ = count == 0;
     expected_ = sequence + count;
     return true;
   }
@@ -224,7 +228,7 @@ class Link {
     item.source = source_;
     item.sequence = sequence;
     item.stamp_ns = stamp_ns;
-    item.publish_ns = publish_ns + clock_offset_ns_;
+    item.publish_ns = publish_ns + clock_offset_ns;
     if (sample_++ % 8 == 0) count_latency(item.publish_ns);
     return item;
   }
@@ -339,7 +343,6 @@ class Link {
   std::uint64_t source_;
   TypeId type_;
   Policy policy_;
-  std::int64_t clock_offset_ns_;
   std::shared_ptr<SubscriberCounters> counters_;
   std::shared_ptr<net::Complaints> complaints_;
   zmq::socket_t socket_;
@@ -348,6 +351,7 @@ class Link {
   std::uint64_t reader_ = 0;
   bool attached_ = false;
   bool known_ = false;  // whether `expected_` is
+  bool is_told_ = false;  // whether the publisher has said so after its last message
   std::uint64_t expected_ = 0;
   std::uint64_t reached_ = 0;  // the highest number below which all has been given away
   std::uint64_t sample_ = 0;

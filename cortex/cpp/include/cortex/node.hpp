@@ -32,9 +32,12 @@ namespace cortex {
 
 struct Options {
   int domain = -1;                 // 0 to 232; -1 takes CORTEX_DOMAIN, else 0
-  std::string registry = "auto";   // "auto": the one of this host; "off"; or "tcp://host:port"
-  std::string listen;              // address of an interface to be reached at over tcp; empty: this host only
-  std::string keys;                // directory of CURVE keys for tcp (`cortex keys new`); empty: none
+  // "auto": the one of this host; "off"; or "tcp://host:port"
+  std::string registry = runtime::environment("CORTEX_REGISTRY", "auto");
+  // Address of an interface to be reached at over tcp; empty: this host only.
+  std::string listen = runtime::environment("CORTEX_LISTEN");
+  // Directory of CURVE keys for tcp (`cortex keys new`); empty: none.
+  std::string keys = runtime::environment("CORTEX_KEYS");
   bool insecure = false;           // without keys, allow plain tcp beyond this host
   Log log = [](const std::string& text) { std::clog << "cortex: " + text + "\n"; };
 };
@@ -51,7 +54,6 @@ class Node {
     check_addresses();
     const std::string directory = runtime::directory(runtime::domain_id(options_.domain));
     host_ = runtime::host_id();
-    clock_offset_ns_ = clock_ns(CLOCK_REALTIME) - monotonic_ns();
     context_.set(zmq::ctxopt::max_sockets, 8192);
     files_ = std::make_unique<runtime::NodeFiles>(directory, id_);
     open_sockets();
@@ -136,6 +138,7 @@ class Node {
   static constexpr std::int64_t tick_ns = 20'000'000;
   static constexpr std::int64_t short_tick_ns = 2'000'000;  // for a while after a change, so that peers meet soon
   static constexpr std::int64_t busy_ns = 300'000'000;
+  static constexpr std::int64_t clock_step_ns = 500'000;  // others are told when our clock has moved by more
   static constexpr std::int64_t linger_ns = 1'000'000'000;
 
   void check_addresses() const {
@@ -299,6 +302,12 @@ class Node {
       }
     }
     changed = directory_->take_changed() || changed;
+    const std::int64_t offset_ns = directory_->clock_offset_ns();
+    if (offset_ns != 0 && std::abs(offset_ns - clock_offset_ns_) > clock_step_ns) {
+      clock_offset_ns_ = offset_ns;
+      directory_->announce();
+      changed = true;
+    }
     const auto subscriptions = this->subscriptions();
     if (changed) match(subscriptions);
     const std::int64_t now_ns = monotonic_ns();
@@ -397,7 +406,7 @@ class Node {
   const Options options_;
   const std::uint64_t id_ = random_number();
   std::string host_;
-  std::int64_t clock_offset_ns_ = 0;
+  std::int64_t clock_offset_ns_ = clock_ns(CLOCK_REALTIME) - monotonic_ns();  // see `NodeRecord`
   std::shared_ptr<net::Complaints> complaints_ = std::make_shared<net::Complaints>(options_.log);
   std::unique_ptr<runtime::NodeFiles> files_;
   std::shared_ptr<const Keys> keys_;

@@ -60,6 +60,7 @@ struct SubscriberCounters {
   std::uint64_t lost = 0;       // gaps in the sequence
   std::uint64_t rejected = 0;   // frames that were malformed or of another type
   std::uint64_t overtaken = 0;  // dropped here for newer ones
+  std::uint64_t cut_off = 0;    // publishers that ended without saying how many messages there were; of reliable ones
   std::array<std::uint64_t, 40> latency{};  // sampled; bucket k counts latencies of k bits in ns
 };
 

@@ -151,6 +151,9 @@ class PublisherCore {
     if (closed_ || readers_.size() >= 1024) return;
     request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
     const auto& reader = readers_.add(pub_socket, key, request, sequence_, pub_sockets_->listener);
+    if (pub_sockets_->listener.heard_other_version) {
+      complaints_->once("version", "a subscriber with another version of Cortex cannot share memory, and gets messages through its socket");
+    }
     answer(*reader, latched_);
   }
 
@@ -294,10 +297,15 @@ class PublisherCore {
     const auto attempt = [&] { return pub_socket.try_send(share(frame), flags); };
     if (attempt() || await_room(lock, readers_.timeout_ms(pub_socket), attempt)) return true;
     if (closed_ || pub_sockets_->closed) return false;
-    late_until_ = sequence_;
-    is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
+    give_up();  // ZeroMQ sends that reader nothing until it has caught up
     pub_socket.send_anyway(share(frame), flags);
     return false;
+  }
+
+  // Waits for the readers of the strict socket no more, until they have found what they lost.
+  void give_up() noexcept {
+    late_until_ = sequence_;
+    is_late_ = true;
   }
 
   // Writes into the ring, waiting for reliable readers; false if one of those lost the frame.
@@ -351,8 +359,12 @@ class PublisherCore {
   // Header and body, the body from where it lies.
   bool send_large(Lock& lock, PubSocket& pub_socket, const Slot& slot, const std::string& head, std::size_t size,
                   bool& passed_over) {
-    const auto fits = [&] { return *private_bytes_ + size <= std::max<std::size_t>(CORTEX_PRIVATE_BYTES, 4 * size); };
-    if (!fits() && !(pub_socket.strict && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
+    const auto& waiting = pub_socket.strict ? strict_waiting_ : lossy_waiting_;
+    const std::size_t most = pub_socket.strict ? std::max(strict_bytes, 2 * size) : std::max<std::size_t>(CORTEX_PRIVATE_BYTES, 4 * size);
+    const auto fits = [&] { return *waiting + size <= most; };
+    const bool may_wait = pub_socket.strict && !is_late_;
+    if (!fits() && !(may_wait && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
+      if (may_wait) give_up();
       passed_over = true;
       return !pub_socket.strict;
     }
@@ -364,7 +376,7 @@ class PublisherCore {
       pub_socket.try_send(std::move(header), zmq::send_flags::sndmore);
     }
     // The second part goes where the first went: it must not be refused.
-    pub_socket.send_anyway(private_message(slot, size, private_bytes_));
+    pub_socket.send_anyway(private_message(slot, size, waiting));
     return on_time;
   }
 
@@ -387,7 +399,8 @@ class PublisherCore {
   const bool exact_;
   std::shared_ptr<net::Complaints> complaints_;
   Readers readers_;
-  std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);
+  std::shared_ptr<std::atomic<std::size_t>> lossy_waiting_ = std::make_shared<std::atomic<std::size_t>>(0);
+  std::shared_ptr<std::atomic<std::size_t>> strict_waiting_ = std::make_shared<std::atomic<std::size_t>>(0);
   std::uint64_t sequence_ = 0;
   std::uint64_t told_ = 0;  // what readers know that `sequence_` was
   std::string latched_;
@@ -402,7 +415,8 @@ class PublisherCore {
 inline void PubSockets::refresh() {
   for (PubSocket* pub_socket : {&lossy, &strict}) {
     zmq::message_t event;
-    while (pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
+    const std::int64_t until_ns = monotonic_ns() + look_max_ns;  // others may send more than we can read
+    while (monotonic_ns() < until_ns && pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
       wire::AttachKey request;
       if (bytes.empty()) continue;

@@ -103,9 +103,9 @@ inline std::string hexadecimal(std::uint64_t number) {
   return text;
 }
 
-inline std::string environment(const char* name) {
+inline std::string environment(const char* name, const char* otherwise = "") {
   const char* value = std::getenv(name);
-  return value == nullptr ? "" : value;
+  return value == nullptr || *value == '\0' ? otherwise : value;
 }
 
 // The domain given, else that of CORTEX_DOMAIN, else 0; -1 stands for "not given".

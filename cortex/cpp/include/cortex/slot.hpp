@@ -29,6 +29,9 @@ inline Slot private_slot(std::size_t size) {
   return {{memory->data(), size}, -1, nullptr, std::move(memory)};
 }
 
+// Most bytes of bodies that wait in the strict sockets of a publisher: few enough to be sent from the cache.
+constexpr std::size_t strict_bytes = 8 << 20;
+
 // The body in memory of its own, which counts in `total` as long as ZeroMQ has it.
 inline zmq::message_t private_message(const Slot& slot, std::size_t size,
                                       const std::shared_ptr<std::atomic<std::size_t>>& total) {

@@ -102,8 +102,10 @@ class SubscriptionCore {
     const std::lock_guard<std::mutex> lock(mutex_);
     if (closed_) return;
     for (auto& link : links_) {
-      const bool there = std::any_of(sources.begin(), sources.end(),
-                                     [&](const Source& source) { return source.source == link->source(); });
+      const auto found = std::find_if(sources.begin(), sources.end(),
+                                      [&](const Source& source) { return source.source == link->source(); });
+      const bool there = found != sources.end();
+      if (there) link->clock_offset_ns = found->clock_offset_ns;
       link->leaving_ns = there ? 0 : link->leaving_ns != 0 ? link->leaving_ns : monotonic_ns();
     }
     for (const auto& source : sources) {
@@ -119,7 +121,8 @@ class SubscriptionCore {
         if (!source.server_key.empty()) keys->apply_client(socket, source.server_key);
       };
       links_.push_back(std::make_unique<Link>(context, source.address, source.source, type_, policy, source.local,
-                                              source.clock_offset_ns, secure, counters_, complaints_));
+                                              secure, counters_, complaints_));
+      links_.back()->clock_offset_ns = source.clock_offset_ns;
     }
     waker_.set();
   }

@@ -1,0 +1,211 @@
+"""Reliable over tcp, while either side closes or is killed and connections are cut, at random moments.
+
+What was sent is received or counted as lost. `CORTEX_TCP_RUNS=1000` runs the long version.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import socket
+import stat
+import threading
+import time
+
+import pytest
+from peer import Block, is_whole, make_block
+from processes import SOON_S, fork_server, wait_for
+
+from cortex import reliable
+from cortex.context import Closed
+
+RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "8"))
+KINDS = ["a publisher closes", "a publisher is killed", "a subscriber leaves", "connections are cut"]
+SIZES = [[40], [3_000], [40_000], [40, 40_000, 3_000, 200_000]]
+ELSEWHERE = {"listen": "127.0.0.1", "host": "elsewhere", "forked": True}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forks():
+    """What starts the processes that are killed."""
+    return fork_server()
+
+
+class Reading:
+    """A thread that reads one subscriber, sometimes slowly, and looks at each message."""
+
+    def __init__(self, subscriber, pause_s):
+        self.subscriber = subscriber
+        self.wrong = []
+        self._pause_s = pause_s
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        last = -1
+        with contextlib.suppress(Closed):
+            while True:
+                try:
+                    block = self.subscriber.recv(0.02)
+                except TimeoutError:
+                    continue
+                if block.number <= last or not is_whole(block):
+                    self.wrong.append(block.number)
+                last = block.number
+                if self._pause_s and block.number % 50 == 0:
+                    time.sleep(self._pause_s)
+
+    def accounted(self):
+        counters = self.subscriber.counters
+        return counters.received + counters.lost
+
+    def wait_for_end(self):
+        """Until its publisher has left, and all that came of it was read."""
+        wait_for(lambda: not self.subscriber.sources() and not self.subscriber._links)
+
+    def close(self):
+        self.subscriber.close()
+        self._thread.join(SOON_S)
+        assert not self._thread.is_alive()
+        assert self.wrong == []
+        assert self.subscriber.counters.rejected == self.subscriber.counters.overtaken == 0
+
+
+def cut_connections(port):
+    """Shut down the connections of this process to a port of this host, as a network does that fails."""
+    for number in map(int, os.listdir("/proc/self/fd")):
+        with contextlib.suppress(OSError):
+            if not stat.S_ISSOCK(os.fstat(number).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(number)) as each:
+                if each.family in (socket.AF_INET, socket.AF_INET6) and each.getpeername()[1] == port:
+                    each.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reliable_over_tcp(make_node, start_child, runtime, tmp_path, kind):
+    generator = random.Random(kind)
+    node = make_node("here", listen="127.0.0.1")
+    run = {
+        KINDS[0]: a_publisher_closes,
+        KINDS[1]: a_publisher_is_killed,
+        KINDS[2]: a_subscriber_leaves,
+        KINDS[3]: connections_are_cut,
+    }[kind]
+    child = start_child("peer", **ELSEWHERE)
+    child.hear()
+    for _ in range(max(RUNS // len(KINDS), 1)):
+        run(node, child, start_child, generator, tmp_path)
+    child.finish()
+
+
+def read(node, generator):
+    """A reader of any kind, to which its publisher is still to come."""
+    depth, timeout_s = generator.choice([1, 4, 64, 1000]), generator.choice([0.002, 0.05, SOON_S])
+    pause_s = generator.choice([0.0, 0.0, 0.01])
+    return Reading(node.subscriber("/blocks", Block, policy=reliable(depth, timeout_s)), pause_s)
+
+
+def publish(child, reading, generator):
+    """Begin to publish, once both ends know of each other, and then close; how many it will be."""
+    count = generator.randrange(1, 1500)
+    child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
+    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+    assert reading.subscriber.wait_for_publisher(SOON_S)
+    rate_hz = generator.choice([0.0, 5000.0])
+    child.say(do="publish", topic="/blocks", count=count, sizes=generator.choice(SIZES), rate_hz=rate_hz)
+    child.say(do="counters", topic="/blocks")
+    child.say(do="close", topic="/blocks")
+    return count
+
+
+def a_publisher_closes(node, child, start_child, generator, tmp_path):
+    reading = read(node, generator)
+    count = publish(child, reading, generator)
+    delivered, published = child.hear()["delivered"], child.hear()
+    child.hear()
+    reading.wait_for_end()
+    counters = reading.subscriber.counters
+    assert published["published"] == count == reading.accounted()
+    assert counters.cut_off == 0
+    assert counters.lost <= published["timeouts"] == count - delivered
+    reading.close()
+
+
+def connections_are_cut(node, child, start_child, generator, tmp_path):
+    """Those that the reader has to its publisher; ZeroMQ makes new ones, and what was on its way is lost."""
+    reading = read(node, generator)
+    count = publish(child, reading, generator)
+    (link,) = wait_for(lambda: reading.subscriber._links)
+    port = int(link.address.rpartition(":")[2])
+    for _ in range(generator.randrange(1, 4)):
+        time.sleep(generator.uniform(0.0, 0.15))
+        cut_connections(port)
+    for _ in range(3):
+        child.hear()
+    reading.wait_for_end()
+    assert reading.accounted() == count or (
+        reading.accounted() < count and reading.subscriber.counters.cut_off == 1
+    )
+    reading.close()
+
+
+def a_publisher_is_killed(node, child, start_child, generator, tmp_path):
+    """What was on its way is lost, nobody knows how much: the reader counts that the stream was cut off."""
+    count_file = tmp_path / "published"
+    count_file.write_bytes(bytes(8))
+    victim = start_child(
+        "endless_publisher",
+        topic="/blocks",
+        sizes=generator.choice(SIZES),
+        rate_hz=generator.choice([300.0, 1e6]),
+        count_file=str(count_file),
+        **ELSEWHERE,
+    )
+    reading = read(node, generator)
+    victim.hear()
+    wait_for(lambda: reading.accounted() > generator.randrange(1, 100))
+    time.sleep(generator.uniform(0.0, 0.05))
+    victim.kill()
+    reading.wait_for_end()
+    published = int.from_bytes(count_file.read_bytes(), "little")
+    assert reading.accounted() <= published + 1
+    assert reading.subscriber.counters.cut_off == 1
+    reading.close()
+    victim.end()
+
+
+def a_subscriber_leaves(node, child, start_child, generator, tmp_path):
+    """It closes, or is killed; the publisher waits no longer for it, and another reader gets all."""
+    victim = start_child(
+        "endless_subscriber",
+        topic="/numbers",
+        policy=["reliable", {"depth": generator.choice([1, 64]), "timeout_s": SOON_S}],
+        **ELSEWHERE,
+    )
+    victim.hear()
+    child.ask(do="subscriber", topic="/numbers", type="Block", policy=["reliable", {"timeout_s": SOON_S}])
+    longest_s = 0.0
+    with node.publisher("/numbers", Block, max_wait_s=SOON_S) as publisher:
+        assert publisher.wait_for_subscribers(2, SOON_S)
+        count = generator.randrange(200, 1500)
+        child.say(do="receive", topic="/numbers", until=count)
+        leave = threading.Timer(
+            generator.uniform(0.0, 0.1),
+            victim.kill if generator.random() < 0.7 else victim.process.stdin.close,
+        )
+        leave.start()
+        block = make_block(0, generator.choice(SIZES)[0])
+        for number in range(count + 1):
+            begin_s = time.monotonic()
+            assert publisher.publish(Block(number, block.check, block.data))
+            longest_s = max(longest_s, time.monotonic() - begin_s)
+        leave.join()
+        got = child.hear()
+        assert publisher.counters.published == count + 1
+        assert publisher.counters.timeouts == 0
+    assert got == {"count": count + 1, "first": 0, "last": count, "ordered": True, "whole": True}
+    assert longest_s < SOON_S / 2.0
+    child.ask(do="close", topic="/numbers")
+    victim.end()
