@@ -140,6 +140,9 @@ class Env:
             self._distances_array = wp.from_torch(self._distances)
         self._rows: Any = wp.zeros((worlds, COLUMN_COUNT), dtype=wp.float32, device=wp_device)
         self._surface: EventSurface | None = None
+        self._thresholds: torch.Tensor | None = None
+        if sees and self.randomisation.threshold_factor != (1.0, 1.0):
+            self._thresholds = wp.to_torch(self.sim.thresholds(CAMERA))
         if sees:
             self._surface = EventSurface(
                 task.surface if surface is None else surface,
@@ -271,18 +274,16 @@ class Env:
         episodes.begin(self._mask_array)
         if self.task.bodies:
             self._throw()
-        drawn = self.randomisation
-        if self._surface is not None and drawn.threshold_factor != (1.0, 1.0):
-            thresholds = self.sim.thresholds(CAMERA)
-            episodes.scale_thresholds(
-                self._mask_array, thresholds, nominal=self.task.threshold, factor=drawn.threshold_factor
-            )
+        drawn, mask = self.randomisation, self._mask[:, None]
+        if self._thresholds is not None:
+            low, high = drawn.threshold_factor
+            chosen = self.task.threshold * (low + (high - low) * view.draws[:, -5:-3].double())
+            self._thresholds.copy_(torch.where(mask, chosen, self._thresholds))
         if drawn.airframes_differ:
             episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )
-        mask = self._mask[:, None]
         for array in (view.action, view.last_action):
             array.masked_fill_(mask, 0.0)
         self._queue = torch.where(mask, self._hover, self._queue)

@@ -64,7 +64,7 @@ class View:
     elapsed_s: torch.Tensor
     """Time since the episode began [s], [N]."""
     draws: torch.Tensor
-    """Uniform numbers in (0, 1) of the episode, [N, 16]; the last three are used, the others are a task's."""
+    """Uniform numbers in (0, 1) of the episode, [N, 16]; the last five are used, the others are a task's."""
     bodies: torch.Tensor
     """Where the bodies are that were thrown, and their velocities, in W [m, m/s], [N, B, 6]."""
     step_s: float
