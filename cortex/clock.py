@@ -38,6 +38,17 @@ class Clock(NamedTuple):
     """How much faster this host's clock runs; None: not known to 20 ppm yet, which takes 16 s and more."""
 
 
+def wall_offset_ns() -> int:
+    """CLOCK_REALTIME less CLOCK_MONOTONIC, by the reading of three that was interrupted least [ns]."""
+
+    def read() -> tuple[int, int]:
+        before_ns = time.monotonic_ns()
+        offset_ns = time.time_ns() - before_ns
+        return time.monotonic_ns() - before_ns, offset_ns
+
+    return min(read() for _ in range(3))[1]
+
+
 class _Sample(NamedTuple):
     at_ns: int
     offset_ns: int
@@ -56,7 +67,7 @@ class ClockEstimate:
         self._samples: deque[_Sample] = deque(maxlen=WINDOWS)
         self._window_ns = 0
         self._has_drift = False
-        self._line = (time.monotonic_ns(), time.time_ns() - time.monotonic_ns(), 0.0)
+        self._line = (time.monotonic_ns(), wall_offset_ns(), 0.0)
         """A time by CLOCK_MONOTONIC, the offset then, and how much it grows in a nanosecond."""
 
     def add(self, asked_ns: int, told_ns: int, answered_ns: int) -> None:
@@ -102,7 +113,7 @@ class ClockEstimate:
     def offset_ns(self, now_ns: int) -> int:
         """CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one, which is given [ns]."""
         if self.local:
-            return time.time_ns() - time.monotonic_ns()
+            return wall_offset_ns()
         at_ns, offset_ns, drift = self._line
         return offset_ns + round(drift * (now_ns - at_ns))
 
@@ -114,6 +125,6 @@ class ClockEstimate:
         if not samples:
             return None
         now_ns = time.monotonic_ns()
-        ahead_ns = time.time_ns() - now_ns - self.offset_ns(now_ns)
+        ahead_ns = wall_offset_ns() - self.offset_ns(now_ns)
         drift = -self._line[2] * 1e6 if self._has_drift else None
         return Clock(ahead_ns, min(sample.trip_ns for sample in samples) // 2, drift)

@@ -12,6 +12,7 @@ from typing import Any
 import zmq
 
 from cortex.answers import Answers
+from cortex.clock import wall_offset_ns
 from cortex.discovery import Directory
 from cortex.places import Places
 from cortex.pub_socket import PubSockets
@@ -45,7 +46,7 @@ class ControlThread:
         self._wakeup = Wakeup()
         self._stopping = False
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
-        self.clock_offset_ns = time.time_ns() - time.monotonic_ns()
+        self.clock_offset_ns = wall_offset_ns()
         """CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC here, as the others are told [ns]."""
         self._thread = threading.Thread(target=self._run, name=f"{name} control", daemon=True)
 

@@ -237,9 +237,10 @@ class Fanout:
         def has_room() -> bool:
             return self.large.has_room(pub_socket, body)
 
-        if not has_room() and not (
-            pub_socket.strict and self._await_room(has_room, self._timeout_s(pub_socket))
-        ):
+        may_wait = pub_socket.strict and pub_socket not in self.late
+        if not has_room() and not (may_wait and self._await_room(has_room, self._timeout_s(pub_socket))):
+            if may_wait:
+                self._give_up(pub_socket)
             self.skipped += 1
             return not pub_socket.strict
         on_time = True
@@ -274,10 +275,14 @@ class Fanout:
 
         if send() or self._await_room(send, self._timeout_s(pub_socket)):
             return True
-        self.late[pub_socket] = self._fast_send.sequence
-        self.route()
+        self._give_up(pub_socket)
         pub_socket.send_anyway(frame, flags)
         return False
+
+    def _give_up(self, pub_socket: PubSocket) -> None:
+        """Wait for the readers of a strict socket no more, until they have found what they lost."""
+        self.late[pub_socket] = self._fast_send.sequence
+        self.route()
 
     def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
         """Try to send until it works, or for so long [s]."""

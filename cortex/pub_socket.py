@@ -25,6 +25,8 @@ DONTWAIT, SNDMORE = int(zmq.DONTWAIT), int(zmq.SNDMORE)
 EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 
 ATTACHED_MAX = 16_384
+LOOK_MAX_NS = 5_000_000
+"""A publisher reads who has come and gone for so long at a time; others may send more than it can read."""
 
 
 class Attachable(Protocol):
@@ -152,7 +154,8 @@ class PubSockets:
         """Read who has come and gone; the caller holds the lock."""
         self._refreshed_ns = time.monotonic_ns()
         for pub_socket in self._pub_sockets:
-            while int(pub_socket.socket.get(EVENTS)) & POLLIN:
+            until_ns = time.monotonic_ns() + LOOK_MAX_NS
+            while int(pub_socket.socket.get(EVENTS)) & POLLIN and time.monotonic_ns() < until_ns:
                 try:
                     event = pub_socket.socket.recv(DONTWAIT)
                 except zmq.Again:

@@ -153,7 +153,7 @@ def _threshold(kib: int) -> Case:
         _cortex("shared memory, round trip", kind="roundtrip", inline_max=shared),
     )
     bar = Bar("shared memory", ("inline",), ">=" if kib > 16 else "<=", 1.0)
-    title = f"{kib} KiB in the frame or in shared memory: the larger rate says where `inline_max` belongs"
+    title = f"{kib} KiB in the frame or in shared memory: the larger rate says what `inline_max` to take"
     return Case(f"threshold-{kib}k", title, 256 * kib, contestants, (bar,), ("rate", *_RTT))
 
 

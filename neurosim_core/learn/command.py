@@ -162,17 +162,14 @@ def _learn(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         algorithm=arguments.algorithm,
     )
-    student, teacher = config.student, config.teacher
-    if arguments.pixels is not None:
-        config = dataclasses.replace(config, pixels=arguments.pixels)
-    if arguments.worlds is not None:
-        student = dataclasses.replace(student, worlds=arguments.worlds)
-    if arguments.student_iterations is not None:
-        student = dataclasses.replace(student, iterations=arguments.student_iterations)
-    if arguments.teacher_iterations is not None:
-        teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
-    if arguments.randomise is not None:
-        config = dataclasses.replace(config, randomise=arguments.randomise)
+    config = _changed(
+        config,
+        pixels=arguments.pixels,
+        randomise=arguments.randomise,
+        wandb=arguments.wandb,
+        student=_changed(config.student, worlds=arguments.worlds, iterations=arguments.student_iterations),
+        teacher=_changed(config.teacher, iterations=arguments.teacher_iterations),
+    )
     changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
     changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
     if arguments.resume and changed:
@@ -180,7 +177,6 @@ def _learn(arguments: argparse.Namespace) -> int:
     folder = arguments.out or Path("runs") / arguments.what
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
-    config = dataclasses.replace(config, student=student, teacher=teacher, wandb=arguments.wandb)
     if arguments.ray is not None:
         if arguments.resume:
             raise ValueError("--resume continues one run, and does not go with --ray")
@@ -195,6 +191,11 @@ def _learn(arguments: argparse.Namespace) -> int:
     if train(folder, config, resume=arguments.resume):
         print(f"wrote {folder}/policy.onnx, evaluation.json and .webp; tensorboard --logdir {folder}")
     return 0
+
+
+def _changed(settings: Any, **given: Any) -> Any:
+    """Return settings with what is given; None: as it is."""
+    return dataclasses.replace(settings, **{name: v for name, v in given.items() if v is not None})
 
 
 def _measure_rate(arguments: argparse.Namespace) -> int:

@@ -326,30 +326,31 @@ def _source(
 
         fly_device = config.fly_device or config.device
         settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        flown = world_windows(
+        windows = world_windows(
             settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
             renders=config.renders, threshold_spread=config.threshold_spread,
         )  # fmt: skip
-        while len(pool) < min(config.batch, worlds):
-            pool.add(next(flown))
-
-        def due(step: int) -> bool:
-            return pool.window_count * config.reuse < step * config.batch * config.sequence
-
-        def fly_on(step: int) -> None:
-            while due(step):
+        with contextlib.closing(windows) as flown:
+            while len(pool) < min(config.batch, worlds):
                 pool.add(next(flown))
 
-        if fly_device == config.device:
-            yield fly_on
-            return
-        with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
+            def due(step: int) -> bool:
+                return pool.window_count * config.reuse < step * config.batch * config.sequence
 
-            def wait(step: int) -> None:
-                while due(step) and goes_on():
-                    time.sleep(1e-3)
+            def fly_on(step: int) -> None:
+                while due(step):
+                    pool.add(next(flown))
 
-            yield wait
+            if fly_device == config.device:
+                yield fly_on
+                return
+            with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
+
+                def wait(step: int) -> None:
+                    while due(step) and goes_on():
+                        time.sleep(1e-3)
+
+                yield wait
         return
     if data is not None:
         length = config.sequence + head.ahead

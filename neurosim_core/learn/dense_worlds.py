@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ def world_windows(
     window_s: float,
     renders: int | None = None,
     threshold_spread: float = 0.0,
-) -> Iterator[Windows]:
+) -> Generator[Windows]:
     """Yield the windows of all worlds, one of each at a time, for ever; the next overwrites their tensors.
 
     Generated scenes are eight, of the seeds from that of the settings on. When a flight is over, all worlds

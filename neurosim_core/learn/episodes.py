@@ -68,7 +68,7 @@ class Randomisation:
     """What differs from episode to episode and from world to world, besides where it begins."""
 
     thrust_factor: tuple[float, float] = (0.9, 1.1)
-    """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
+    """Range of thrust per commanded thrust: a battery, or a mass that is not known; not of velocities."""
     latency_steps: int = 1
     """Most steps between an action and its effect; each episode has its own, from 0 on."""
     lag_s: tuple[float, float] = (0.0, 0.0)
@@ -226,26 +226,6 @@ def _look(
     _write(rows_out, world, 22, w + wp.vec3(b[0], b[1], b[2]) + gyro_noise * wp.vec3(n[0], n[1], n[2]))
     _write(rows_out, world, 25, down + gravity_noise * wp.vec3(m[0], m[1], m[2]))
     rows_out[world, 28] = sample_distance(fields[scene_of_world[world]], p)[0]
-
-
-@wp.kernel
-def _scale_thresholds(
-    # Model:
-    nominal: wp.float64,
-    low: wp.float32,
-    high: wp.float32,
-    # In:
-    mask: wp.array[wp.bool],
-    seeds: wp.array[wp.uint64],
-    # Out:
-    thresholds_out: wp.array[wp.vec2d],
-) -> None:
-    world = wp.tid()
-    if mask[world]:
-        u = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(4), 0))
-        on = wp.float64(low + (high - low) * u[0])
-        off = wp.float64(low + (high - low) * u[1])
-        thresholds_out[world] = nominal * wp.vec2d(on, off)
 
 
 @wp.struct
@@ -424,18 +404,6 @@ class Episodes:
             dim=len(self.seeds),
             inputs=[self._nominal, ranges, mask, self.seeds],
             outputs=[airframes, self.parameters],
-            device=self._device,
-        )
-
-    def scale_thresholds(
-        self, mask: Any, thresholds: Any, *, nominal: float, factor: tuple[float, float]
-    ) -> None:
-        """Draw thresholds of an event camera for the worlds of a mask: a factor on each polarity."""
-        wp.launch(
-            _scale_thresholds,
-            dim=len(self.seeds),
-            inputs=[nominal, *factor, mask, self.seeds],
-            outputs=[thresholds],
             device=self._device,
         )
 

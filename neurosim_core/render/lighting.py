@@ -322,9 +322,8 @@ def _hemisphere(count: int) -> NDArray[np.float32]:
     radius2 = (k + 0.5) / count
     angle = k * _GOLDEN_ANGLE
     radius = np.sqrt(radius2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius2)], 1).astype(
-        np.float32
-    )
+    columns = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius2)
+    return np.stack(columns, axis=1, dtype=np.float32)
 
 
 def _sphere(count: int) -> NDArray[np.float32]:
@@ -332,9 +331,8 @@ def _sphere(count: int) -> NDArray[np.float32]:
     k = spread_order(count)
     z = 1.0 - (2.0 * k + 1.0) / count
     radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z], 1).astype(
-        np.float32
-    )
+    columns = radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z
+    return np.stack(columns, axis=1, dtype=np.float32)
 
 
 def corner_normals(mesh: RefinedMesh) -> NDArray[np.float32]:
@@ -376,15 +374,16 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
         openness: Share of the ambient light, shape [G, 2].
         faces: Groups of the corners of each face, shape [F, 3].
     """
-    ends = np.concatenate([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
-    ends = np.concatenate([ends, ends[:, ::-1]])
+    a, b, c = np.ascontiguousarray(faces.T)
+    one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
     for side in range(2):
         buried = openness[:, side] < _BURIED
-        from_open = ends[buried[ends[:, 0]] & ~buried[ends[:, 1]]]
-        count = np.bincount(from_open[:, 0], minlength=len(light))
+        rim = buried.take(one) & ~buried.take(other)
+        inside, outside = one[rim], other[rim]
+        count = np.bincount(inside, minlength=len(light))
         touched = count > 0
         for channel in range(3):
-            total = np.bincount(from_open[:, 0], light[from_open[:, 1], side, channel], minlength=len(light))
+            total = np.bincount(inside, light[outside, side, channel], minlength=len(light))
             light[touched, side, channel] = total[touched] / count[touched]
 
 
@@ -442,7 +441,7 @@ def bake_light(
     rest = scene.lights, scene.ambient, config, caster, wp.__version__, _source()
     large = wp.get_device(device).is_cpu and len(mesh.faces) >= _KEPT_FACES_MIN
     found = cached_arrays((*inputs, *rest), compute) if large else compute()
-    per_corner = found["light"][found["group"]]
+    per_corner = found["light"].take(found["group"], axis=0)
     return np.ascontiguousarray(np.moveaxis(per_corner, 1, 0)).reshape(2, -1, 3, 3)
 
 

@@ -292,8 +292,8 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     order = np.lexsort((up, plan))
     place = np.zeros(len(vertices), dtype=np.int64)
     place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
-    corner, others = place[mesh.faces], ((1, 2), (2, 0), (0, 1))
-    first, last = corner[:, (1, 2, 0)].reshape(-1), corner[:, (2, 0, 1)].reshape(-1)
+    corner = place.take(mesh.faces)
+    first, last = np.roll(corner, -1, axis=1).reshape(-1), np.roll(corner, 1, axis=1).reshape(-1)
     key = edge_keys(first, last)
     order = np.argsort(key, kind="stable")
     same = key[order[1:]] == key[order[:-1]]
@@ -303,10 +303,15 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
     normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    uv = mesh.uv[mesh.faces][:, others].reshape(-1, 2, 2)
-    uv = np.where((first > last)[:, None, None], uv[:, ::-1], uv)
-    joined = (material[one // 3] == material[other // 3]) & (uv[one] == uv[other]).all(axis=(1, 2))
-    joined &= np.einsum("ec,ec->e", normal[one // 3], normal[other // 3]) > _PLANE_COSINE
+    uv = mesh.uv.take(mesh.faces, axis=0)  # of the ends of each edge, the one of the lower number first:
+    ends = np.roll(uv, -1, axis=1).reshape(-1, 2), np.roll(uv, 1, axis=1).reshape(-1, 2)
+    turned = (first > last)[:, None]
+    joined = material[one // 3] == material[other // 3]
+    for end in (np.where(turned, *ends[::-1]), np.where(turned, *ends)):
+        u, v = (end.take(one, axis=0) == end.take(other, axis=0)).T
+        joined &= u & v
+    sides = (normal.take(edges // 3, axis=0) for edges in (one, other))
+    joined &= np.einsum("ec,ec->e", *sides) > _PLANE_COSINE
     pairs = (one[joined] // 3, other[joined] // 3)
     graph = scipy.sparse.coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
     return neighbor, scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int32)

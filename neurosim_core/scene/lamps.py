@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
 from neurosim_core.scene.scene import Light, LinearRgb, extent
+from neurosim_core.scene.source import SceneError, Source, rgb
 
 LEVEL = 0.3
 """What the median bit of surface would reflect if it were white and faced its brightest lamp, alone."""
@@ -62,6 +64,57 @@ def scaled_lights(
         for p, i in zip(where, power * factor, strict=True)
     )
     return lights, factor
+
+
+def lights_of(
+    source: Source,
+    light_scale: float | None,
+    triangles: NDArray[np.float64],
+    notes: list[str],
+    *,
+    turn: NDArray[np.float64],
+    shift_m: NDArray[np.float64],
+    path: Path,
+) -> tuple[Light, ...]:
+    """Return the lights of a file, or lamps hung where it has none, and add a sentence to the notes.
+
+    Args:
+        source: What the file says.
+        light_scale: Factor of its lights; None: what brings them to `LEVEL`.
+        triangles: Of the scene [m], shape [F, 3, 3].
+        notes: Appended to.
+        turn: Takes directions and places of the file to metres with z up, shape [3, 3].
+        shift_m: Added to places [m], shape [3].
+        path: The file, for messages.
+
+    Raises:
+        SceneError: There are no lights to scale by `light_scale`.
+    """
+    if not source.lamps:
+        if light_scale is not None:
+            raise SceneError(
+                f"light_scale = {light_scale:g} scales the lights of the file, and {path} has none: "
+                "leave it out"
+            )
+        places, sentence = hang_lamps(triangles)
+        notes.append(f"The file has no lights; {len(places)} are {sentence}.")
+        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
+    low, high = extent(triangles)
+    away = 20.0 * float(np.linalg.norm(high - low))
+    positions, intensities = [], []
+    for lamp in source.lamps:
+        vector = turn @ lamp.vector
+        if lamp.kind == "directional":  # a point light so far off that its rays are parallel
+            vector = vector / np.linalg.norm(vector)
+            positions.append((low + high) / 2.0 - away * vector)
+            intensities.append(rgb(np.asarray(lamp.intensity) * away**2))
+        else:
+            positions.append(vector + shift_m)
+            intensities.append(lamp.intensity)
+    lights, factor = scaled_lights(positions, intensities, triangles, factor=light_scale)
+    how = "as declared" if light_scale is not None else "so that the median surface is well lit"
+    notes.append(f"{len(lights)} lights of the file, their intensities (cd, lx) times {factor:.3g}, {how}.")
+    return lights
 
 
 def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:

@@ -34,13 +34,13 @@ def smooth_normals(
     """
     if len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    key = np.empty((len(positions), 4), dtype=np.int64)
-    key[:, :3] = np.ascontiguousarray(positions + 0.0).view(np.int64)  # + 0.0 makes -0.0 equal to 0.0
-    key[:, 3] = group
-    order = np.lexsort(key.T)
-    new = np.ones(len(key), dtype=np.int64)
-    new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
-    point = np.empty(len(key), dtype=np.int64)
+    keys = np.empty((4, len(positions)), dtype=np.int64)
+    keys[:3] = np.ascontiguousarray(positions.T + 0.0).view(np.int64)  # + 0.0 makes -0.0 equal to 0.0
+    keys[3] = group
+    order = np.lexsort(keys)
+    new = np.ones(len(positions), dtype=np.int64)
+    new[1:] = (np.diff(keys[:, order], axis=1) != 0).any(axis=0)
+    point = np.empty(len(positions), dtype=np.int64)
     point[order] = np.cumsum(new) - 1
 
     corner = positions.take(faces, axis=0)
@@ -54,12 +54,13 @@ def smooth_normals(
     # half-edges c -> c + 1 of each face; the two of one edge become neighbours when sorted by their ends
     tail = np.arange(faces.size)
     head = tail + 1 - 3 * (tail % 3 == 2)
-    at = point[faces].reshape(-1)
+    at = point.take(faces).reshape(-1)
     edge_key = edge_keys(at, at[head])
     sorted_edges = np.argsort(edge_key, kind="stable")
     first, second = sorted_edges[:-1], sorted_edges[1:]
     gentle = edge_key[first] == edge_key[second]
-    gentle &= np.einsum("ex,ex->e", face_normal[first // 3], face_normal[second // 3]) > np.cos(CREASE_RAD)
+    sides = (face_normal.take(corners // 3, axis=0) for corners in (first, second))
+    gentle &= np.einsum("ex,ex->e", *sides) > np.cos(CREASE_RAD)
     first, second = first[gentle], second[gentle]
     same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
     joined_a = np.concatenate([first, head[first]])

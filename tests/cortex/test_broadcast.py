@@ -20,6 +20,7 @@ import zmq
 from peer import Block, Number, is_whole, make_block
 from processes import SOON_S, wait_for
 
+import cortex.broadcast
 import cortex.link
 import cortex.subscriber
 from cortex import keep_last, reliable
@@ -311,9 +312,9 @@ def test_a_reader_that_is_gone_is_forgotten(ring):
 
 
 @contextlib.contextmanager
-def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3"):
+def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3", bell: int | None = None):
     """The connection of a reader, number 1, that has said hello."""
-    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0)
+    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0) if bell is None else bell
     os.ftruncate(page, 4096)
     fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
@@ -322,6 +323,20 @@ def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3"):
         os.close(page)
         os.close(bell)
         yield other
+
+
+@pytest.mark.parametrize(
+    "make", [os.pipe, lambda: [end.detach() for end in socket.socketpair()]], ids=["pipe", "socket"]
+)
+def test_a_bell_whose_ringing_would_end_the_process_is_refused(ring, make):
+    """Nobody is at its other end: to write there sends SIGPIPE."""
+    other, bell = make()
+    os.close(other)
+    with asks_by_hand(ring.path, SOURCE, bell=bell):
+        connection = native.accept(ring.listener)
+        with pytest.raises(OSError, match=r"[Pp]rotocol"):
+            native.hear(connection)
+        os.close(connection)
 
 
 def test_a_reader_that_spoke_and_died_is_forgotten(ring):
@@ -548,6 +563,24 @@ def test_a_reader_in_the_same_process_has_the_ring_as_others(make_node):
     publisher.publish(make_block(1, 100))
     assert subscriber.recv(SOON_S).number == 1
     assert subscriber.carriers == ["ipc, shared memory"]
+
+
+def test_who_connects_and_says_nothing_is_forgotten(tmp_path, monkeypatch):
+    """More of them than are waited for: the older ones are let go of."""
+    monkeypatch.setattr(cortex.broadcast, "WAITING_MAX", 16)
+    listener = Listener(tmp_path / "1.ring")
+    before = len(os.listdir("/proc/self/fd"))
+    with contextlib.ExitStack() as others:
+        for _ in range(3):
+            for _ in range(10):
+                other = others.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+                other.connect(str(tmp_path / "1.ring"))
+            listener.take(SOURCE, 1)
+        listener.take(SOURCE, 1)
+        assert len(os.listdir("/proc/self/fd")) == before + 30 + 16
+    listener.take(SOURCE, 1)
+    assert len(os.listdir("/proc/self/fd")) == before
+    listener.close()
 
 
 def test_a_reader_that_leaves_before_it_attaches_is_forgotten(tmp_path):

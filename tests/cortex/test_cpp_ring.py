@@ -151,6 +151,19 @@ def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(
     assert 8 <= result["taken"] <= 12
 
 
+def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
+    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a second, not for one with each large message."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 1.0))
+    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)
+    begin = time.monotonic()
+    result = result_of(start("publish", "/scan", 40, "250000"))
+    assert result["refused"] >= 28
+    assert time.monotonic() - begin < 20.0
+
+
 @pytest.mark.parametrize("others", [0, 2])
 def test_killed_cpp_reader_that_holds_up_its_publisher(
     start: Callable[..., Peer], make_node: Callable[..., Node], others: int

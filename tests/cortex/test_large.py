@@ -387,6 +387,36 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
 
+def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch):
+    """Not each large message; it goes on when it reads, and counts what it lost."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
+    waits = []
+    wait = publisher._back_pressure.wait_for
+    monkeypatch.setattr(
+        publisher._back_pressure, "wait_for", lambda *arguments: waits.append(wait(*arguments)) or waits[-1]
+    )
+    with monkeypatch.context() as still:
+        still.setattr(subscriber, "top_up", lambda now_ns: None)
+        delivered = [publisher.publish(scan(number, 250_000)) for number in range(30)]
+    assert delivered == [True] * sum(delivered) + [False] * delivered.count(False)
+    assert waits.count(False) == 1
+    received = []
+
+    def goes_on():
+        if publisher.publish(scan(len(delivered), 250_000)):
+            return True
+        delivered.append(False)
+        received.extend(scan.stamp_ns for scan in iter(lambda: _try(subscriber), None))
+
+    wait_for(goes_on)
+    last = len(delivered)
+    while not received or received[-1] < last:
+        received.append(subscriber.recv(SOON_S).stamp_ns)
+    assert received == sorted(set(received))
+    assert len(received) + subscriber.counters.lost == last + 1
+
+
 def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):
     """Not even from one of another thread."""
     publisher, subscriber = connected(node, Scan, keep_last())

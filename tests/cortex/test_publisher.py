@@ -6,13 +6,16 @@ import itertools
 import logging
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import zmq
 from peer import Number, Scan
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, message, reliable
+from cortex.pub_socket import PubSockets
 from cortex.publisher import Closed
 
 LARGE = 100_000
@@ -273,6 +276,24 @@ def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     subscriber.close()
     assert done.wait(SOON_S)
     thread.join()
+
+
+def test_a_flood_of_subscriptions_holds_up_nobody():
+    """A peer sends more of them than can be read."""
+
+    class Flood:
+        def get(self, option):
+            return zmq.POLLIN
+
+        def recv(self, flags):
+            return b"\1" + bytes(32)
+
+    pub_sockets = PubSockets()
+    pub_sockets.add(SimpleNamespace(socket=Flood(), listener=None))
+    thread = threading.Thread(target=pub_sockets.tick, daemon=True)
+    thread.start()
+    thread.join(SOON_S)
+    assert not thread.is_alive()
 
 
 def test_a_log_that_travels_over_cortex(node):

@@ -46,6 +46,50 @@ def test_a_runner_of_rsl_rl_trains(hall):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+def test_a_runner_of_rsl_rl_distils_a_student_on_events(hall):
+    """It comes nearer to its teacher, who acts on states."""
+    runners = pytest.importorskip("rsl_rl.runners", reason="rsl-rl-lib is not installed")
+    from neurosim_core.learn.rsl_rl import RslRlEnv
+
+    torch.manual_seed(0)
+    bare = ns.learn.make_env("hover", worlds=16, device="cpu", pixels=12, models=[hall])
+    layers = {"output_channels": [4, 4], "kernel_size": [5, 3], "stride": [2, 2], "activation": "elu"}
+    network = {"hidden_dims": [16], "activation": "elu"}
+    spread = {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.1}}
+    runner = runners.DistillationRunner(
+        RslRlEnv(bare),
+        {
+            "num_steps_per_env": 8,
+            "save_interval": 100,
+            "obs_groups": {name: bare.obs_groups[name] for name in ("student", "teacher")},
+            "algorithm": {
+                "class_name": "Distillation",
+                "num_learning_epochs": 4,
+                "gradient_length": 4,
+                "learning_rate": 5e-3,
+            },
+            "student": {"class_name": "CNNModel", "cnn_cfg": layers, **network, **spread},
+            "teacher": {"class_name": "MLPModel", **network, **spread},
+        },
+        log_dir=None,
+        device="cpu",
+    )
+    runner.alg.teacher_loaded = True  # one that was not trained, and pushes one way, will do
+    torch.nn.init.constant_(runner.alg.teacher.mlp[-1].bias, 0.5)
+    losses = []
+    update = runner.alg.update
+
+    def note():
+        losses.append(update())
+        return losses[-1]
+
+    runner.alg.update = note
+    runner.learn(12)
+    errors = [loss["behavior"] for loss in losses]
+    assert np.mean(errors[-3:]) < 0.5 * errors[0], errors
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
 @pytest.mark.parametrize("name", ["PPO", "SAC"])
 def test_stable_baselines_trains(hall, name):
     """On policy and off policy; episodes of 0.2 s end by time, and say what was seen last."""

@@ -211,6 +211,12 @@ static inline int cortex_accept(int listener) {
     return -1;
 }
 
+/* Whether this may be rung: a pipe or a socket that nobody reads would send us a signal that ends the process. */
+static inline int cortex_is_bell(int fd) {
+    struct stat status;
+    return fstat(fd, &status) == 0 && !S_ISFIFO(status.st_mode) && !S_ISSOCK(status.st_mode) && fcntl(fd, F_SETFL, O_NONBLOCK) == 0;
+}
+
 /* Whether this is the magic of a ring of an older or newer kind: only the last letter differs. */
 static inline int cortex_is_other_version(uint64_t magic) { return magic != CORTEX_RING_MAGIC && !((magic ^ CORTEX_RING_MAGIC) << 8); }
 
@@ -223,8 +229,7 @@ static inline int cortex_hear(int socket, CortexHello *hello) {
     hello->socket = socket;
     hello->page = fds[0];
     hello->bell = fds[1];
-    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && fcntl(fds[1], F_SETFL, O_NONBLOCK) == 0)
-        return 0;
+    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && cortex_is_bell(fds[1])) return 0;
     close(fds[0]);
     close(fds[1]);
     errno = cortex_is_other_version(said[0]) ? EPROTONOSUPPORT : EPROTO;

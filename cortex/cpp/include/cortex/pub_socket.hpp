@@ -73,6 +73,7 @@ class PubSockets {
   bool closed = false;
 
  private:
+  static constexpr std::int64_t look_max_ns = 5'000'000;
   std::int64_t told_ns_ = 0;
 };
 

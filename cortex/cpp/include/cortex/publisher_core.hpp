@@ -297,10 +297,15 @@ class PublisherCore {
     const auto attempt = [&] { return pub_socket.try_send(share(frame), flags); };
     if (attempt() || await_room(lock, readers_.timeout_ms(pub_socket), attempt)) return true;
     if (closed_ || pub_sockets_->closed) return false;
-    late_until_ = sequence_;
-    is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
+    give_up();  // ZeroMQ sends that reader nothing until it has caught up
     pub_socket.send_anyway(share(frame), flags);
     return false;
+  }
+
+  // Waits for the readers of the strict socket no more, until they have found what they lost.
+  void give_up() noexcept {
+    late_until_ = sequence_;
+    is_late_ = true;
   }
 
   // Writes into the ring, waiting for reliable readers; false if one of those lost the frame.
@@ -357,7 +362,9 @@ class PublisherCore {
     const auto& waiting = pub_socket.strict ? strict_waiting_ : lossy_waiting_;
     const std::size_t most = pub_socket.strict ? std::max(strict_bytes, 2 * size) : std::max<std::size_t>(CORTEX_PRIVATE_BYTES, 4 * size);
     const auto fits = [&] { return *waiting + size <= most; };
-    if (!fits() && !(pub_socket.strict && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
+    const bool may_wait = pub_socket.strict && !is_late_;
+    if (!fits() && !(may_wait && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
+      if (may_wait) give_up();
       passed_over = true;
       return !pub_socket.strict;
     }
@@ -408,7 +415,8 @@ class PublisherCore {
 inline void PubSockets::refresh() {
   for (PubSocket* pub_socket : {&lossy, &strict}) {
     zmq::message_t event;
-    while (pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
+    const std::int64_t until_ns = monotonic_ns() + look_max_ns;  // others may send more than we can read
+    while (monotonic_ns() < until_ns && pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
       wire::AttachKey request;
       if (bytes.empty()) continue;
