@@ -86,8 +86,12 @@ class Listener:
     def take(self, source: int, reader: int) -> Hello | None:
         """What a reader has handed over, if it has asked for the ring of a publisher; now the caller's."""
         with contextlib.suppress(OSError):  # too many files, or somebody else's process
-            while (fd := native.accept(self._fd)) >= 0:
+            for _ in range(WAITING_MAX):  # others may come faster than they can be taken in
+                if (fd := native.accept(self._fd)) < 0:
+                    break
                 self._unheard.append(fd)
+        for fd in self._unheard[:-WAITING_MAX]:
+            os.close(fd)
         unheard, self._unheard = self._unheard[-WAITING_MAX:], []
         for fd in unheard:
             try:

@@ -20,6 +20,7 @@ import zmq
 from peer import Block, Number, is_whole, make_block
 from processes import SOON_S, wait_for
 
+import cortex.broadcast
 import cortex.link
 import cortex.subscriber
 from cortex import keep_last, reliable
@@ -562,6 +563,24 @@ def test_a_reader_in_the_same_process_has_the_ring_as_others(make_node):
     publisher.publish(make_block(1, 100))
     assert subscriber.recv(SOON_S).number == 1
     assert subscriber.carriers == ["ipc, shared memory"]
+
+
+def test_who_connects_and_says_nothing_is_forgotten(tmp_path, monkeypatch):
+    """More of them than are waited for: the older ones are let go of."""
+    monkeypatch.setattr(cortex.broadcast, "WAITING_MAX", 16)
+    listener = Listener(tmp_path / "1.ring")
+    before = len(os.listdir("/proc/self/fd"))
+    with contextlib.ExitStack() as others:
+        for _ in range(3):
+            for _ in range(10):
+                other = others.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+                other.connect(str(tmp_path / "1.ring"))
+            listener.take(SOURCE, 1)
+        listener.take(SOURCE, 1)
+        assert len(os.listdir("/proc/self/fd")) == before + 30 + 16
+    listener.take(SOURCE, 1)
+    assert len(os.listdir("/proc/self/fd")) == before
+    listener.close()
 
 
 def test_a_reader_that_leaves_before_it_attaches_is_forgotten(tmp_path):

@@ -1,8 +1,10 @@
 // Returns the part of a face before the cuts that is in a direction from a position.
 auto nearest_part = [&](int face, const wp::vec3& from, const wp::vec3& direction) {
     int found = scene.whole_first.data[face];
+    const int end = scene.whole_first.data[face + 1];
+    if (end - found == 1) return found;
     float most = -1e30f;
-    for (int part = scene.whole_first.data[face]; part < scene.whole_first.data[face + 1]; ++part) {
+    for (int part = found; part < end; ++part) {
         const int* index = &mesh.indices[3 * (size_t)part];
         const wp::vec3 a = mesh.points[index[0]] - from, b = mesh.points[index[1]] - from, c = mesh.points[index[2]] - from;
         const float at[3] = {wp::dot(wp::cross(b, c), direction), wp::dot(wp::cross(c, a), direction),

@@ -34,7 +34,11 @@ class Listener {
 
   // What a reader has handed over, if it has asked for the ring of a publisher; now the caller's.
   bool take(std::uint64_t source, std::uint64_t reader, CortexHello& hello) {
-    for (int fd = -1; fd_ >= 0 && (fd = cortex_accept(fd_)) >= 0;) unheard_.push_back(fd);
+    for (std::size_t count = 0; fd_ >= 0 && count < waiting_max; ++count) {  // others may come faster than they can be taken in
+      const int fd = cortex_accept(fd_);
+      if (fd < 0) break;
+      unheard_.push_back(fd);
+    }
     for (const int fd : std::exchange(unheard_, {})) {
       CortexHello said;
       if (cortex_hear(fd, &said) == 0) {
