@@ -144,6 +144,9 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     ns.load_config(pilot_settings(pilot.card))
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
+    export_onnx(policy, {**card, "mode": "velocity"}, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match="commands velocity, and only thrust and body rates are flown"):
+        Pilot(tmp_path / "other.onnx")
     shape = {**policy.shape, "vector_size": 17}
     export_onnx(EventPolicy(**shape), {**card, "task": "avoid"}, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="trained for 'avoid', and needs more than events"):
