@@ -97,6 +97,12 @@ def make_kernels() -> None:
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
         antialiasing_kernels(OUTPUTS, terms, is_cuda=True)
+    quads, worlds = (
+        everything._replace(quads=True),
+        {"worlds": True, "world_scenes": True, "world_lenses": True},
+    )
+    for terms in (quads, quads._replace(bodies=True, timed=True, **worlds)):
+        raycast_kernel(("log_radiance", "rgb"), terms)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

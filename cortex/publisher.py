@@ -126,6 +126,8 @@ class Publisher(Generic[T]):
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._fanout.readers and not self.latch:
+                if not self._fast_send.sequence:  # who has no subscriber yet hears of a mistake, too
+                    self.codec.prepare(message, -1)
                 self._fast_send.sequence += 1
                 return True
             prepared: Any = self.codec.prepare(message, self._inline_max)

@@ -58,6 +58,7 @@ class Descent:
 
     Attributes:
         optimizer: Adam.
+        rate_factor: What learning rates are multiplied with; kept with the state.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class Descent:
         self._module, self._loss, self._gradient_max = module, loss, gradient_max
         device = next(module.parameters()).device
         self._on_cuda = device.type == "cuda"
+        self.rate_factor = 1.0
         self._rate = torch.zeros((), device=device) if self._on_cuda else 0.0
         self.optimizer = torch.optim.Adam(
             module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
@@ -86,6 +88,7 @@ class Descent:
         Args:
             rate: Learning rate.
         """
+        rate *= self.rate_factor
         for group in self.optimizer.param_groups:
             if self._on_cuda:
                 group["lr"].fill_(rate)
@@ -98,12 +101,17 @@ class Descent:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training goes on from."""
-        return {"policy": self._module.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {
+            "policy": self._module.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "rate_factor": self.rate_factor,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self._module.load_state_dict(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.rate_factor = state["rate_factor"]
 
     def _backward(self) -> None:
         loss = self._loss()

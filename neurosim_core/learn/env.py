@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 import warp as wp
 
+from neurosim_core.learn.actions import hover_command
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
@@ -159,12 +160,12 @@ class Env:
         self._mask_array = wp.from_torch(self._mask)
         self._mask_int = torch.zeros(worlds, dtype=torch.int32, device=self.device)
         latency = self.randomisation.latency_steps
-        self._queue = torch.zeros((latency + 1, worlds, 4), device=self.device)
+        self._hover = torch.tensor(hover_command(task.mode, self.sim.model.airframe), device=self.device)
+        self._queue = torch.zeros((latency + 1, worlds, len(self._hover)), device=self.device)
         self._queue_place = 0
-        self._lagging = torch.zeros((worlds, 4), device=self.device)
+        self._lagging = self._queue[0].clone()
         self._each = torch.arange(worlds, device=self.device)
         self.view = self._make_view()
-        self._hover = torch.tensor([self.view.vehicle.hover_thrust_n, 0.0, 0.0, 0.0], device=self.device)
         self._fall = torch.tensor([0.0, 0.0, -GRAVITY_M_S2], dtype=torch.float64, device=self.device)
         self._seed = seed
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
@@ -239,7 +240,7 @@ class Env:
         view = self.view
         view.last_action.copy_(view.action)
         torch.clamp(actions.detach(), -1.0, 1.0, out=view.action)
-        observation = self.sim.step(self._delayed(self.task.command(view)), mode="rates")
+        observation = self.sim.step(self._delayed(self.task.command(view)), mode=self.task.mode)
         if self._surface is not None:
             self._surface.update(observation.events[CAMERA], observation.clock_ns)
         self._look(observation)
@@ -309,9 +310,11 @@ class Env:
     def _delayed(self, command: torch.Tensor) -> torch.Tensor:
         """Return the commands that take effect now: each episode has a latency and a factor of thrust."""
         low, high = self.randomisation.thrust_factor
-        draws = self.view.draws
-        command = command.clone()
-        command[:, 0] *= low + (high - low) * draws[:, -1]
+        factor = low + (high - low) * self.view.draws[:, -1:]
+        if self.task.mode == "motor_speeds":
+            command = command * factor.sqrt()
+        elif self.task.mode != "velocity":
+            command = torch.cat([command[:, :1] * factor, command[:, 1:]], dim=1)
         length = self._queue.shape[0]
         if length > 1:
             self._queue[self._queue_place] = command

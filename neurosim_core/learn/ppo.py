@@ -7,9 +7,13 @@ from dataclasses import dataclass
 
 import torch
 
+from neurosim_core.learn import ranks
 from neurosim_core.learn.descent import Descent
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import ActorCritic, Critic
+
+_RATE_STEP, _RATE_LEAST, _RATE_MOST = 1.2, 0.05, 4.0
+"""What adaptation multiplies the learning rate with, and the range of the product."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +28,9 @@ class PpoConfig:
     minibatches: int = 4
     learning_rate: float = 1.5e-3
     """At first; it falls to a tenth."""
+    divergence: float = 0.0
+    """How much a teacher should change in an iteration (KL): where it changes more than twice or less than
+    half as much, the learning rate is divided or multiplied by 1.2 from then on. 0: it only falls."""
     discount: float = 0.98
     reward_scale: float = 1.0
     """What rewards are multiplied with: large errors of the critic would drown the gradient of the actor."""
@@ -117,6 +124,20 @@ class Ppo:
         for rows in minibatches(len(batch["advantage"]), len(self._rows), self.config, self._generator):
             self._rows.copy_(rows)
             self.descent.step(rate)
+        if self.config.divergence:
+            self._adapt(batch)
+
+    def _adapt(self, batch: dict[str, torch.Tensor]) -> None:
+        """Change the learning rate by how much the policy has changed on a batch."""
+        with torch.no_grad():
+            action = self.policy(batch["actor"])
+            change = self.policy.log_probability(action, batch["action"]) - batch["log_p"]
+            divergence = (change.exp() - 1.0 - change).mean()[None]  # Schulman's estimate
+        if ranks.count() > 1:
+            ranks.average(divergence)
+        ratio = float(divergence) / self.config.divergence
+        factor = 1.0 / _RATE_STEP if ratio > 2.0 else _RATE_STEP if ratio < 0.5 else 1.0
+        self.descent.rate_factor = min(max(self.descent.rate_factor * factor, _RATE_LEAST), _RATE_MOST)
 
     def _loss(self) -> torch.Tensor:
         """Return the loss of the rows of the batch that `_rows` names."""

@@ -448,6 +448,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "rays_per_pixel": task.rays_per_pixel,
         "surface": env.surface_card,
         "hover_thrust_n": env.view.vehicle.hover_thrust_n,
+        "mode": task.mode,
         "thrust_span": task.thrust_span,
         "rate_max_rad_s": list(task.rate_max_rad_s),
         "vehicle": dict(task.vehicle),

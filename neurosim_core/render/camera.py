@@ -16,7 +16,9 @@ from neurosim_core.settings import Settings
 
 
 class Lens(Protocol):
-    """What a renderer asks of a lens."""
+    """What a renderer asks of a lens; equal ones have the same rays, which are kept."""
+
+    def __hash__(self) -> int: ...
 
     @property
     def width(self) -> int:

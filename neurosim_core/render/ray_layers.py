@@ -1,7 +1,11 @@
-"""Rays through the pixels of a camera: through their centres, and through several points of each."""
+"""Rays through the pixels of a camera: through their centres, and through several points of each.
+
+Those that were asked for last are kept, for the renderers of several batches in flight.
+"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -24,6 +28,7 @@ def _rays_through(
         yield np.concatenate([lens.ray_table((column, row)), spread], axis=-1)
 
 
+@functools.lru_cache(maxsize=1)
 def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArray[np.float32]:
     """Return rays through the centres of pixels and, for several samples, through points spread over them.
 
@@ -45,6 +50,7 @@ def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArr
     return layers.reshape(len(points), -1, 4)
 
 
+@functools.lru_cache(maxsize=1)
 def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     """Return the rays of the first pass, shape [H * W, 4].
 
@@ -63,6 +69,7 @@ def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     return rays.reshape(-1, 4)
 
 
+@functools.lru_cache(maxsize=1)
 def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     """Return, of each pixel, the ray through its centre and its change across columns and rows.
 

@@ -4,8 +4,9 @@
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """The ray caster whose threads are pixels: of one instant, or, with candidate lists, of a few.
 
-Blocks of 64 threads are tiles of 8 x 8 pixels, so that their rays traverse the same nodes of the tree. With
-candidate lists (`candidate_lists.py`) the threads of a block share the set-up of triangles.
+Blocks of 64 threads are tiles of 8 x 8 pixels, so that their rays traverse the same nodes of the tree; four
+of several rays a pixel are cast side by side (`raycast_quads.py`). With candidate lists
+(`candidate_lists.py`) the threads of a block share the set-up of triangles.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -31,6 +32,7 @@ from neurosim_core.render.ray_intersection import (
     intersect_candidate,
     intersect_scene,
 )
+from neurosim_core.render.raycast_quads import casts_quads, quad_program
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -39,6 +41,8 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_finder, til
 PIXEL_BOUNDS = (64, 14)
 """Threads of a block and, on CUDA, blocks of a multiprocessor: registers are limited to fit; fastest on an
 H200."""
+QUAD_BOUNDS = (64, 16)
+"""The same where four threads cast the rays of a pixel: 4 % faster than with 14."""
 _CANDIDATE_BOUNDS = (64, 10)
 """The same with candidate lists: a few registers are spilled, and it is still 1 to 3 % faster."""
 _FACE_BOUNDS = (64, 12)
@@ -47,7 +51,7 @@ _FACE_BOUNDS = (64, 12)
 
 def _bounds_of(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[int, int] | None:
     if terms.candidate_group == 0:
-        return PIXEL_BOUNDS
+        return QUAD_BOUNDS if casts_quads(outputs, terms) else PIXEL_BOUNDS
     simple = len(outputs) == 1 and not (terms.worlds or terms.bodies or terms.supersampled)
     if not simple:
         return None
@@ -56,9 +60,12 @@ def _bounds_of(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[int, int] 
 
 def pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Build the kernel; see `raycast.raycast_kernel`."""
-    render_thread = (
-        _group_program(outputs, terms) if terms.candidate_group else _pixel_program(outputs, terms)
-    )
+    if terms.candidate_group:
+        render_thread = _group_program(outputs, terms)
+    elif casts_quads(outputs, terms):
+        render_thread = quad_program(outputs, terms)
+    else:
+        render_thread = _pixel_program(outputs, terms)
 
     @wp.kernel(
         module="unique",
@@ -126,7 +133,7 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     ):
         # `index` counts the pixels of a tile in one instant, then the instants of a tile, then tiles.
         # Adjacent threads should traverse the same nodes: a block is a quarter of a tile at four instants,
-        # and at the remaining instants the whole tile.
+        # half of it at two that remain, and at the last instant the whole tile.
         in_tile = index % 64
         block = index // 64
         instant = block % view.instant_count
@@ -136,6 +143,10 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                 quarter = instant % 4
                 instant += in_tile // 16 - quarter
                 in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
+            elif instant < view.instant_count // 2 * 2:
+                half = instant % 2
+                instant += (in_tile // 16) % 2 - half
+                in_tile = 32 * half + 4 * (in_tile // 32) + 8 * ((in_tile % 16) // 4) + in_tile % 4
         place = locate_tile(tile, instant, view, worlds)
         if wp.static(terms.world_scenes):
             scene = worlds.scenes[worlds.scene[place.world]]

@@ -42,6 +42,8 @@ class RenderTerms(NamedTuple):
     """With `candidate_group`: a thread renders a tile and resolves all of its pixels, on a CPU."""
     timed: bool = False
     """Each ray has an instant of its own (`ray_times`); rays traverse the tree."""
+    quads: bool = False
+    """Four threads side by side cast the rays of a pixel, a multiple of four, on CUDA (`raycast_quads`)."""
 
 
 def with_candidate_lists(

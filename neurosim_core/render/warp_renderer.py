@@ -287,6 +287,7 @@ class WarpRenderer:
             world_lenses=len(worlds.lenses) > 1,
             supersampled=len(rays) > 1,
             timed=self._times is not None,
+            quads=wp.get_device(arrays.device).is_cuda and len(rays) % 4 == 1 and len(rays) > 1,
         )
         shared = None
         if not (

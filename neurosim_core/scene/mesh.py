@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -121,8 +122,16 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         )
     _check_extent(boxes - origin, path)
 
-    arrays = _assembled(parts, source, notes, path)
-    triangles = arrays["vertices"].take(arrays["faces"], axis=0).astype(np.float64)
+    positions, faces, keep = _joined(parts, notes, path)
+    triangles = positions.take(faces, axis=0)
+    with ThreadPoolExecutor(max_workers=1) as aside:
+        shift_m, told = np.array(config.position_m) - origin, list[str]()
+        lighting = aside.submit(
+            lights_of, source, config.light_scale, triangles, told, turn=turn, shift_m=shift_m, path=path
+        )
+        arrays = _assembled(parts, positions, faces, keep, source, notes)
+        lights = lighting.result()
+    notes += told
     low, high = extent(triangles)
     size = high - low
     if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
@@ -130,15 +139,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")
     scene = Scene(
         name=path.stem,
-        lights=lights_of(
-            source,
-            config.light_scale,
-            triangles,
-            notes,
-            turn=turn,
-            shift_m=np.array(config.position_m) - origin,
-            path=path,
-        ),
+        lights=lights,
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
         instance_names=tuple(source.instance_names),
         instance_labels=source.instance_labels,
@@ -327,25 +328,35 @@ def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.einsum("fx,fx->f", cross, cross) <= (1e-7 * longest_squared) ** 2)
 
 
-def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], path: Path) -> dict[str, Any]:
-    """Join parts into the arrays of a scene, without degenerate faces and unused vertices."""
+def _joined(
+    parts: list[dict[str, Any]], notes: list[str], path: Path
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the vertices of all parts as a scene rounds them, faces that have an area, and which have."""
     start = np.cumsum([0, *(len(part["positions"]) for part in parts)])
     positions = np.concatenate([part["positions"] for part in parts]).astype(np.float32).astype(np.float64)
     faces = np.concatenate([part["faces"] + first for part, first in zip(parts, start, strict=False)])
-    count = [len(part["faces"]) for part in parts]
-    material = np.repeat([part["material"] for part in parts], count)
-    instance = np.repeat([part["instance"] for part in parts], count)
-    owner = np.repeat(np.arange(len(parts)), np.diff(start))
-
     # in the file's numbers, where a line is still exactly one, and as the scene stores them
     thin = np.concatenate([part["thin"] for part in parts]) | _is_thin(positions.take(faces, axis=0))
     if thin.any():
         notes.append(f"{int(thin.sum())} of {len(faces)} faces have no area and are dropped.")
     if thin.all():
         raise SceneError(f"{path}: empty, none of its {len(faces)} faces has an area")
-    keep = ~thin
-    faces, material, instance = faces[keep], material[keep], instance[keep]
+    return positions, faces[~thin], ~thin
 
+
+def _assembled(
+    parts: list[dict[str, Any]],
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    keep: NDArray[np.bool_],
+    source: Source,
+    notes: list[str],
+) -> dict[str, Any]:
+    """Join parts into the arrays of a scene, without unused vertices; see `_joined`."""
+    count = [len(part["faces"]) for part in parts]
+    material = np.repeat([part["material"] for part in parts], count)[keep]
+    instance = np.repeat([part["instance"] for part in parts], count)[keep]
+    owner = np.repeat(np.arange(len(parts)), [len(part["positions"]) for part in parts])
     uv = np.concatenate([np.zeros((len(p["positions"]), 2)) if p["uv"] is None else p["uv"] for p in parts])
     used_uv = uv[faces.reshape(-1)]
     if not np.isfinite(used_uv).all():

@@ -24,7 +24,7 @@ def train(folder: Path, model: ns.Model, *, stops: tuple[tuple[int, int], ...] =
     config = TrainConfig(
         task="hover",
         device=ranks.join("cpu"),
-        teacher=PpoConfig(worlds=4, iterations=2, horizon=6, epochs=2, minibatches=2),
+        teacher=PpoConfig(worlds=4, iterations=2, horizon=6, epochs=2, minibatches=2, divergence=1e-9),
         student=DaggerConfig(worlds=4, iterations=2, horizon=6),
         pixels=8,
         block=1,

@@ -69,7 +69,7 @@ def small(**changes) -> TrainConfig:
         task="brief-hover",
         device="cpu",
         seed=2,
-        teacher=PpoConfig(worlds=4, iterations=4, horizon=6, epochs=2, minibatches=2),
+        teacher=PpoConfig(worlds=4, iterations=4, horizon=6, epochs=2, minibatches=2, divergence=1e-9),
         **{"student": DaggerConfig(worlds=4, iterations=4, horizon=6), "block": 2, **changes},
     )
 
@@ -144,6 +144,9 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     ns.load_config(pilot_settings(pilot.card))
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
+    export_onnx(policy, {**card, "mode": "velocity"}, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match="commands velocity, and only thrust and body rates are flown"):
+        Pilot(tmp_path / "other.onnx")
     shape = {**policy.shape, "vector_size": 17}
     export_onnx(EventPolicy(**shape), {**card, "task": "avoid"}, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="trained for 'avoid', and needs more than events"):
@@ -187,6 +190,17 @@ def test_ppo_learns_to_stop(hall):
     after = evaluate_policy(env, teacher_actor(ppo.policy, env))
     assert np.mean(rewards[-3:]) > np.mean(rewards[2:6]) + 0.2
     assert after.metrics["speed_m_s"] < before.metrics["speed_m_s"]
+
+
+@pytest.mark.parametrize(("divergence", "factor"), [(0.0, 1.0), (1e-9, 1.2**-3), (1e3, 1.2**3)])
+def test_the_learning_rate_follows_how_much_a_policy_changes(hall, divergence, factor):
+    config = PpoConfig(worlds=8, horizon=6, epochs=2, minibatches=2, divergence=divergence)
+    env = ns.learn.make_env("hover", worlds=config.worlds, device="cpu", observe=["state"], models=[hall])
+    ppo = Ppo(env, config, torch.Generator().manual_seed(0))
+    for _ in range(3):
+        ppo.iterate(0.0)
+    assert ppo.descent.rate_factor == pytest.approx(factor)
+    assert ppo.descent.optimizer.param_groups[0]["lr"] == pytest.approx(1.5e-3 * factor ** (2 / 3))
 
 
 class Recall:

@@ -24,6 +24,8 @@ _RANGES_M = (0.8, 1.6, 2.8, 4.5)
 _BEARINGS_RAD = tuple(math.radians(angle) for angle in (-70, -45, -25, -10, 0, 10, 25, 45, 70))
 _FAR_M = 2.0
 """Obstacles that are farther than this from a point leave it free."""
+_NEAR_M = 0.6
+"""Distances to the scene below this cost something."""
 _SHARE = 0.75
 """Of the speed that is asked for, in the mean and towards the goal, to succeed."""
 
@@ -47,8 +49,8 @@ class Avoid(Task):
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03), "rpy_rad": (0.0, -0.2, 0.0)}
     surface = LeakySurface(tau_s=(0.02, 0.06, 0.3))
     probes = tuple((r * math.cos(b), r * math.sin(b), 0.0) for r in _RANGES_M for b in _BEARINGS_RAD)
-    teacher: Mapping[str, Any] = {"worlds": 2048, "iterations": 300, "reward_scale": 0.1}
-    student: Mapping[str, Any] = {"disturbance": 0.1}
+    teacher: Mapping[str, Any] = {"worlds": 2048, "iterations": 500, "reward_scale": 0.1, "divergence": 0.016}
+    student: Mapping[str, Any] = {"iterations": 200, "disturbance": 0.1}
     hint = "room"
     mirror: Mapping[str, Sequence[float]] = {
         "proprioception": (
@@ -104,7 +106,7 @@ class Avoid(Task):
         goal = view.goal_B / view.goal_B.norm(dim=1, keepdim=True).clamp(min=1e-3)
         ahead = (view.velocity_B * goal).sum(1) / self._speed
         excess = (view.velocity.norm(dim=1) / self._speed - 1.0).clamp(min=0.0)
-        near = (0.6 - view.clearance[:, 0]).clamp(min=0.0)
+        near = (_NEAR_M - view.clearance[:, 0]).clamp(min=0.0)
         above = (view.goal_B * view.gravity_B).sum(1)
         change = (view.action - view.last_action).norm(dim=1)
         cost = excess + 2.0 * near + goal[:, 1].square() + 0.3 * above.abs()

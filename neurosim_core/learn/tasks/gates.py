@@ -45,7 +45,7 @@ class Gates(Task):
     camera: Mapping[str, Any] = {"width": 48, "height": 48, "horizontal_fov_rad": 1.6}
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03), "rpy_rad": (0.0, -0.3, 0.0)}
     surface = TimeSurface(tau_s=(0.01, 0.03, 0.1))
-    teacher: Mapping[str, Any] = {"worlds": 512, "iterations": 250, "reward_scale": 0.1}
+    teacher: Mapping[str, Any] = {"worlds": 512, "iterations": 250, "reward_scale": 0.1, "divergence": 0.016}
     student: Mapping[str, Any] = {"iterations": 120, "disturbance": 0.1, "hint_weight": 0.2}
     hint = "next_gate"
     mirror: Mapping[str, Sequence[float]] = {
