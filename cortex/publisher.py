@@ -203,7 +203,7 @@ class Publisher(Generic[T]):
     def _acquire_loan(
         self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
     ) -> Loan | None:
-        size = self.codec.draft_size(dims, dtypes)
+        size = self.codec.drafter.size(dims, dtypes)
         slot = None
         if size <= self._inline_max:
             buffer = np.empty(size, np.uint8)
@@ -216,7 +216,7 @@ class Publisher(Generic[T]):
                     return None
                 buffer = self._memory(slot, size)
         self._check_open()
-        draft = self.codec.draft(buffer, dims=dims, dtypes=dtypes)
+        draft = self.codec.drafter.draft(buffer, dims, dtypes)
         if slot is not None:
             slot.on_forgotten = self._warn_of_forgotten_loan
         return Loan(draft, buffer, slot, self._publish_loan)
@@ -229,13 +229,13 @@ class Publisher(Generic[T]):
     def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
         """Send a message that was written on loan; returns and raises as `Loan.publish`."""
         if message is not None:
-            in_place = slot is not None and self.codec.drafts_by_tail
+            in_place = slot is not None and self.codec.drafter.is_by_tail
             sent = self._send_loaned(message, slot) if in_place else None
             if sent is None:
                 sent = self.publish(message)
-            self.codec.seal(draft)
+            self.codec.drafter.seal(draft)
             return sent
-        size = self.codec.finish(draft)
+        size = self.codec.drafter.finish(draft)
         stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
