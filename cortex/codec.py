@@ -140,18 +140,6 @@ class Codec:
         """Whether all arrays of a message lie behind its block, which is cleared before they are copied."""
         return not self._drafter.has_fixed_arrays
 
-    def fill(self, draft: Draft, message: Any) -> None:
-        """Set every field of a draft as in a message.
-
-        Args:
-            draft: What arrays of the message lie in it already are not copied.
-            message: Of the codec's type.
-
-        Raises:
-            ValueError: An array does not fit.
-        """
-        self._drafter.fill(draft, message)
-
     def seal(self, draft: Draft) -> None:
         """Make the views of a draft read-only: it is sent as it is."""
         self._drafter.seal(draft)

@@ -123,14 +123,6 @@ class Drafter:
         """Whether arrays of the type, or of a message within it, lie in a block and not behind it."""
         return any(_is_in_block(field.type) for field in self._schema.fields)
 
-    def fill(self, draft: Draft, message: Any) -> None:
-        """Set every field as in a message; what lies in its place already is not copied."""
-        views = draft._Draft__views
-        for name in self._names:
-            value = getattr(message, name)
-            if name not in views or not _is_same(views[name], value):
-                setattr(draft, name, value)
-
     def seal(self, draft: Draft) -> None:
         """Let nobody write to the views of a draft any more."""
         for view in draft._Draft__views.values():
@@ -224,14 +216,6 @@ def _is_in_block(kind: FieldType) -> bool:
     if isinstance(kind, OptionalType | ListType):
         return _is_in_block(kind.item)
     return isinstance(kind, ArrayType) and kind.is_fixed
-
-
-def _is_same(view: NDArray[Any], value: Any) -> bool:
-    """Return whether an array is the same memory, seen in the same way."""
-    return isinstance(value, np.ndarray) and all(
-        view.__array_interface__[key] == value.__array_interface__[key]
-        for key in ("data", "shape", "strides", "typestr")
-    )
 
 
 def _reserve(writer: Writer, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
