@@ -371,7 +371,7 @@ def test_a_task_that_lacks_what_training_needs_says_so(tmp_path, hall):
         Training(tmp_path, dataclasses.replace(small(), task="hover-paper"), models=[hall])
     env = ns.learn.make_env("hover", worlds=2, device="cpu", observe=["state"], models=[hall])
     seen, _ = env.reset()
-    with pytest.raises(ValueError, match=r"no group of observations 'pilot', .* actor, critic, teacher, stud"):
+    with pytest.raises(ValueError, match=r"no group of observations 'pilot', .* actor, critic, teacher, st"):
         env.group(seen, "pilot")
 
 
