@@ -205,7 +205,7 @@ class Publisher(Generic[T]):
     def _acquire_loan(
         self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
     ) -> Loan | None:
-        size = self.codec.draft_size(dims, dtypes)
+        size = self.codec.drafter.size(dims, dtypes)
         slot = None
         if size <= self._inline_max:
             buffer = np.empty(size, np.uint8)
@@ -219,7 +219,7 @@ class Publisher(Generic[T]):
                     return None
                 buffer = self._memory(slot, size)
         self._check_open()
-        draft = self.codec.draft(buffer, dims=dims, dtypes=dtypes)
+        draft = self.codec.drafter.draft(buffer, dims, dtypes)
         if slot is not None:
             slot.on_forgotten = self._warn_of_forgotten_loan
         return Loan(draft, buffer, slot, self._publish_loan)
@@ -231,12 +231,15 @@ class Publisher(Generic[T]):
 
     def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
         """Send a message that was written on loan; returns and raises as `Loan.publish`."""
-        if message is not None and slot is not None and self.codec.drafts_by_tail:
-            sent = self._send_loaned(message, slot)
-            if sent is not None:
-                self.codec.seal(draft)
-                return sent
-        size, stamp_ns = self._finish_draft(draft, message)
+        if message is not None:
+            in_place = slot is not None and self.codec.drafter.is_by_tail
+            sent = self._send_loaned(message, slot) if in_place else None
+            if sent is None:
+                sent = self.publish(message)
+            self.codec.drafter.seal(draft)
+            return sent
+        size = self.codec.drafter.finish(draft)
+        stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
             self._prepare(now_ns)
@@ -257,15 +260,6 @@ class Publisher(Generic[T]):
             if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
             return self._fast_send.send_slot(message, slot)
-
-    def _finish_draft(self, draft: Any, message: Any) -> tuple[int, int]:
-        """Write what is not in its place yet; the size of the body, and its stamp [ns]."""
-        if message is not None:
-            if type(message) is not self._type:
-                raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
-            self.codec.fill(draft, message)
-        size = self.codec.finish(draft)
-        return size, 0 if self._stamp_of is None else int(draft.stamp_ns)
 
     def _send_written(
         self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int, waited_s: float = 0.0
