@@ -273,19 +273,23 @@ def train_dense(
     _log.info("waiting for the first windows")
     with _source(pool, config, data, live, worlds, ray) as more:
         fit = _fit(net.to(config.device), pool, config, more)
+    folder.mkdir(parents=True, exist_ok=True)
+    card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
+    weights = {name: value.cpu() for name, value in net.state_dict().items()}
+    torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
     constant = head.constant(pool.targets()).cpu()[None]
+
+    def predict_mean(voxel: Tensor, _memory: Any) -> tuple[Tensor, Any]:
+        return torch.nn.functional.interpolate(constant, voxel.shape[-2:]), None
+
     _log.info("testing in scenes that were not trained in" if test is None else f"testing on {test}")
     tested = [*held_out_windows(config, test)]
     net.eval()
     errors = {
         "network": evaluate(net, tested, head, config.device),
         "events zeroed": evaluate(lambda v, m: net(torch.zeros_like(v), m), tested, head, config.device),
-        "mean of each pixel": evaluate(lambda _voxel, _memory: (constant, None), tested, head),
+        "mean of each pixel": evaluate(predict_mean, tested, head),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
-    weights = {name: value.cpu() for name, value in net.state_dict().items()}
-    torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
     told = {
         "config": asdict(config),
         "steps": fit.steps,
