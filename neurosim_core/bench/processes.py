@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from cortex.places import NETWORK_VARIABLES
 from neurosim_core.bench.engine import SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
@@ -33,15 +34,13 @@ def own_runtime() -> Iterator[Path]:
     """
     parent = tempfile.gettempdir()
     folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
-    before = os.environ.get(_RUNTIME)
+    before = {name: os.environ.pop(name, None) for name in (_RUNTIME, *NETWORK_VARIABLES)}
     os.environ[_RUNTIME] = str(folder / "cortex")
     try:
         yield folder
     finally:
-        if before is None:
-            del os.environ[_RUNTIME]
-        else:
-            os.environ[_RUNTIME] = before
+        del os.environ[_RUNTIME]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
         shutil.rmtree(folder, ignore_errors=True)
 
 
