@@ -12,10 +12,11 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from cortex.places import NETWORK_VARIABLES
 from neurosim_core.bench.engine import SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
+_VARIABLES = (_RUNTIME, "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
+"""What says where nodes meet."""
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
 _STOP_S = 5.0
@@ -34,7 +35,7 @@ def own_runtime() -> Iterator[Path]:
     """
     parent = tempfile.gettempdir()
     folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
-    before = {name: os.environ.pop(name, None) for name in (_RUNTIME, *NETWORK_VARIABLES)}
+    before = {name: os.environ.pop(name, None) for name in _VARIABLES}
     os.environ[_RUNTIME] = str(folder / "cortex")
     try:
         yield folder
