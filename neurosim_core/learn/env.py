@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 import warp as wp
@@ -30,6 +30,8 @@ from neurosim_core.sim.observation import Observation
 from neurosim_core.sim.scene_table import SceneSource
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
+
+_T = TypeVar("_T")
 
 CAMERA = "front"
 """Name of the event camera."""
@@ -204,9 +206,22 @@ class Env:
         return {"kind": type(config).__name__, **dataclasses.asdict(config)}
 
     def group(self, observations: Observations, name: str) -> torch.Tensor:
-        """Return the observations of a group that are vectors, in one tensor [N, n]."""
-        parts = [observations[key] for key in self.obs_groups[name]]
+        """Return the observations of a group that are vectors, in one tensor [N, n].
+
+        Raises:
+            ValueError: The task has no such group, or an observation of it was not asked for.
+        """
+        names = _named(self.obs_groups, name, "group of observations")
+        parts = [_named(observations, key, "observation") for key in names]
         return torch.cat([part for part in parts if part.ndim == 2], dim=1)
+
+    def hint(self, observations: Observations) -> torch.Tensor:
+        """Return what students estimate besides (`Task.hint`), [N, n].
+
+        Raises:
+            ValueError: The task does not observe it.
+        """
+        return _named(observations, self.task.hint, "observation")
 
     def reset(self, *, seed: int | None = None, spread: bool = False) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode in all worlds.
@@ -380,6 +395,12 @@ class Env:
         if self.view.surface is not None:
             seen.setdefault("events", self.view.surface)
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
+
+
+def _named(found: Mapping[str, _T], name: str, what: str) -> _T:
+    if name not in found:
+        raise ValueError(f"the task has no {what} {name!r}, which is needed here; it has {', '.join(found)}")
+    return found[name]
 
 
 make_env = Env
