@@ -230,7 +230,11 @@ def test_a_network_is_tested_at_another_size_and_kept_if_that_fails(tmp_path, fl
     errors = train_dense(tmp_path / "run", config, data=flights, test=tmp_path / "wide.h5")
     assert 0.0 < errors["mean of each pixel"].abs_rel < 1.0
     with pytest.raises(FileNotFoundError):
-        train_dense(tmp_path / "kept", config, data=flights, test=tmp_path / "nothing.h5")
+        train_dense(tmp_path / "none", config, data=flights, test=tmp_path / "nothing.h5")
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "events.csv").write_text("t,x,y,p\n0,0,0,1\n900000,15,15,1\n")
+    with pytest.raises(ValueError, match="has no sensor for depth"):
+        train_dense(tmp_path / "kept", config, data=flights, test=tmp_path / "events.csv")
     load_dense(tmp_path / "kept" / "depth.pt")
 
 
