@@ -123,6 +123,7 @@ class Publisher(Generic[T]):
             now_ns = monotonic_ns()
             if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
+            self._back_pressure.begin()
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._fanout.readers and not self.latch:
@@ -144,9 +145,10 @@ class Publisher(Generic[T]):
             with self._lock:
                 slot = self._acquire(prepared.size, now_ns, may_wait=True)
                 buffer = self._memory(slot, prepared.size)
+                waited_s = self._back_pressure.waited_s
             prepared.write(buffer)
             with self._lock:
-                return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns)
+                return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns, waited_s)
 
     def _acquire(self, size: int, now_ns: int, *, may_wait: bool = False) -> Any:
         """A slot for a large message; None if there is none. The lock is held."""
@@ -211,6 +213,7 @@ class Publisher(Generic[T]):
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
+                self._back_pressure.begin()
                 slot = self._acquire(size, now_ns, may_wait=may_wait)
                 if slot is None and self._fanout.ring.has_slots(size):
                     return None
@@ -240,6 +243,7 @@ class Publisher(Generic[T]):
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
             self._prepare(now_ns)
+            self._back_pressure.begin()
             if size <= self._inline_max:
                 return self._publish_inline(buffer[:size].tobytes(), stamp_ns, now_ns)
             if slot is None or not slot.is_current:  # its ring was replaced by one of larger slots
@@ -247,7 +251,7 @@ class Publisher(Generic[T]):
                 if slot is not None or replaced is not None:  # else it stays where it is
                     written, buffer = buffer, self._memory(slot, size)
                     buffer[:size] = written[:size]
-            return self._send_written(buffer, slot, size, stamp_ns, now_ns)
+            return self._send_written(buffer, slot, size, stamp_ns, now_ns, self._back_pressure.waited_s)
 
     def _send_loaned(self, message: Any, slot: Any) -> bool | None:
         """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
@@ -257,11 +261,17 @@ class Publisher(Generic[T]):
                 self._prepare(now_ns)
             return self._fast_send.send_slot(message, slot)
 
-    def _send_written(self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
-        """Send a large message that lies in a slot, or in memory of its own; both locks are held."""
+    def _send_written(
+        self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int, waited_s: float = 0.0
+    ) -> bool:
+        """Send a large message that lies in a slot, or in memory of its own; both locks are held.
+
+        It was held up for `waited_s` before.
+        """
         if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
+        self._back_pressure.waited_s = waited_s
         body = buffer[:size]
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current
