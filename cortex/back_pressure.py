@@ -28,6 +28,9 @@ class BackPressure:
         """Nobody is waited for after this, on the monotonic clock [s]; set by any thread, without lock."""
         self.is_waiting = False
         """Whether a thread is held up: others wait until its message is sent."""
+        self.waited_s = 0.0
+        """For how long the message that is sent now was held up so far, by whomever [s]."""
+        self._sequence = -1
 
     def __enter__(self) -> None:
         self.is_waiting = True
@@ -37,6 +40,16 @@ class BackPressure:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.is_waiting = False
+
+    def begin(self, sequence: int = -1) -> None:
+        """Let the next message be held up anew.
+
+        Args:
+            sequence: Of the message, where this is called more than once for it.
+        """
+        if sequence < 0 or sequence != self._sequence:
+            self.waited_s = 0.0
+        self._sequence = sequence
 
     def is_over(self) -> bool:
         """Whether nobody is waited for any more."""
@@ -58,10 +71,13 @@ class BackPressure:
         return more and not self.is_over()
 
     def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Call a function until it returns true, for so long at most [s]; whether it did."""
-        backoff = Backoff(timeout_s)
+        """Call a function until it returns true; False if the message was held up for so long [s]."""
+        begin_s, before_s = time.monotonic(), self.waited_s
+        backoff = Backoff(timeout_s - before_s)
         with self:
             while not condition():
-                if not self.sleep(backoff):
+                more = self.sleep(backoff)
+                self.waited_s = before_s + time.monotonic() - begin_s
+                if not more:
                     return False
         return True

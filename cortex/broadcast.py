@@ -309,15 +309,14 @@ class Broadcast:
 
     def _wait(self, attempt: Callable[[], bool], size: int) -> None:
         """Attempt something until it works, or nobody is in its way; give up readers whose time is over."""
-        begin_s = time.monotonic()
         while not attempt():
             patience_ms = self._ring.patience(size)
             if patience_ms < 0:
                 attempt()
                 return
-            if self._await_room(attempt, patience_ms / 1000.0 - (time.monotonic() - begin_s)):
+            if self._await_room(attempt, patience_ms / 1000.0):
                 return
-            waited_ms = int((time.monotonic() - begin_s) * 1000.0)
+            waited_ms = int(self._back_pressure.waited_s * 1000.0)
             self._ring.give_up(size, 2**32 if self._back_pressure.is_over() else waited_ms)
 
     def offer(self, frame: bytes) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex.body import Body, MalformedMessage
-from cortex.draft import Draft, Drafter
+from cortex.draft import Drafter
 from cortex.layout import has_tail
 from cortex.native import make_coder
 from cortex.schema import schema_of
@@ -84,7 +83,8 @@ class Codec:
         if self._coder is not None:
             self.encode = _encode_natively(self._coder.encode, self._encode)
             self.decode = _decode_natively(self._coder.decode, self.decode)
-        self._drafter = Drafter(self.schema, message_type, self._body)
+        self.drafter = Drafter(self.schema, message_type, self._body)
+        """Makes messages that are written in place."""
 
     def prepare(self, message: Any, limit: int) -> bytes | Plan:
         """Return the body of a message, or its plan if it would be larger than `limit` bytes.
@@ -105,65 +105,6 @@ class Codec:
     def _encode(self, message: Any, limit: int) -> bytes | None:
         plan = Plan(self._body, message)
         return None if plan.size > limit else plan.to_bytes()
-
-    def draft_size(
-        self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
-    ) -> int:
-        """Return how much memory `draft` needs [bytes]: what is known of the body, and 4 KiB for the rest.
-
-        Args:
-            dims: Sizes of named dimensions.
-            dtypes: For arrays of open dtype, the dtype by field name.
-
-        Raises:
-            ValueError: The type has no such dimension or array, or a size is out of range.
-        """
-        return self._drafter.size(dims, dtypes)
-
-    def draft(
-        self,
-        buffer: NDArray[np.uint8],
-        dims: Mapping[str, int] | None = None,
-        dtypes: Mapping[str, Any] | None = None,
-    ) -> Draft:
-        """Begin a message in writable memory; arrays whose size is known become views of it.
-
-        Args:
-            buffer: At least `draft_size` bytes; a larger one leaves more room for the other fields.
-            dims: As for `draft_size`.
-            dtypes: As for `draft_size`.
-        """
-        return self._drafter.draft(buffer, dims, dtypes)
-
-    @cached_property
-    def drafts_by_tail(self) -> bool:
-        """Whether all arrays of a message lie behind its block, which is cleared before they are copied."""
-        return not self._drafter.has_fixed_arrays
-
-    def fill(self, draft: Draft, message: Any) -> None:
-        """Set every field of a draft as in a message.
-
-        Args:
-            draft: What arrays of the message lie in it already are not copied.
-            message: Of the codec's type.
-
-        Raises:
-            ValueError: An array does not fit.
-        """
-        self._drafter.fill(draft, message)
-
-    def seal(self, draft: Draft) -> None:
-        """Make the views of a draft read-only: it is sent as it is."""
-        self._drafter.seal(draft)
-
-    def finish(self, draft: Draft) -> int:
-        """Complete a draft in its buffer and return the size of the body [bytes]. Its views become read-only.
-
-        Raises:
-            ValueError: A field without default is not set, or the fields that are no views do not fit.
-            TypeError: As `encode` does.
-        """
-        return self._drafter.finish(draft)
 
 
 def _encode_natively(

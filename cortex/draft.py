@@ -80,17 +80,30 @@ class Drafter:
         self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
         self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
         self._defaults = {field.name: field for field in dataclasses.fields(cls)}
+        self.is_by_tail = not any(_is_in_block(field.type) for field in schema.fields)
+        """Whether all arrays of a message lie behind its block, which is cleared before they are copied."""
         self._placed: dict[tuple[Any, ...], tuple[dict[str, _Place], int]] = {}
 
-    def size(self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None) -> int:
-        """Return how much memory a draft needs [bytes]."""
+    def size(self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None) -> int:
+        """Return how much memory a draft needs [bytes]: what is known of the body, and 4 KiB for the rest.
+
+        Args:
+            dims: Sizes of named dimensions.
+            dtypes: For arrays of open dtype, the dtype by field name.
+
+        Raises:
+            ValueError: The type has no such dimension or array, or a size is out of range.
+        """
         _, end = self._places_of(dims, dtypes)
         return end + RESERVE_BYTES
 
     def draft(
-        self, buffer: NDArray[np.uint8], dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
+        self,
+        buffer: NDArray[np.uint8],
+        dims: Mapping[str, int] | None = None,
+        dtypes: Mapping[str, Any] | None = None,
     ) -> Draft:
-        """Return a draft in writable memory."""
+        """Return a draft in memory of at least `size` bytes; arrays whose size is known are views of it."""
         places, end = self._places_of(dims, dtypes)
         if end > len(buffer):
             raise ValueError(f"{self._schema.name}: draft of {end} bytes, the buffer has {len(buffer)}")
@@ -104,7 +117,12 @@ class Drafter:
         return draft
 
     def finish(self, draft: Draft) -> int:
-        """Write what is not yet in its place and return the size of the body; the views become read-only."""
+        """Write what is not yet in its place and return the size of the body; the views become read-only.
+
+        Raises:
+            ValueError: A field without default is not set, or the fields that are no views do not fit.
+            TypeError: As `Codec.encode` does.
+        """
         buffer, places = draft._Draft__buffer, draft._Draft__places
         self._set_defaults(draft)
         end = self._write(draft, None)
@@ -117,19 +135,6 @@ class Drafter:
         self._write(draft, buffer)
         self.seal(draft)
         return end
-
-    @property
-    def has_fixed_arrays(self) -> bool:
-        """Whether arrays of the type, or of a message within it, lie in a block and not behind it."""
-        return any(_is_in_block(field.type) for field in self._schema.fields)
-
-    def fill(self, draft: Draft, message: Any) -> None:
-        """Set every field as in a message; what lies in its place already is not copied."""
-        views = draft._Draft__views
-        for name in self._names:
-            value = getattr(message, name)
-            if name not in views or not _is_same(views[name], value):
-                setattr(draft, name, value)
 
     def seal(self, draft: Draft) -> None:
         """Let nobody write to the views of a draft any more."""
@@ -224,14 +229,6 @@ def _is_in_block(kind: FieldType) -> bool:
     if isinstance(kind, OptionalType | ListType):
         return _is_in_block(kind.item)
     return isinstance(kind, ArrayType) and kind.is_fixed
-
-
-def _is_same(view: NDArray[Any], value: Any) -> bool:
-    """Return whether an array is the same memory, seen in the same way."""
-    return isinstance(value, np.ndarray) and all(
-        view.__array_interface__[key] == value.__array_interface__[key]
-        for key in ("data", "shape", "strides", "typestr")
-    )
 
 
 def _reserve(writer: Writer, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:

@@ -258,6 +258,7 @@ class Fanout:
 
     def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
         """Send what one of the fast path's `sends` refused, waiting; False if a reliable reader lost it."""
+        self._back_pressure.begin(self._fast_send.sequence)
         retry = self._retries.get(send)  # None: it has left since
         on_time = retry is None or retry(frame)
         if not on_time:

@@ -44,8 +44,7 @@ class Loan:
 
         Args:
             message: What to send in place of the draft, in half the time: one whose arrays are those of the
-                draft, where they are. Others are copied, if they fit. One that begins where that of the draft
-                does and has other dimensions is sent as it is, or raises a `ValueError`: do not rely on it.
+                draft, where they are. Any other is copied, as by `Publisher.publish`.
 
         Returns:
             As `Publisher.publish`.

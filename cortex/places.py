@@ -21,6 +21,10 @@ from cortex.security import Authenticator, Keys, apply_client, apply_server, che
 Secure = Callable[[zmq.Socket[bytes]], None]
 
 
+NETWORK_VARIABLES = ("CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
+"""What the environment may say of other hosts."""
+
+
 class Network(NamedTuple):
     """How a node meets those of other hosts."""
 

@@ -123,9 +123,12 @@ class Publisher(Generic[T]):
             now_ns = monotonic_ns()
             if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
+            self._back_pressure.begin()
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._fanout.readers and not self.latch:
+                if not self._fast_send.sequence:  # who has no subscriber yet hears of a mistake, too
+                    self.codec.prepare(message, -1)
                 self._fast_send.sequence += 1
                 return True
             prepared: Any = self.codec.prepare(message, self._inline_max)
@@ -142,9 +145,10 @@ class Publisher(Generic[T]):
             with self._lock:
                 slot = self._acquire(prepared.size, now_ns, may_wait=True)
                 buffer = self._memory(slot, prepared.size)
+                waited_s = self._back_pressure.waited_s
             prepared.write(buffer)
             with self._lock:
-                return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns)
+                return self._send_written(buffer, slot, prepared.size, stamp_ns, now_ns, waited_s)
 
     def _acquire(self, size: int, now_ns: int, *, may_wait: bool = False) -> Any:
         """A slot for a large message; None if there is none. The lock is held."""
@@ -201,7 +205,7 @@ class Publisher(Generic[T]):
     def _acquire_loan(
         self, dtypes: Mapping[str, Any] | None, dims: Mapping[str, int], *, may_wait: bool
     ) -> Loan | None:
-        size = self.codec.draft_size(dims, dtypes)
+        size = self.codec.drafter.size(dims, dtypes)
         slot = None
         if size <= self._inline_max:
             buffer = np.empty(size, np.uint8)
@@ -209,12 +213,13 @@ class Publisher(Generic[T]):
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
+                self._back_pressure.begin()
                 slot = self._acquire(size, now_ns, may_wait=may_wait)
                 if slot is None and self._fanout.ring.has_slots(size):
                     return None
                 buffer = self._memory(slot, size)
         self._check_open()
-        draft = self.codec.draft(buffer, dims=dims, dtypes=dtypes)
+        draft = self.codec.drafter.draft(buffer, dims, dtypes)
         if slot is not None:
             slot.on_forgotten = self._warn_of_forgotten_loan
         return Loan(draft, buffer, slot, self._publish_loan)
@@ -226,15 +231,19 @@ class Publisher(Generic[T]):
 
     def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
         """Send a message that was written on loan; returns and raises as `Loan.publish`."""
-        if message is not None and slot is not None and self.codec.drafts_by_tail:
-            sent = self._send_loaned(message, slot)
-            if sent is not None:
-                self.codec.seal(draft)
-                return sent
-        size, stamp_ns = self._finish_draft(draft, message)
+        if message is not None:
+            in_place = slot is not None and self.codec.drafter.is_by_tail
+            sent = self._send_loaned(message, slot) if in_place else None
+            if sent is None:
+                sent = self.publish(message)
+            self.codec.drafter.seal(draft)
+            return sent
+        size = self.codec.drafter.finish(draft)
+        stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
             self._prepare(now_ns)
+            self._back_pressure.begin()
             if size <= self._inline_max:
                 return self._publish_inline(buffer[:size].tobytes(), stamp_ns, now_ns)
             if slot is None or not slot.is_current:  # its ring was replaced by one of larger slots
@@ -242,7 +251,7 @@ class Publisher(Generic[T]):
                 if slot is not None or replaced is not None:  # else it stays where it is
                     written, buffer = buffer, self._memory(slot, size)
                     buffer[:size] = written[:size]
-            return self._send_written(buffer, slot, size, stamp_ns, now_ns)
+            return self._send_written(buffer, slot, size, stamp_ns, now_ns, self._back_pressure.waited_s)
 
     def _send_loaned(self, message: Any, slot: Any) -> bool | None:
         """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
@@ -252,20 +261,17 @@ class Publisher(Generic[T]):
                 self._prepare(now_ns)
             return self._fast_send.send_slot(message, slot)
 
-    def _finish_draft(self, draft: Any, message: Any) -> tuple[int, int]:
-        """Write what is not in its place yet; the size of the body, and its stamp [ns]."""
-        if message is not None:
-            if type(message) is not self._type:
-                raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
-            self.codec.fill(draft, message)
-        size = self.codec.finish(draft)
-        return size, 0 if self._stamp_of is None else int(draft.stamp_ns)
+    def _send_written(
+        self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int, waited_s: float = 0.0
+    ) -> bool:
+        """Send a large message that lies in a slot, or in memory of its own; both locks are held.
 
-    def _send_written(self, buffer: np.ndarray, slot: Any, size: int, stamp_ns: int, now_ns: int) -> bool:
-        """Send a large message that lies in a slot, or in memory of its own; both locks are held."""
+        It was held up for `waited_s` before.
+        """
         if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
+        self._back_pressure.waited_s = waited_s
         body = buffer[:size]
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
@@ -48,9 +47,8 @@ class RawCodec:
             raise ValueError(f"a body has at most {BODY_LIMIT} bytes, got {size}")
         return bytes(message.body) if size <= limit else RawPlan(message.body, size)
 
-    def draft_size(
-        self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
-    ) -> NoReturn:
+    @property
+    def drafter(self) -> NoReturn:
         """Refuse: there are no fields to fill."""
         raise TypeError("a raw publisher has nothing to loan")
 

@@ -19,6 +19,7 @@ from cortex.bench.measure import CaseResult, Settings, run_case
 from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
 from cortex.bench.report import print_case, print_header, print_summary, write_csv
+from cortex.places import NETWORK_VARIABLES
 
 _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
@@ -93,6 +94,8 @@ def _make_place(stack: ExitStack, checkout: Path | None) -> None:
     short = parent if len(parent) <= _PARENT_MAX else "/tmp"
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cxb", dir=short))
     os.environ["CORTEX_BENCH_DIR"] = folder
+    for name in NETWORK_VARIABLES:
+        os.environ.pop(name, None)
     for name in ("", str(checkout.resolve())) if checkout else ("",):
         place = runtime_dir(name)
         place.mkdir(mode=0o700)

@@ -22,6 +22,7 @@ from cortex.commands.text import seconds
 from cortex.compiled import native
 from cortex.host import REGISTRY_LOCK, FileLock, domain_id, runtime_dir
 from cortex.message import message
+from cortex.places import NETWORK_VARIABLES
 from cortex.security import PUBLIC_FILE, default_directory, load_keys
 
 _FILES_MIN = 1024
@@ -186,7 +187,7 @@ def _check_exchange() -> str:
     return f"they talk by {'; '.join(carriers)}"
 
 
-_ENVIRONMENT = ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN", "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
+_ENVIRONMENT = ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN", *NETWORK_VARIABLES)
 _SIZES = [10, 1_000_000]
 
 

@@ -15,6 +15,8 @@ from pathlib import Path
 from neurosim_core.bench.engine import SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
+_VARIABLES = (_RUNTIME, "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
+"""What says where nodes meet."""
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
 _STOP_S = 5.0
@@ -33,15 +35,13 @@ def own_runtime() -> Iterator[Path]:
     """
     parent = tempfile.gettempdir()
     folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
-    before = os.environ.get(_RUNTIME)
+    before = {name: os.environ.pop(name, None) for name in _VARIABLES}
     os.environ[_RUNTIME] = str(folder / "cortex")
     try:
         yield folder
     finally:
-        if before is None:
-            del os.environ[_RUNTIME]
-        else:
-            os.environ[_RUNTIME] = before
+        del os.environ[_RUNTIME]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -55,6 +56,7 @@ def _make(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
     from neurosim_core.data.card import write_card
     from neurosim_core.data.make import DatasetPlan, prepare, write_checksums
+    from neurosim_core.render.launch import single_threaded_blas
     from neurosim_core.signals import stop_at_signals
 
     overrides = read_settings(arguments.settings)
@@ -73,6 +75,7 @@ def _make(arguments: argparse.Namespace) -> int:
     if shards is not None and (shards.exists() or plan.folder.resolve() in shards.resolve().parents):
         raise FileExistsError(f"--webdataset {shards}: name a new folder, outside of {plan.folder}")
     prepare(plan)
+    os.environ.update(single_threaded_blas())  # of the workers
     console = Console(soft_wrap=not sys.stdout.isatty())
     stop = threading.Event()
     left = len(plan.missing())

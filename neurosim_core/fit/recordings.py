@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import optimize, special
 
 from neurosim_core.packets import EventArrays
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-_HOT_SIGMAS = 6.0
-"""A pixel is hot that fires so many standard deviations more often than the median, in log rate,"""
+_HOT_CHANCE = 1e-3
+"""A pixel is hot that fires more often than any would with this probability, by the spread of all,"""
 _HOT_FACTOR = 8.0
-"""and so many times more often."""
+"""and so many times more often than the median."""
 _EARLY = 0.2
 """Share of the mean time to an ON event in which a pixel has not leaked a threshold."""
 _SHORTEST = 5
@@ -29,7 +29,9 @@ _SHORTEST = 5
 _BIN_US = 1000
 """Time over which the turns of light are looked for."""
 _TRIM = 0.02
-"""Share of the pixels at either end whose thresholds are not counted: noise has made them."""
+"""Share of the pixels at either end whose thresholds are not counted: noise has made them.
+
+As many of the busiest pixels of still light are left out: hot ones among them would outweigh all others."""
 _WINDOW_US = 200
 """Time over which a saturated readout is counted."""
 _RUN_MIN = 5
@@ -97,7 +99,8 @@ def find_hot(still: Still) -> NDArray[np.bool_]:
     count = (still.on + still.off).astype(float)
     middle, high = np.quantile(count, [0.5, 0.84])
     sigma = max(math.log((high + 1.0) / (middle + 1.0)), 0.1)
-    limit = (middle + 1.0) * max(math.exp(_HOT_SIGMAS * sigma), _HOT_FACTOR)
+    sigmas = -float(special.ndtri(_HOT_CHANCE / len(count)))
+    limit = (middle + 1.0) * max(math.exp(sigmas * sigma), _HOT_FACTOR)
     return np.asarray(count > limit + 10.0)
 
 
@@ -117,12 +120,13 @@ def measure_still(still: Still) -> dict[str, float]:
     if hot.any():
         found["hot_pixels.rate_hz"] = float(np.median(count[hot] / at_risk_s[hot]))
         found["hot_pixels.on_fraction"] = float(still.on[hot].sum() / count[hot].sum())
-    on, off, risk_s = still.on[~hot].astype(float), still.off[~hot].astype(float), at_risk_s[~hot]
-    found["shot_noise.on_fraction"] = share = _early_on_share(still, hot, on.sum() / risk_s.sum())
+    busy = hot | (count > np.quantile(count[~hot], 1.0 - _TRIM))
+    on, off, risk_s = still.on[~busy].astype(float), still.off[~busy].astype(float), at_risk_s[~busy]
+    found["shot_noise.on_fraction"] = share = _early_on_share(still, busy, on.sum() / risk_s.sum())
     off_hz, off_spread = _log_normal(off, risk_s)
     found["shot_noise.rate_hz"] = off_hz / max(1.0 - share, 1e-6)
     found["shot_noise.spread_decades"] = off_spread
-    found["leak.rate_hz"], found["leak.spread_decades"] = _measure_leak(still, hot)
+    found["leak.rate_hz"], found["leak.spread_decades"] = _measure_leak(still, busy)
     shot_on = share / max(1.0 - share, 1e-6) * off.sum()
     found["leak share"] = max(1.0 - shot_on / max(on.sum(), 1.0), 0.0)
     return found
@@ -138,7 +142,7 @@ def measure_refractory(still: Still, rate_hz: Floats) -> float:
     return shortest - chance if by_chance and shortest > 3.0 * chance else 0.0
 
 
-def _measure_leak(still: Still, hot: NDArray[np.bool_]) -> tuple[float, float]:
+def _measure_leak(still: Still, busy: NDArray[np.bool_]) -> tuple[float, float]:
     """Return median [Hz] and spread [decades] of what limits the time between events: the longest of a pixel.
 
     A pixel that leaks is never silent for longer than it takes to leak a threshold.
@@ -146,16 +150,16 @@ def _measure_leak(still: Still, hot: NDArray[np.bool_]) -> tuple[float, float]:
     longest_s = np.zeros(len(still.on))
     np.maximum.at(longest_s, still.interval_pixel, still.interval_s)
     number = np.bincount(still.interval_pixel, minlength=len(still.on))
-    longest_s = longest_s[(number >= 2) & ~hot]
+    longest_s = longest_s[(number >= 2) & ~busy]
     if len(longest_s) < 10:
         return 0.0, 0.0
     low, middle, high = np.quantile(np.log10(longest_s), [0.16, 0.5, 0.84])
     return float(10.0**-middle), float(0.5 * (high - low))
 
 
-def _early_on_share(still: Still, hot: NDArray[np.bool_], on_hz: float) -> float:
+def _early_on_share(still: Still, busy: NDArray[np.bool_], on_hz: float) -> float:
     """Return the share of ON among the events that follow soon after another."""
-    early = (still.interval_s < _EARLY / max(on_hz, 1e-9)) & ~hot[still.interval_pixel]
+    early = (still.interval_s < _EARLY / max(on_hz, 1e-9)) & ~busy[still.interval_pixel]
     return float((still.interval_on[early].sum() + 0.5) / (early.sum() + 1.0))
 
 

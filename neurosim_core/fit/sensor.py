@@ -185,7 +185,8 @@ def _tell_alike(
             continue
         alike = settings[key] / (numbers[counted] + 1.0)
         if settings.get(f"threshold_spread.sigma_{name}", 0.0) < _ALIKE * alike:
-            errors[key] = math.hypot(errors.get(key, 0.0), alike / math.sqrt(12.0))
+            for unsure in (key, f"threshold_spread.sigma_{name}"):
+                errors[unsure] = math.hypot(errors.get(unsure, 0.0), alike / math.sqrt(12.0))
             widened = True
     if widened:
         notes.append(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from neurosim_core.io.event_file import UNITS_US, EventFileError, EventReader, EventWriter
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+from neurosim_core.record.hdf5 import FORMAT
 
 
 class Format(NamedTuple):
@@ -91,7 +92,9 @@ def check_events(path: Path) -> None:
         EventFileError: It is damaged.
         OSError: It cannot be read.
     """
-    if not path.is_dir() and (name := _format_in(path)) in (*_UNITLESS, "mvsec"):
+    if path.is_dir() or (path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path)):
+        return
+    if (name := _format_in(path)) in (*_UNITLESS, "mvsec"):
         _open(name, path).close()
 
 
@@ -130,6 +133,17 @@ def open_events(
         more["unit_us"] = UNITS_US[time_unit]
     source = _open(name, path, **more)
     return EventReader(path, source, size, knows_unit=name not in _UNITLESS or source.knows_unit)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether an HDF5 file is a recording of Neurosim.
+
+    Raises:
+        EventFileError: It is no HDF5 file.
+        OSError: It cannot be read.
+    """
+    with open_hdf5(path) as file, damage_of(path):
+        return bool(file.attrs.get("format") == FORMAT)
 
 
 def _format_in(path: Path) -> str:

@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from neurosim_core.io.formats import create_events, format_of, open_events
-from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+from neurosim_core.io.formats import FORMATS, create_events, format_of, is_recording, open_events
 from neurosim_core.packets import Events
-from neurosim_core.record.hdf5 import FORMAT
 
 _log = logging.getLogger(__name__)
 
@@ -120,7 +118,7 @@ def as_recording(path: Path) -> Iterator[Path]:
         EventFileError: It is damaged.
         OSError: It cannot be read, or there is no room for the copy.
     """
-    if is_recording(path):
+    if path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -128,16 +126,3 @@ def as_recording(path: Path) -> Iterator[Path]:
         for note in transfer(path, copy, from_zero=True).notes:
             _log.warning("%s: %s", path, note)
         yield copy
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of Neurosim.
-
-    Raises:
-        EventFileError: Its name says HDF5, and it is not.
-        OSError: It cannot be read.
-    """
-    if path.suffix.lower() not in (".h5", ".hdf5"):
-        return False
-    with open_hdf5(path) as file, damage_of(path):
-        return bool(file.attrs.get("format") == FORMAT)

@@ -70,7 +70,7 @@ class Dagger:
         self._generator = generator
         self._now, _ = env.reset()
         vector = env.group(self._now, "student")
-        hint = self._now[env.task.hint]
+        hint = env.hint(self._now)
         self.policy = make_event_policy(
             self._now["events"], vector, hint, hidden=config.hidden, widths=config.widths
         )
@@ -171,7 +171,7 @@ class Dagger:
             seen = self._seen
             seen["begun"].copy_(self._begun)
             seen["vector"].copy_(env.group(self._now, "student"))
-            seen["hint"].copy_(self._now[env.task.hint])
+            seen["hint"].copy_(env.hint(self._now))
             self._told.copy_(env.group(self._now, "teacher"))
             self._act()
             for name, value in seen.items():

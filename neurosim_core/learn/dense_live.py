@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from neurosim_core.data.ray_source import SEEDS_APART
+from neurosim_core.render.launch import single_threaded_blas
 
 
 def flight_settings(
@@ -56,7 +57,7 @@ def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> I
     ]
     with contextlib.ExitStack() as stack:
         for command in commands:
-            process = subprocess.Popen(command)
+            process = subprocess.Popen(command, env=single_threaded_blas())
             stack.callback(process.wait)
             stack.callback(process.terminate)
         yield names

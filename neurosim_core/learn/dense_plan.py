@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import pickle
 import signal
 import subprocess
@@ -18,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from neurosim_core.config import SimulationConfig
-from neurosim_core.render.launch import core_count, limit_cores
+from neurosim_core.render.launch import core_count, limit_cores, single_threaded_blas
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.sim.model import plan_path
 from neurosim_core.trajectory import Path
@@ -36,8 +35,7 @@ class PathPlanner:
     """
 
     def __init__(self) -> None:
-        # SciPy's optimiser of a path has matrices so small that threads of BLAS cost ten times what they do.
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+        environment = {**single_threaded_blas(), "CUDA_VISIBLE_DEVICES": ""}
         self._processes = [
             subprocess.Popen(
                 [sys.executable, "-m", __name__],

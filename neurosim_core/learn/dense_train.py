@@ -20,6 +20,7 @@ from torch import Tensor
 
 from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
+from neurosim_core.data.stream import find_recordings
 from neurosim_core.learn.dense import DenseNet, Head, Memory
 from neurosim_core.learn.dense_live import flight_settings, live_flights
 from neurosim_core.learn.depth import DepthHead
@@ -251,6 +252,7 @@ def train_dense(
         Errors of the network, of the network with its events zeroed, and of the mean of each pixel.
 
     Raises:
+        FileNotFoundError: There is no such data set.
         ValueError: Not exactly one source is given, there is too little data, the backbone does not fit, or
             `fly_device` is given for what are no worlds.
     """
@@ -258,6 +260,8 @@ def train_dense(
         raise ValueError("say what to learn from: --data DIR, --live N, or --worlds N")
     if config.fly_device is not None and not worlds:
         raise ValueError(f"fly_device {config.fly_device!r} needs worlds: say --worlds N")
+    if test is not None:
+        find_recordings(test)  # that it is not there is said now, not after training
     torch.manual_seed(config.seed)
     head, net = config.head, config.net()
     if config.backbone is not None:
@@ -273,19 +277,23 @@ def train_dense(
     _log.info("waiting for the first windows")
     with _source(pool, config, data, live, worlds, ray) as more:
         fit = _fit(net.to(config.device), pool, config, more)
+    folder.mkdir(parents=True, exist_ok=True)
+    card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
+    weights = {name: value.cpu() for name, value in net.state_dict().items()}
+    torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
     constant = head.constant(pool.targets()).cpu()[None]
+
+    def predict_mean(voxel: Tensor, _memory: Any) -> tuple[Tensor, Any]:
+        return torch.nn.functional.interpolate(constant, voxel.shape[-2:]), None
+
     _log.info("testing in scenes that were not trained in" if test is None else f"testing on {test}")
     tested = [*held_out_windows(config, test)]
     net.eval()
     errors = {
         "network": evaluate(net, tested, head, config.device),
         "events zeroed": evaluate(lambda v, m: net(torch.zeros_like(v), m), tested, head, config.device),
-        "mean of each pixel": evaluate(lambda _voxel, _memory: (constant, None), tested, head),
+        "mean of each pixel": evaluate(predict_mean, tested, head),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
-    weights = {name: value.cpu() for name, value in net.state_dict().items()}
-    torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
     told = {
         "config": asdict(config),
         "steps": fit.steps,

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -67,6 +69,7 @@ def deploy(
             stack.enter_context(bridge)
         commands = node.publisher(f"/{vehicle}/command/rates", RateThrustCommand)
         last_ns, count = -1, 0
+        times_s: deque[float] = deque(maxlen=10_000)  # the newest
         try:
             say(f"waiting for {vehicle}")
             for state, new in synchronised(
@@ -78,6 +81,7 @@ def deploy(
                     pilot.reset()
                     say(f"flying {vehicle} by {policy} ({pilot.card['task']})")
                 if state.stamp_ns != last_ns:  # else it is sent again
+                    begin_s = time.perf_counter()
                     parts = [(e.t, e.x, e.y, e.polarity) for e in new["events"]]
                     columns = [np.concatenate(part) for part in zip(*parts, strict=True)]
                     command = pilot.act(
@@ -86,6 +90,7 @@ def deploy(
                         orientation=state.orientation,
                         body_rate=state.body_rate,
                     )
+                    times_s.append(time.perf_counter() - begin_s)
                     last_ns = state.stamp_ns
                 commands.publish(
                     RateThrustCommand(
@@ -100,7 +105,8 @@ def deploy(
                     break
         except Closed:
             pass
-    say(f"{count} commands")
+    latency = f"; each took {1e3 * np.median(times_s):.2f} ms (median) of computing" if times_s else ""
+    say(f"{count} commands{latency}")
     return 0
 
 

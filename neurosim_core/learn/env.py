@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 import warp as wp
 
+from neurosim_core.learn.actions import hover_command
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
@@ -29,6 +30,8 @@ from neurosim_core.sim.observation import Observation
 from neurosim_core.sim.scene_table import SceneSource
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
+
+_T = TypeVar("_T")
 
 CAMERA = "front"
 """Name of the event camera."""
@@ -159,12 +162,12 @@ class Env:
         self._mask_array = wp.from_torch(self._mask)
         self._mask_int = torch.zeros(worlds, dtype=torch.int32, device=self.device)
         latency = self.randomisation.latency_steps
-        self._queue = torch.zeros((latency + 1, worlds, 4), device=self.device)
+        self._hover = torch.tensor(hover_command(task.mode, self.sim.model.airframe), device=self.device)
+        self._queue = torch.zeros((latency + 1, worlds, len(self._hover)), device=self.device)
         self._queue_place = 0
-        self._lagging = torch.zeros((worlds, 4), device=self.device)
+        self._lagging = self._queue[0].clone()
         self._each = torch.arange(worlds, device=self.device)
         self.view = self._make_view()
-        self._hover = torch.tensor([self.view.vehicle.hover_thrust_n, 0.0, 0.0, 0.0], device=self.device)
         self._fall = torch.tensor([0.0, 0.0, -GRAVITY_M_S2], dtype=torch.float64, device=self.device)
         self._seed = seed
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
@@ -203,9 +206,22 @@ class Env:
         return {"kind": type(config).__name__, **dataclasses.asdict(config)}
 
     def group(self, observations: Observations, name: str) -> torch.Tensor:
-        """Return the observations of a group that are vectors, in one tensor [N, n]."""
-        parts = [observations[key] for key in self.obs_groups[name]]
+        """Return the observations of a group that are vectors, in one tensor [N, n].
+
+        Raises:
+            ValueError: The task has no such group, or an observation of it was not asked for.
+        """
+        names = _named(self.obs_groups, name, "group of observations")
+        parts = [_named(observations, key, "observation") for key in names]
         return torch.cat([part for part in parts if part.ndim == 2], dim=1)
+
+    def hint(self, observations: Observations) -> torch.Tensor:
+        """Return what students estimate besides (`Task.hint`), [N, n].
+
+        Raises:
+            ValueError: The task does not observe it.
+        """
+        return _named(observations, self.task.hint, "observation")
 
     def reset(self, *, seed: int | None = None, spread: bool = False) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode in all worlds.
@@ -239,7 +255,7 @@ class Env:
         view = self.view
         view.last_action.copy_(view.action)
         torch.clamp(actions.detach(), -1.0, 1.0, out=view.action)
-        observation = self.sim.step(self._delayed(self.task.command(view)), mode="rates")
+        observation = self.sim.step(self._delayed(self.task.command(view)), mode=self.task.mode)
         if self._surface is not None:
             self._surface.update(observation.events[CAMERA], observation.clock_ns)
         self._look(observation)
@@ -309,9 +325,11 @@ class Env:
     def _delayed(self, command: torch.Tensor) -> torch.Tensor:
         """Return the commands that take effect now: each episode has a latency and a factor of thrust."""
         low, high = self.randomisation.thrust_factor
-        draws = self.view.draws
-        command = command.clone()
-        command[:, 0] *= low + (high - low) * draws[:, -1]
+        factor = low + (high - low) * self.view.draws[:, -1:]
+        if self.task.mode == "motor_speeds":
+            command = command * factor.sqrt()
+        elif self.task.mode != "velocity":
+            command = torch.cat([command[:, :1] * factor, command[:, 1:]], dim=1)
         length = self._queue.shape[0]
         if length > 1:
             self._queue[self._queue_place] = command
@@ -377,6 +395,12 @@ class Env:
         if self.view.surface is not None:
             seen.setdefault("events", self.view.surface)
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
+
+
+def _named(found: Mapping[str, _T], name: str, what: str) -> _T:
+    if name not in found:
+        raise ValueError(f"the task has no {what} {name!r}, which is needed here; it has {', '.join(found)}")
+    return found[name]
 
 
 make_env = Env

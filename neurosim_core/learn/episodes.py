@@ -68,7 +68,7 @@ class Randomisation:
     """What differs from episode to episode and from world to world, besides where it begins."""
 
     thrust_factor: tuple[float, float] = (0.9, 1.1)
-    """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
+    """Range of thrust per commanded thrust: a battery, or a mass that is not known; not of velocities."""
     latency_steps: int = 1
     """Most steps between an action and its effect; each episode has its own, from 0 on."""
     lag_s: tuple[float, float] = (0.0, 0.0)

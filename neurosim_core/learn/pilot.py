@@ -66,6 +66,8 @@ class Pilot:
                 f"{file} is no policy of `neurosim learn`: it does not say what it was trained for"
             )
         self.card: dict[str, Any] = json.loads(metadata[CARD])
+        if (mode := self.card.get("mode", "rates")) != "rates":
+            raise ValueError(f"{file} commands {mode}, and only thrust and body rates are flown here")
         shown = dict(self.card["surface"])
         if "tau_s" in shown:
             shown["tau_s"] = tuple(shown["tau_s"])

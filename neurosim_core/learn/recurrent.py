@@ -61,7 +61,7 @@ class RecurrentPpo:
         self._now, _ = env.reset()
         on_cuda = env.device.type == "cuda"
         vector, told = (env.group(self._now, name) for name in ("student", "critic"))
-        surface, hint = self._now["events"], self._now[env.task.hint]
+        surface, hint = self._now["events"], env.hint(self._now)
         self.policy = make_event_policy(surface, vector, hint, hidden=config.hidden, widths=config.widths)
         last = self.policy.head[-1]
         assert isinstance(last, nn.Linear)
@@ -141,7 +141,7 @@ class RecurrentPpo:
         seen["surface"].copy_(now["events"])
         seen["vector"].copy_(env.group(now, "student"))
         seen["critic"].copy_(env.group(now, "critic"))
-        seen["hint"].copy_(now[env.task.hint])
+        seen["hint"].copy_(env.hint(now))
 
     def _decide(self) -> None:
         """Act on what is in `_seen`, with `_noise`."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from neurosim_core.learn.actions import COMMANDS, ActionMode
 from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
 from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
 from neurosim_core.scene.config import SceneConfig
@@ -105,10 +106,18 @@ class Task:
     randomisation: Randomisation = Randomisation()
     training: Randomisation | None = None
     """What training draws in its place: with more of it, students cope with other scenes; None: the same."""
+    mode: ActionMode = "rates"
+    """What the four numbers of an action command. `rates`: thrust, body rates. `attitude`: thrust, roll,
+    pitch, change of the heading. `velocity`: ahead, left, up, rate of the heading. `motor_speeds`: the thrust
+    of each of four rotors."""
     rate_max_rad_s: Sequence[float] = (4.0, 4.0, 2.0)
-    """Body rates of an action of 1 [rad/s]."""
+    """Body rates of an action of 1 [rad/s]; the last is that of the heading, too."""
     thrust_span: float = 0.6
     """Change of thrust of an action of 1, as a share of the hover thrust."""
+    tilt_max_rad: float = 0.6
+    """Angles of an action of 1, in mode `attitude` [rad]."""
+    speed_max_m_s: float = 2.0
+    """Speed of an action of 1 along each axis, in mode `velocity` [m/s]."""
     bodies: Mapping[str, Any] = {}
     """Settings of bodies that are thrown in each world as `throw` says; there can be one scene then."""
     probes: Sequence[tuple[float, float, float]] = ()
@@ -154,11 +163,8 @@ class Task:
         raise NotImplementedError
 
     def command(self, view: View) -> torch.Tensor:
-        """Return collective thrust [N] and body rate [rad/s] of the last actions, [N, 4]."""
-        hover_n = view.vehicle.hover_thrust_n
-        thrust = hover_n * (1.0 + self.thrust_span * view.action[:, :1])
-        rates = [most * view.action[:, 1 + axis, None] for axis, most in enumerate(self.rate_max_rad_s)]
-        return torch.cat([thrust, *rates], dim=1)
+        """Return what the last actions command, rows of `control.modes.MODES[mode]`, [N, width]."""
+        return COMMANDS[self.mode](self, view)
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
         """Note that the episodes of the worlds of a mask (bool, [N]) have begun."""

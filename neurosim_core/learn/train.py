@@ -79,6 +79,16 @@ class TrainConfig:
                 task.surface = dataclasses.replace(task.surface, tau_s=slower)
         return task
 
+    def make_env(self, task: Task | None = None, *, device: str | None = None, **options: Any) -> Env:
+        """Return the task as an environment, with the pixels and on the device of this training.
+
+        Args:
+            task: A variant of what `make_task` returns; None: that.
+            device: Another device.
+            **options: Of `env.make_env`.
+        """
+        return make_env(task or self.make_task(), device=device or self.device, pixels=self.pixels, **options)
+
 
 class Training:
     """A run of training.
@@ -113,28 +123,16 @@ class Training:
         randomise: bool | Randomisation = config.randomise != "none"
         if config.randomise == "training" and task.training is not None:
             randomise = task.training
-        self.env = make_env(
-            task,
-            worlds=config.student.worlds,
-            device=config.device,
-            models=models,
-            randomise=randomise,
-            pixels=config.pixels,
-            seed=config.seed,
-        )
+        drawn: dict[str, Any] = {"randomise": randomise, "seed": config.seed}
+        self.env = config.make_env(task, worlds=config.student.worlds, models=models, **drawn)
         device = self.env.device
         self._generator = torch.Generator(device=device)
         states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
         self._trainers: dict[str, Trainer] = {}
         if isinstance(config.student, DaggerConfig):
-            teacher_env = make_env(
-                config.make_task(),
-                worlds=config.teacher.worlds,
-                device=config.device,
-                observe=states,
-                models=self.env.sim.models,
-                randomise=randomise,
-                seed=config.seed,
+            models = self.env.sim.models
+            teacher_env = config.make_env(
+                worlds=config.teacher.worlds, observe=states, models=models, **drawn
             )
             teacher = Ppo(teacher_env, config.teacher, self._generator)
             student = Dagger(self.env, teacher.policy, config.student, self._generator)
@@ -375,7 +373,7 @@ def evaluate_run(
         task = config.make_task()
         if speed_m_s is not None:
             task.start = dataclasses.replace(task.start, speed_m_s=(speed_m_s, speed_m_s))
-        return make_env(task, device=device or config.device, pixels=config.pixels, **options)
+        return config.make_env(task, device=device, **options)
 
     where: Any = scenes if scenes in ("seen", "unseen") else [scenes]
     env = make(worlds=worlds or config.evaluation_worlds, scenes=where)
@@ -448,6 +446,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "rays_per_pixel": task.rays_per_pixel,
         "surface": env.surface_card,
         "hover_thrust_n": env.view.vehicle.hover_thrust_n,
+        "mode": task.mode,
         "thrust_span": task.thrust_span,
         "rate_max_rad_s": list(task.rate_max_rad_s),
         "vehicle": dict(task.vehicle),

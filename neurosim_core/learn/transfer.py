@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.env import Env, make_env
+from neurosim_core.learn.env import Env
 from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate_policy, student_actor
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import Observations, Task, View
@@ -64,13 +64,8 @@ def evaluate_transfer(
         task = _changed(config.make_task(), changes)
         if "lost" in changes and not isinstance(task.surface, LeakySurface):
             continue  # what other surfaces show without a packet is not known
-        env = make_env(
-            task,
-            worlds=min(count, _NOISY_WORLDS) if task.pixel else count,
-            device=device or config.device,
-            pixels=config.pixels,
-            **where,
-        )
+        noisy = min(count, _NOISY_WORLDS) if task.pixel else count
+        env = config.make_env(task, worlds=noisy, device=device, **where)
         where = {"models": env.sim.models}  # nothing is loaded twice
         if "lost" in changes:
             _lose_events(env, changes["lost"])

@@ -32,6 +32,14 @@ def limit_cores(count: int) -> None:
     _most = max(1, count)
 
 
+def single_threaded_blas() -> dict[str, str]:
+    """Return the environment of a process that works beside others.
+
+    SciPy's optimiser of a path has matrices so small that threads of BLAS cost ten times what they compute.
+    """
+    return {"OPENBLAS_NUM_THREADS": "1", **os.environ}
+
+
 @cache
 def _pool(thread_count: int) -> ThreadPoolExecutor:
     """Return the threads that share a launch."""

@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 _ROOM_MIN_M3 = 12.0
 """Smaller regions with walls around them are taken for the insides of things."""
+_SIGHT, _SIGHT_MIN_M = 100.0, 1000.0
+"""From so many diagonals of a scene, and no fewer metres, nothing of it is seen."""
 _CPU_CHUNKS = 8
 """Launches that the columns of a grid are divided into on the CPU, for two or more threads to share."""
 
@@ -240,7 +242,7 @@ class FreeSpace:
         return _reachable(self, clearance_m)
 
     def check_start(self, point_m: ArrayLike) -> None:
-        """Refuse to begin inside a solid, or outside of a closed scene.
+        """Refuse to begin inside a solid, outside of a closed scene, or out of sight of any.
 
         A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
         (12 m^3). Where a surface passes, there is no solid to be inside of. Outside is what is beyond the
@@ -250,9 +252,17 @@ class FreeSpace:
             point_m: In the world [m], shape [3].
 
         Raises:
-            ValueError: The point is inside a solid, or outside.
+            ValueError: The point is inside a solid, outside, or out of sight.
         """
         point = np.asarray(point_m, dtype=np.float64)
+        away_m = float(np.linalg.norm(point - np.clip(point, *self.bounds_m)))
+        if away_m > max(_SIGHT_MIN_M, _SIGHT * np.linalg.norm(np.ptp(self.bounds_m, axis=0))):
+            raise ValueError(
+                f"the path begins at {np.round(point, 3).tolist()} m, {away_m:,.0f} m away from the scene, "
+                f"which reaches from {np.round(self.bounds_m[0], 1).tolist()} to "
+                f"{np.round(self.bounds_m[1], 1).tolist()} m; where `neurosim scene` says that a place was "
+                "subtracted from a file's coordinates, subtract it here as well"
+            )
         voxel = self.voxel_of(point)
         where = "outside of the rooms"
         if (point >= self.bounds_m[0]).all() and (point <= self.bounds_m[1]).all():

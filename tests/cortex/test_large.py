@@ -14,9 +14,12 @@ import pytest
 from peer import Block, Scan, is_whole, make_block
 from processes import SOON_S, shared_mappings, wait_for
 
+import cortex.back_pressure
 import cortex.broadcast
+import cortex.large
 import cortex.link
 from cortex import keep_last, latest, reliable
+from cortex.pub_socket import Backoff
 
 LARGE = 100_000
 
@@ -415,6 +418,35 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
         received.append(subscriber.recv(SOON_S).stamp_ns)
     assert received == sorted(set(received))
     assert len(received) + subscriber.counters.lost == last + 1
+
+
+def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkeypatch):
+    """One reads the ring and has all slots, for one there is no memory: `max_wait_s` is that of a message."""
+    publisher = node.publisher("/scans", Scan, max_wait_s=0.5)
+    readers = []
+    for module in (cortex.link.native, None):
+        monkeypatch.setattr(cortex.link, "native", module)
+        readers.append(node.subscriber("/scans", Scan, policy=reliable(1, SOON_S)))
+        assert publisher.wait_for_subscribers(len(readers), SOON_S)
+        assert readers[-1].wait_for_publisher(SOON_S)
+        monkeypatch.setattr(readers[-1], "top_up", lambda now_ns: None)
+    while (
+        slot := publisher._fanout.ring._ring.acquire(100_000)
+    ) is not None or not publisher._fanout.ring._ring.slots:
+        del slot
+        assert publisher.publish(scan(0, 25_000))
+    monkeypatch.setattr(cortex.large, "STRICT_BYTES", 0)
+    waits_s = []
+
+    class Recording(Backoff):
+        def __init__(self, timeout_s):
+            waits_s.append(max(timeout_s, 0.0))
+            super().__init__(timeout_s)
+
+    monkeypatch.setattr(cortex.back_pressure, "Backoff", Recording)
+    assert not publisher.publish(scan(1, 25_000))
+    assert len(waits_s) > 1
+    assert 0.5 <= sum(waits_s) < 0.6
 
 
 def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):

@@ -318,3 +318,13 @@ def test_a_log_that_travels_over_cortex(node):
         wait_for(lambda: any("too late" in text for text in said))
     finally:
         logging.getLogger("cortex").removeHandler(handler)
+
+
+def test_the_first_message_is_checked_without_subscribers(node):
+    """Later ones cost nothing where nobody listens."""
+    publisher = node.publisher("/numbers", Number)
+    with pytest.raises(TypeError, match=r"Number\.value"):
+        publisher.publish(Number(0, "one"))
+    assert publisher.counters.published == 0
+    assert publisher.publish(Number(0, 1))
+    assert publisher.counters.published == 1

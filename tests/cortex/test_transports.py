@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import zmq
+from cable import ADDRESSES, two_hosts
 from peer import Block, Number, is_whole, make_block
-from processes import SOON_S
+from processes import SOON_S, wait_for
 
 import cortex.node
 from cortex import reliable
@@ -272,31 +273,13 @@ def test_frames_have_a_limit(runtime):
 @pytest.fixture
 def hosts(runtime):
     """Two network namespaces with a cable between them; each has a runtime directory of its own."""
-    if os.getuid() != 0 or shutil.which("ip") is None:
-        pytest.skip("network namespaces need root and the command ip")
-    names = [f"ctx{side}{os.getpid()}" for side in "xy"]
-
-    def ip(*words):
-        subprocess.run(["ip", *words], check=True, capture_output=True, timeout=300.0)
-
-    with contextlib.ExitStack() as stack:
-        try:
-            for name in names:
-                ip("netns", "add", name)
-                stack.callback(ip, "netns", "del", name)
-            ip("link", "add", "cable", "netns", names[0], "type", "veth", "peer", "cable", "netns", names[1])
-            for number, name in enumerate(names, 1):
-                ip("-n", name, "address", "add", f"10.213.8.{number}/24", "dev", "cable")
-                ip("-n", name, "link", "set", "cable", "up")
-                ip("-n", name, "link", "set", "lo", "up")
-        except (OSError, subprocess.SubprocessError) as error:
-            pytest.skip(f"cannot make network namespaces: {error}")
+    with two_hosts() as names:
         yield [
             (
                 {"prefix": ["ip", "netns", "exec", name], "env": {"CORTEX_RUNTIME_DIR": str(runtime / side)}},
                 address,
             )
-            for name, side, address in zip(names, "xy", ("10.213.8.1", "10.213.8.2"), strict=True)
+            for name, side, address in zip(names, "xy", ADDRESSES, strict=True)
         ]
 
 
@@ -308,6 +291,7 @@ def test_two_hosts(hosts, start_child, tmp_path):
     (directories["two"] / AUTHORIZED_FILE).write_text(f"{load_keys(directories['one']).public} {address}\n")
     serve = [sys.executable, "-m", "cortex.discovery", "--listen", registry, "--keys", directories["one"]]
     serving = subprocess.Popen([*place["prefix"], *serve], env={**os.environ, **place["env"]})
+    wait_for(lambda: list(Path(place["env"]["CORTEX_RUNTIME_DIR"]).glob("*/registry")))
     one = start_child("peer", name="one", listen=address, keys=str(directories["one"]), **place)
     two = start_child(
         "peer",

@@ -97,6 +97,18 @@ def test_errors_say_how_far_off_the_settings_are():
     assert 0.5 < ratio < 1.8
 
 
+def test_hot_pixels_are_told_among_pixels_of_many_rates():
+    """A few pixels fire a hundred times as often as the others: if not told, they pass for a wide spread."""
+    shot = {"rate_hz": 3.0, "bright_factor": 1.0, "on_fraction": 0.7, "spread_decades": 0.35}
+    truth = {f"shot_noise.{key}": value for key, value in shot.items()}
+    hot = {"hot_pixels.fraction": 0.002, "hot_pixels.rate_hz": 300.0, "hot_pixels.on_fraction": 0.5}
+    still = record_still(truth | hot, seed=5)
+    fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=still, span_s=SPAN_S), repeats=2)
+    assert fit.settings["hot_pixels.rate_hz"] == pytest.approx(300.0, rel=0.05)
+    for key, true in truth.items():
+        assert fit.settings[key] == pytest.approx(true, rel=0.05), key
+
+
 def test_what_a_recording_does_not_show_is_left_out_and_said():
     shot = {"shot_noise.rate_hz": 1.0, "shot_noise.bright_factor": 1.0}
     stimulus = Stimulus(width=WIDTH, height=HEIGHT, still=record_still(shot), span_s=SPAN_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
 
@@ -246,8 +247,9 @@ def test_a_policy_as_a_cortex_node_commands_what_it_does_in_process(policy, runt
     from neurosim_core.learn.pilot import Pilot
 
     rng, pilot = np.random.default_rng(0), Pilot(policy)
+    said: list[str] = []
     flown = threading.Thread(
-        target=deploy, args=(policy,), kwargs={"duration_s": 0.06, "say": lambda line: None}, daemon=True
+        target=deploy, args=(policy,), kwargs={"duration_s": 0.06, "say": said.append}, daemon=True
     )
     with Node("vehicle") as node:
         states = node.publisher("/drone/odometry", Odometry)
@@ -275,6 +277,7 @@ def test_a_policy_as_a_cortex_node_commands_what_it_does_in_process(policy, runt
             np.testing.assert_array_equal(command.body_rate, expected.body_rate)
         flown.join(SOON_S)
     assert not flown.is_alive()
+    assert re.fullmatch(r"4 commands; each took \d+\.\d\d ms \(median\) of computing", said[-1])
 
 
 def test_a_policy_flies_in_this_process(policy, hall, tmp_path):

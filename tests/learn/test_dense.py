@@ -217,6 +217,27 @@ def test_training_from_files_learns_and_can_be_loaded(tmp_path, flights, task, c
     assert capsys.readouterr().out == f"{errors['network']}\n"
 
 
+def test_a_network_is_tested_at_another_size_and_kept_if_that_fails(tmp_path, flights, scene):
+    sensors = settings(scene)["sensors"]
+    for sensor in sensors.values():
+        sensor["lens"]["width"] = 24
+    with RecordingWriter(
+        tmp_path / "wide.h5", RecordingHeader(config_yaml="", seed=0, version="0")
+    ) as writer:
+        for packet in ns.run(settings(scene, sensors=sensors)):
+            writer.write(packet)
+    config = DenseConfig(steps=1, batch=1, channels=4)
+    errors = train_dense(tmp_path / "run", config, data=flights, test=tmp_path / "wide.h5")
+    assert 0.0 < errors["mean of each pixel"].abs_rel < 1.0
+    with pytest.raises(FileNotFoundError):
+        train_dense(tmp_path / "none", config, data=flights, test=tmp_path / "nothing.h5")
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "events.csv").write_text("t,x,y,p\n0,0,0,1\n900000,15,15,1\n")
+    with pytest.raises(ValueError, match="has no sensor for depth"):
+        train_dense(tmp_path / "kept", config, data=flights, test=tmp_path / "events.csv")
+    load_dense(tmp_path / "kept" / "depth.pt")
+
+
 def test_worlds_give_the_windows_of_runs(scene):
     """Voxels and ground truth of worlds on their device are those that are cut from their packets."""
     config = settings(scene, seed=3)

@@ -204,6 +204,54 @@ def calm(**start):
     )()
 
 
+def fly(make, action, steps, **settings):
+    """Return an environment where an action was held for some steps, from rest, and nothing is drawn."""
+    task = calm()
+    for name, value in settings.items():
+        setattr(task, name, value)
+    env = make(4, task, observe=["state"], randomise=still())
+    env.reset(seed=1)
+    for _ in range(steps):
+        env.step(torch.tensor(action).repeat(4, 1))
+    return env
+
+
+def test_actions_command_rotors(make):
+    """Equal thrusts of 1 + a climb with a g; more on one side turns the vehicle."""
+    view = fly(make, [0.5] * 4, 5, mode="motor_speeds", thrust_span=0.4).view
+    # motors of 5 ms lag, inflow: 8 %
+    torch.testing.assert_close(view.velocity[:, 2], torch.full((4,), 0.1 * 9.81 * 0.2), rtol=0.13, atol=0.0)
+    assert view.velocity_B[:, :2].abs().max() < 1e-3
+    assert fly(make, [0.0] * 4, 5, mode="motor_speeds").view.velocity.abs().max() < 1e-3
+    left = [0.1 * (y > 0.0) for _, y, _ in view.vehicle.rotor_position_m]
+    assert fly(make, left, 3, mode="motor_speeds").view.body_rate[:, 0].min() > 0.1
+
+
+def test_actions_command_an_attitude(make):
+    """Roll, pitch and heading are reached, whichever way the vehicle looks."""
+    before = fly(make, [0.0] * 4, 0, mode="attitude").view
+    q = before.orientation.clone()
+    view = fly(make, [0.0, 0.5, -0.25, 0.0], 30, mode="attitude", tilt_max_rad=0.4).view
+    roll, pitch = torch.tensor(0.2), torch.tensor(-0.1)
+    down = torch.stack([pitch.sin(), -roll.sin() * pitch.cos(), -roll.cos() * pitch.cos()])
+    torch.testing.assert_close(view.gravity_B, down.repeat(4, 1), atol=0.02, rtol=0.0)
+    assert (view.orientation * q).sum(1).abs().min() > 0.98  # the heading stays
+    view = fly(make, [0.0, 0.0, 0.0, 1.0], 10, mode="attitude").view
+    assert view.body_rate[:, 2].min() > 0.1
+    assert fly(make, [1.0, 0.0, 0.0, 0.0], 10, mode="attitude").view.velocity[:, 2].min() > 0.5
+
+
+def test_actions_command_a_velocity(make):
+    """Ahead is where the vehicle looks; the thrust is not a command, and no factor of it counts."""
+    view = fly(make, [0.5, 0.0, 0.25, 0.0], 40, mode="velocity", speed_max_m_s=1.0).view
+    torch.testing.assert_close(
+        view.velocity_B, torch.tensor([0.5, 0.0, 0.25]).repeat(4, 1), atol=0.06, rtol=0.0
+    )
+    assert fly(make, [0.0] * 4, 20, mode="velocity").view.velocity.abs().max() < 0.02
+    with pytest.raises(ValueError, match="unknown mode 'position' of actions, known: rates, attitude"):
+        fly(make, [0.0] * 4, 0, mode="position")
+
+
 def test_a_mass_that_is_drawn_is_the_mass_that_flies(make):
     """The thrust that carries the nominal mass m accelerates f m with g (1 / f - 1) upwards."""
     env = make(

@@ -144,6 +144,9 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     ns.load_config(pilot_settings(pilot.card))
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
+    export_onnx(policy, {**card, "mode": "velocity"}, tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match="commands velocity, and only thrust and body rates are flown"):
+        Pilot(tmp_path / "other.onnx")
     shape = {**policy.shape, "vector_size": 17}
     export_onnx(EventPolicy(**shape), {**card, "task": "avoid"}, tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="trained for 'avoid', and needs more than events"):
@@ -203,7 +206,7 @@ def test_the_learning_rate_follows_how_much_a_policy_changes(hall, divergence, f
 class Recall:
     """Episodes of five steps: which way to act is shown in the first of them only."""
 
-    num_envs, device, task = 32, torch.device("cpu"), SimpleNamespace(hint="velocity")
+    num_envs, device = 32, torch.device("cpu")
 
     def reset(self, *, seed=0, spread=False):
         self._generator, self._step = torch.Generator().manual_seed(seed), 0
@@ -211,6 +214,9 @@ class Recall:
 
     def group(self, observations, name):
         return observations["vector"] if name == "student" else observations["velocity"]
+
+    def hint(self, observations):
+        return observations["velocity"]
 
     def step(self, action):
         reward, end = (
@@ -358,6 +364,15 @@ def test_runs_of_another_version_are_refused(tmp_path, hall):
     for read in (training.resume, lambda: load_student(tmp_path, torch.device("cpu"))):
         with pytest.raises(ValueError, match="of another version"):
             read()
+
+
+def test_a_task_that_lacks_what_training_needs_says_so(tmp_path, hall):
+    with pytest.raises(ValueError, match="the task has no observation 'velocity', which is needed here; it"):
+        Training(tmp_path, dataclasses.replace(small(), task="hover-paper"), models=[hall])
+    env = ns.learn.make_env("hover", worlds=2, device="cpu", observe=["state"], models=[hall])
+    seen, _ = env.reset()
+    with pytest.raises(ValueError, match=r"no group of observations 'pilot', .* actor, critic, teacher, st"):
+        env.group(seen, "pilot")
 
 
 def test_nothing_is_drawn_if_that_is_asked_for(tmp_path, hall):

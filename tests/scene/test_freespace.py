@@ -291,6 +291,8 @@ def test_a_start_inside_a_solid_is_refused(furnished):
     furnished.check_start((-3.0, 0.0, 1.0))  # not in the scene at all: flights there are allowed
     with pytest.raises(ValueError, match=r"begins at \[1.75, 1.5, 0.6\] m, inside a solid of"):
         furnished.check_start((1.75, 1.5, 0.6))
+    with pytest.raises(ValueError, match=r"m away from the scene.*subtract it here as well"):
+        furnished.check_start((9000.0, -100.0, 1.0))  # in the coordinates of a map, say
     cut_off = make_free_space(two_rooms(0.0), FreeSpaceConfig())
     cut_off.check_start((6.0, 1.5, 1.2))  # another room of 30 m^3, behind a closed wall
 

@@ -20,6 +20,7 @@ from zmq.utils.garbage import GarbageCollectorThread
 
 from cortex import registry
 from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, sweep
+from cortex.places import NETWORK_VARIABLES
 
 _SPAWN = registry._spawn
 
@@ -56,7 +57,8 @@ def own_directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Let nodes meet in a directory of their own; check at the end that nothing is left of them."""
     base = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
     monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(base))
-    monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
+    for name in ("CORTEX_DOMAIN", *NETWORK_VARIABLES):
+        monkeypatch.delenv(name, raising=False)
     if sys.platform == "linux":
         monkeypatch.setattr(registry, "_spawn", forks(_SPAWN))
     threads, files, mappings = _threads(), _shared_files(), set(shared_mappings())

@@ -21,7 +21,6 @@ if constexpr (TIMED)
         shift[axis] = position[axis] - origin[axis];
     }
 const unsigned below = (1u << lane) - 1u, ours = alone ? ALL : 0xffffu << (16 * half); // threads before; those of the instant
-const unsigned pixels = 0xffffu << (lane & 16); // threads that look at the same faces as this one
 const int room = alone ? MOST : MOST / 2, width_of_row = alone ? 16 : 32, base_of_faces = half * room;
 int *const seen = block.seen + base_of_faces, *const part_of = block.part + base_of_faces;
 unsigned char* const first_of = block.first + base_of_faces;
@@ -123,6 +122,11 @@ for (int begin = 0; more;) {
     more = __any_sync(ALL, begin < count); // if not, the last edges are looked at
     const int number = wp::max(wp::min(count - begin, members), 0), most = wp::max(number, __shfl_xor_sync(ALL, number, 16));
     const int entry = begin + member;
+    // Each half of the warp looks at faces of its own: at those of its instant, or at half of those of the one that is alone.
+    const int split = alone ? (number + 1) / 2 : 16, turns = alone ? split : most;
+    const bool later = lane >= split; // which half looks at the face of this thread, and in which turn
+    const unsigned lookers = later ? 0xffff0000u : 0xffffu;
+    const int own_turn = later ? lane - split : lane;
     bool solid = false;
     if (member < number) { // each thread prepares a face
         const int face = seen[entry];
@@ -137,9 +141,9 @@ for (int begin = 0; more;) {
     const unsigned solids = __ballot_sync(ALL, solid);
     __syncwarp();
     unsigned crossed = 0; // of the face of this thread: edges that cross pixels; 8: it reaches one
-    for (int turn = 0; turn < wp::min(wp::max(most, 1), 16); ++turn) {
+    for (int turn = 0; turn < wp::max(turns, 1); ++turn) {
         if (more) {
-            const int at = (lane & 16) + turn, looked_at = begin + at % members; // of one instant two at a time
+            const int at = (lane < 16 ? 0 : split) + turn, looked_at = begin + at % members;
             bool reached = (solids >> at) & 1u;
             float value[3][3], cut_at[3], along_shift[3];
 #pragma unroll
@@ -162,7 +166,7 @@ for (int begin = 0; more;) {
                 own_shown[looked_at * width_of_row] = ALL_POINTS;
             }
             const unsigned reaches = __ballot_sync(ALL, reached);
-            if (pixel == turn && reaches & pixels) crossed |= 8u;
+            if (own_turn == turn && reaches & lookers) crossed |= 8u;
             float near[3];
 #pragma unroll
             for (int term = 0; term < 3; ++term) near[term] = OVERLAP * (value[0][term] + value[1][term] + value[2][term]);
@@ -170,7 +174,7 @@ for (int begin = 0; more;) {
             for (int side = 0; side < 3; ++side) {
                 const bool cut = reached && cut_at[side] < 0.0f;
                 const unsigned cuts = __ballot_sync(ALL, cut);
-                if (pixel == turn && cuts & pixels) crossed |= 1u << side;
+                if (own_turn == turn && cuts & lookers) crossed |= 1u << side;
                 if (cut)
                     block.edge[(edges + __popc(cuts & below)) % 128] = {value[side][0] + near[0], value[side][1] + near[1],
                                                                        value[side][2] + near[2],

@@ -69,6 +69,7 @@ class PublisherCore {
   bool publish_inline(zmq::message_t frame, std::int64_t stamp_ns) {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, false);
+    waited_ns_ = 0;
     const std::size_t size = frame.size() - wire::header_size;
     write_header(static_cast<std::uint8_t*>(frame.data()), 'M', sequence_++, stamp_ns, size, 0);
     ++counters_.published;
@@ -86,7 +87,12 @@ class PublisherCore {
   Slot acquire(std::size_t size, bool for_loan) {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
-    if (!provide(lock, size)) return private_slot(size);
+    waited_ns_ = 0;
+    const auto after_wait = [&](Slot acquired) {
+      acquired.waited_ns = waited_ns_;
+      return acquired;
+    };
+    if (!provide(lock, size)) return after_wait(private_slot(size));
     Slot slot = readers_.acquire();
     if (slot.index < 0) {
       wait_for_readers(lock, 0, [&] {
@@ -95,8 +101,8 @@ class PublisherCore {
         return slot.index >= 0;
       });
     }
-    if (slot.index >= 0) return slot;
-    if (!for_loan) return private_slot(size);
+    if (slot.index >= 0) return after_wait(std::move(slot));
+    if (!for_loan) return after_wait(private_slot(size));
     ++sequence_;
     ++counters_.published;
     ++counters_.skipped;
@@ -113,6 +119,7 @@ class PublisherCore {
   bool publish_slot(const Slot& slot, std::size_t size, std::int64_t stamp_ns) {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
+    waited_ns_ = slot.waited_ns;
     const std::uint64_t sequence = sequence_++;
     ++counters_.published;
     counters_.bytes += size;
@@ -267,10 +274,11 @@ class PublisherCore {
   // Whether the socket itself serves some reader.
   bool has_sockets(const PubSocket& pub_socket) const noexcept { return readers_.socket_count(pub_socket) > 0; }
 
-  // Tries to send until it works or the time is over; the lock is let go while sleeping.
+  // Tries to send until it works or the message was held up for its time; the lock is let go while sleeping.
   template <class Attempt>
   bool await_room(Lock& lock, std::uint32_t timeout_ms, Attempt attempt) {
-    Backoff backoff(std::int64_t{timeout_ms} * 1'000'000);
+    const std::int64_t begin_ns = monotonic_ns() - waited_ns_;
+    Backoff backoff(std::int64_t{timeout_ms} * 1'000'000 - waited_ns_);
     bool sent = false;
     bool in_time = true;
     blocked_ = true;
@@ -278,6 +286,7 @@ class PublisherCore {
       lock.unlock();
       in_time = backoff.wait();
       lock.lock();
+      waited_ns_ = monotonic_ns() - begin_ns;
       if (closed_ || pub_sockets_->closed) break;
       pub_sockets_->refresh();
       sent = attempt();
@@ -326,15 +335,12 @@ class PublisherCore {
   // Attempts something until it works, or nobody is in its way; false if it did not. Gives up readers whose time is over.
   template <class Attempt>
   bool wait_for_readers(Lock& lock, std::size_t frame_size, Attempt attempt) {
-    const std::int64_t begin_ns = monotonic_ns();
-    const auto waited_ms = [&] { return (monotonic_ns() - begin_ns) / 1'000'000; };
     while (!attempt()) {
       const std::int64_t patience_ms = readers_.patience_ms(frame_size);
       if (patience_ms < 0) return attempt();
-      const std::int64_t left_ms = std::max<std::int64_t>(patience_ms - waited_ms(), 0);
-      if (await_room(lock, static_cast<std::uint32_t>(left_ms), attempt)) break;
+      if (await_room(lock, static_cast<std::uint32_t>(patience_ms), attempt)) break;
       if (closed_ || pub_sockets_->closed) return false;
-      readers_.give_up(frame_size, waited_ms());
+      readers_.give_up(frame_size, waited_ns_ / 1'000'000);
     }
     return true;
   }
@@ -407,6 +413,7 @@ class PublisherCore {
   PublisherCounters counters_;
   std::int64_t refresh_at_ns_ = 0;
   bool blocked_ = false;
+  std::int64_t waited_ns_ = 0;  // for how long the message that is sent now was held up so far
   bool is_late_ = false;
   std::uint64_t late_until_ = 0;
   bool closed_ = false;

@@ -22,11 +22,12 @@ struct Slot {
   int index = -1;                  // of the slot; -1: there is none
   std::shared_ptr<CortexMap> map;  // the ring's memory
   std::shared_ptr<std::vector<std::uint8_t>> memory;
+  std::int64_t waited_ns = 0;  // for how long readers have held it up
 };
 
 inline Slot private_slot(std::size_t size) {
   auto memory = std::make_shared<std::vector<std::uint8_t>>(size);
-  return {{memory->data(), size}, -1, nullptr, std::move(memory)};
+  return {{memory->data(), size}, -1, nullptr, std::move(memory), 0};
 }
 
 // Most bytes of bodies that wait in the strict sockets of a publisher: few enough to be sent from the cache.
