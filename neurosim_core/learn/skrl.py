@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
-import gymnasium
 import torch
 from skrl.envs.wrappers.torch import Wrapper
 from skrl.utils.spaces.torch import flatten_tensorized_space
@@ -29,25 +29,19 @@ class SkrlEnv(Wrapper):  # type: ignore[misc]
     """
 
     def __init__(self, env: Env, *, actor: str = "actor", critic: str = "critic") -> None:
-        super().__init__(env)
+        self._worlds = env
+        self._value: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None
         self._actor, self._critic = env.obs_groups[actor], env.obs_groups[critic]
         self._now, _ = env.reset(spread=True)
-        self._value: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None
-
-    @property
-    def observation_space(self) -> gymnasium.Space[Any]:
-        """Of a world."""
-        return observation_space(self._now, self._actor)
-
-    @property
-    def state_space(self) -> gymnasium.Space[Any]:
-        """Of a world."""
-        return observation_space(self._now, self._critic)
-
-    @property
-    def action_space(self) -> gymnasium.Space[Any]:
-        """Of a world."""
-        return action_space(self._env)
+        super().__init__(
+            SimpleNamespace(  # of which the base has its properties
+                num_envs=env.num_envs,
+                device=env.device,
+                observation_space=observation_space(self._now, self._actor),
+                state_space=observation_space(self._now, self._critic),
+                action_space=action_space(env),
+            )
+        )
 
     def value_time_outs(
         self, value: Callable[[Mapping[str, torch.Tensor]], torch.Tensor], *, discount_factor: float
@@ -69,7 +63,7 @@ class SkrlEnv(Wrapper):  # type: ignore[misc]
         self, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Act in all worlds; all but observations and information is of shape [N, 1]."""
-        self._now, reward, terminated, truncated, info = self._env.step(actions)
+        self._now, reward, terminated, truncated, info = self._worlds.step(actions)
         if self._value is not None:
             last = info["final_obs"]
             seen = {"observations": _flat(last, self._actor), "states": _flat(last, self._critic)}
@@ -85,7 +79,7 @@ class SkrlEnv(Wrapper):  # type: ignore[misc]
         return _flat(self._now, self._critic)
 
     def render(self, *_: Any, **__: Any) -> None:
-        """Show nothing: `neurosim learn eval --film` films a flight."""
+        """Show nothing; `learn.film` films an episode."""
 
     def close(self) -> None:
         """Nothing to close: memory is freed with the object."""

@@ -2,7 +2,8 @@
 
 The log is cut into windows. Each begins with the measured body rate and is flown open loop with the logged
 commands. What differs from one specimen to the next is estimated from the flight before the window only: the
-thrust for a command, which falls with the battery, and a steady torque, as of a battery that sits off centre.
+thrust for a command, which falls with the battery, and a torque that the model misses, as of a battery that
+sits off centre, or of a gust.
 """
 
 from __future__ import annotations
@@ -32,8 +33,7 @@ Reference: Crazyflie firmware, power_distribution_quadrotor.c, pwmToThrustB and 
 _G_M_S2 = 9.80665  # the unit of the log's accelerometer
 _STEP_S = 1e-3
 _STRIDE = 50  # samples from the beginning of a window to that of the next
-_PAST_S = 3.0  # flight before a window that it is calibrated on
-_PAST_MIN_S = 0.5
+_PAST_S = 0.15  # flight before a window that it is calibrated on; more of it holds other gusts
 _TILT_S = 3.0  # how slowly the mean direction of the specific force corrects the integrated attitude
 _FORCE_S = 0.02  # the accelerometer is averaged over this where it tells the air speed
 _FORCE_EVERY = 10
@@ -128,9 +128,9 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
     past = round(_PAST_S / _STEP_S)
     first = np.arange(past, len(flying) - size, _STRIDE)
     first = first[flown[first + size] - flown[first] == size]
-    first = first[flown[first] - flown[first - past] >= _PAST_MIN_S / _STEP_S]
+    first = first[flown[first] - flown[first - past] == past]
     if len(first) == 0:
-        raise ValueError(f"the log has no {window_s:g} s of flight after {_PAST_MIN_S:g} s of it")
+        raise ValueError(f"the log has no {window_s:g} s of flight after {_PAST_S:g} s of it")
 
     begin = _states(log, config)
     scale, lift = _calibrate(log, config, begin, flying, first, past)
