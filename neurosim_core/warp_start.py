@@ -11,6 +11,8 @@ from pathlib import Path
 
 import warp as wp
 
+_NO_CUDA = ("NVIDIA CUDA driver", "no CUDA-capable device")
+"""What Warp writes where there is no driver, and where there is no device."""
 _owner: int | None = None
 """Process that was the first to compute."""
 
@@ -18,8 +20,9 @@ _owner: int | None = None
 def start_warp() -> None:
     """Start Warp without its lines about devices and modules; set `wp.config.log_level` later to see them.
 
-    The line about a missing CUDA driver is written by native code straight to the standard error stream: the
-    stream is held back while Warp starts, and what else was written to it is written again.
+    The line about a CUDA driver or device that is missing, or hidden by CUDA_VISIBLE_DEVICES, is written by
+    native code straight to the standard error stream: the stream is held back while Warp starts, and what
+    else was written to it is written again.
 
     Raises:
         RuntimeError: This process was forked from one that had computed.
@@ -40,7 +43,7 @@ def start_warp() -> None:
             os.close(stderr)
         held.seek(0)
         lines = held.read().decode(errors="replace").splitlines(keepends=True)
-    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
+    sys.stderr.write("".join(line for line in lines if not any(known in line for known in _NO_CUDA)))
     wp._src.context.runtime.get_clang_pch_dir = _header_folder  # type: ignore[attr-defined]
 
 

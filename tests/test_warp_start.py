@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -21,6 +23,23 @@ def test_an_empty_kernel_cache_is_known(tmp_path, monkeypatch):
 
     wp.launch(store, dim=1, outputs=[wp.zeros(1, dtype=int, device="cpu")], device="cpu")
     assert has_kernels()
+
+
+def test_that_no_device_is_to_be_seen_is_not_told():
+    """As with a driver and CUDA_VISIBLE_DEVICES="": what else is written while Warp starts is kept."""
+    lines = [
+        "Warp CUDA error 100: no CUDA-capable device is detected (in function init_cuda_driver)",
+        "something else",
+    ]
+    program = (
+        "import os, warp as wp\n"
+        "from neurosim_core.warp_start import start_warp\n"
+        "init = wp.init\n"
+        f"wp.init = lambda: (init(), os.write(2, {chr(10).join([*lines, '']).encode()!r}))\n"
+        "start_warp()\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert run.stderr == "something else\n"
 
 
 def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch):

@@ -133,13 +133,20 @@ def measure_still(still: Still) -> dict[str, float]:
 
 
 def measure_refractory(still: Still, rate_hz: Floats) -> float:
-    """Return the dead time after an event [s]: the shortest intervals, less what chance leaves above it."""
+    """Return the dead time after an event [s]: the shortest intervals, less what chance leaves above it.
+
+    Leak alone is never fast: its shortest intervals are as long as the others of their pixels, or far apart.
+    """
     if len(still.interval_s) < 10 * _SHORTEST:
         return 0.0
-    shortest = float(np.partition(still.interval_s, _SHORTEST)[_SHORTEST])
+    few = np.argpartition(still.interval_s, 10 * _SHORTEST - 1)[: 10 * _SHORTEST]
+    few = few[np.argsort(still.interval_s[few])]
+    shortest, later = still.interval_s[few[[_SHORTEST, -1]]].tolist()
     chance = (_SHORTEST + 1) / float(rate_hz[still.interval_pixel].sum())
-    by_chance = 3e-6 < shortest < 0.1 * float(np.median(still.interval_s))  # leak alone is never fast
-    return shortest - chance if by_chance and shortest > 3.0 * chance else 0.0
+    share = float(np.median(still.interval_s[few] * rate_hz[still.interval_pixel[few]]))  # of the mean
+    dense = share < 0.7 and later - shortest < max(30.0 * chance, 3e-6)  # 7.5, without what varies
+    fast = dense or shortest < 0.1 * float(np.median(still.interval_s))
+    return shortest - chance if fast and shortest > max(3.0 * chance, 3e-6) else 0.0
 
 
 def _measure_leak(still: Still, busy: NDArray[np.bool_]) -> tuple[float, float]:

@@ -161,6 +161,8 @@ def fit_sensor(
         if isinstance(again[0], float) and np.ptp(again) > 0.0:
             errors[key] = float(np.std(again, ddof=1)) * math.sqrt(fewer + 1.0 / repeats)
             centred[key] = max(2.0 * settings[key] - float(np.mean(again)), 0.0)  # what all share is chance
+    if "refractory_s" in errors:
+        errors["refractory_s"] = max(errors["refractory_s"], 1e-6)  # stamps are whole microseconds
     share = settings.get("hot_pixels.fraction", 0.0)
     if share:
         errors["hot_pixels.fraction"] = math.sqrt(share * (1.0 - share) / (stimulus.width * stimulus.height))
