@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
-# mypy: disable-error-code="no-untyped-call"
+# mypy: disable-error-code="no-untyped-call,no-redef,var-annotated"
 """Event surfaces: the events of a step of many worlds as pictures for a network, on the device.
 
 A surface is [world, channel, row, column], float32 unless told otherwise, written in place by one or two
