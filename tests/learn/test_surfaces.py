@@ -138,3 +138,28 @@ def test_in_uint8_nothing_is_the_level_of_zero_and_much_is_held():
     assert (seen[1] != 128).any()
     many = np.array([[5_000] * 20, [1] * 20, [2] * 20, [1] * 20])
     assert show(config, [[many]])[0, 0, 2, 1] == 255
+
+
+def test_surfaces_are_those_of_tonic():
+    """Its voxel grids last from the first event to the last, and leave out the moment at the end."""
+    functional = pytest.importorskip("tonic", reason="tonic is not installed").functional
+    size, steps = (WIDTH, HEIGHT, 2), [rows[0] for rows in draw_steps(5, 4, 1)]
+    for step, rows in enumerate(steps):
+        rows[0] = np.minimum(rows[0], (step + 1) * STEP_US - 1)  # its slices do not contain their end
+    steps[0][0, 0] = 0
+    all_events, last = (
+        np.rec.fromarrays(list(rows), names=["t", "x", "y", "p"])
+        for rows in (np.concatenate(steps, axis=1), steps[-1])
+    )
+    tau_us = 10_000
+    expected = functional.to_timesurface_numpy(all_events, size, STEP_US, tau_us, include_incomplete=True)
+    seen = show(TimeSurface(tau_s=(1e-6 * tau_us,)), [[rows] for rows in steps])
+    np.testing.assert_allclose(seen[0], expected[-1], atol=2e-4)
+    seen = show(Counts(), [[rows] for rows in steps])
+    np.testing.assert_array_equal(seen[0], functional.to_frame_numpy(last, size, n_event_bins=1)[0])
+    rows = steps[0]
+    rows[0, -1] = STEP_US
+    events = np.rec.fromarrays(list(rows), names=["t", "x", "y", "p"])
+    seen = show(VoxelGrid(bins=6), [[rows]])
+    grid = functional.to_voxel_grid_numpy(events, size, n_time_bins=5)
+    np.testing.assert_allclose(seen[0, :5], grid[:, 0], atol=2e-4)
