@@ -142,6 +142,9 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
         thrust_n = card["hover_thrust_n"] * (1.0 + card["thrust_span"] * pilot.action[0])
         assert command.thrust_n == pytest.approx(thrust_n)
     ns.load_config(pilot_settings(pilot.card))
+    for x, y in ((8, 0), (0, 8)):
+        with pytest.raises(ValueError, match="trained with 8x8 pixels, and got events of others"):
+            pilot.act([1], [x], [y], [1], stamp_ns=1000, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate)
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
     export_onnx(policy, {**card, "mode": "velocity"}, tmp_path / "other.onnx")
