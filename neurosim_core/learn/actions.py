@@ -34,7 +34,8 @@ def _attitude(task: Task, view: View) -> torch.Tensor:
     x, y = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz
     z, w = cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz
     q = torch.stack([x, y, z, w], dim=1)
-    near = (q * view.orientation).sum(1, keepdim=True) >= 0.0  # q and -q are one attitude: lag must not mix them
+    # q and -q are one attitude, and commands that lag must not mix them
+    near = (q * view.orientation).sum(1, keepdim=True) >= 0.0
     return torch.cat([_thrust_n(task, view), torch.where(near, q, -q)], dim=1)
 
 

@@ -244,7 +244,7 @@ def test_actions_command_an_attitude(make):
 
 
 def test_attitudes_begin_and_go_on_with_the_heading(make):
-    """A command that is late, or lags, is one of the same heading: no vehicle is turned to another and back."""
+    """A command that is late, or lags, is one of the same heading: no vehicle is turned aside."""
     task = calm()
     task.mode, task.tilt_max_rad, task.episode_s = "attitude", 0.4, 8.0
     late = dataclasses.replace(still(), latency_steps=3, lag_s=(0.05, 0.05))

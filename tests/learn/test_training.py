@@ -369,6 +369,15 @@ def test_runs_of_another_version_are_refused(tmp_path, hall):
             read()
 
 
+def test_a_run_from_before_rates_adapted_goes_on(tmp_path, hall):
+    training = run(tmp_path, hall)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert state["teacher"].pop("rate_factor") != 1.0
+    torch.save(state, tmp_path / "checkpoint.pt")
+    training.resume()
+    assert training._trainers["teacher"].descent.rate_factor == 1.0
+
+
 def test_a_task_that_lacks_what_training_needs_says_so(tmp_path, hall):
     with pytest.raises(ValueError, match="the task has no observation 'velocity', which is needed here; it"):
         Training(tmp_path, dataclasses.replace(small(), task="hover-paper"), models=[hall])
