@@ -1,7 +1,7 @@
 """One time for all hosts: that of the registry's host, estimated from the answers to a node's heartbeats.
 
 An answer carries CLOCK_REALTIME of the registry's host, and was made at some moment between question and
-answer: half the round trip is the largest error. Of each second the quickest answer counts, and a line
+answer: half the round trip is the largest error then. Of each second the quickest answer counts, and a line
 through those of a minute gives the drift. The clocks of the hosts need not agree, and may be set. With a
 registry on this host, or none, time is CLOCK_REALTIME itself.
 """
@@ -25,6 +25,8 @@ DRIFT_ERROR_MAX = 20e-6
 """A drift is used once its standard error is smaller."""
 DRIFT_MAX = 500e-6
 """No two clocks of computers run further apart than this."""
+DRIFT_USUAL = 100e-6
+"""Clocks that nobody sets run apart by so much: old answers count less, while the drift is not known."""
 
 
 class Clock(NamedTuple):
@@ -33,7 +35,8 @@ class Clock(NamedTuple):
     ahead_ns: int
     """How far CLOCK_REALTIME of this host is ahead [ns]."""
     error_ns: int
-    """How wrong `ahead_ns` can be: half of the quickest round trip [ns]."""
+    """How wrong `ahead_ns` can be [ns]: half of the quickest round trip, and how far the clocks may have run
+    apart since then: by 0.1 ms a second as long as the drift is not known, else by 20 us."""
     drift_ppm: float | None
     """How much faster this host's clock runs; None: not known to 20 ppm yet, which takes 16 s and more."""
 
@@ -54,6 +57,10 @@ class _Sample(NamedTuple):
     offset_ns: int
     trip_ns: int
 
+    def error_ns(self, now_ns: int, drift: float) -> float:
+        """How wrong it can be by now, if the clocks have run apart by so much in a nanosecond."""
+        return self.trip_ns / 2 + drift * (now_ns - self.at_ns)
+
 
 class ClockEstimate:
     """What a node knows of the time of the registry's host; `add` belongs to one thread.
@@ -66,9 +73,8 @@ class ClockEstimate:
         self.local = local
         self._samples: deque[_Sample] = deque(maxlen=WINDOWS)
         self._window_ns = 0
-        self._has_drift = False
-        self._line = (time.monotonic_ns(), wall_offset_ns(), 0.0)
-        """A time by CLOCK_MONOTONIC, the offset then, and how much it grows in a nanosecond."""
+        self._line: tuple[int, int, float | None] = (time.monotonic_ns(), wall_offset_ns(), None)
+        """By CLOCK_MONOTONIC: a time, the offset then, its growth in 1 ns or None; other threads read it."""
 
     def add(self, asked_ns: int, told_ns: int, answered_ns: int) -> None:
         """Take an answer into account.
@@ -95,16 +101,18 @@ class ClockEstimate:
         self._fit()
 
     def _fit(self) -> None:
-        best = min(self._samples, key=lambda sample: sample.trip_ns)
-        self._line, self._has_drift = (best.at_ns, best.offset_ns, 0.0), False
+        now_ns = self._samples[-1].at_ns
+        best = min(self._samples, key=lambda sample: sample.error_ns(now_ns, DRIFT_USUAL))
+        line: tuple[int, int, float | None] = (best.at_ns, best.offset_ns, None)
         if len(self._samples) >= DRIFT_WINDOWS:
             times, offsets, trips = (
                 np.array([sample[k] - best[k] for sample in self._samples], np.float64) for k in range(3)
             )
-            (drift, offset_ns), spread = np.polyfit(times, offsets, 1, w=1.0 / (trips + JITTER_NS), cov=True)
+            weights = 1.0 / (trips - trips.min() + JITTER_NS)
+            (drift, offset_ns), spread = np.polyfit(times, offsets, 1, w=weights, cov=True)
             if spread[0, 0] < DRIFT_ERROR_MAX**2 and abs(drift) <= DRIFT_MAX:
-                self._line = (best.at_ns, best.offset_ns + round(offset_ns), float(drift))
-                self._has_drift = True
+                line = (best.at_ns, best.offset_ns + round(offset_ns), float(drift))
+        self._line = line
 
     def forget(self) -> None:
         """Another registry answers from now on: begin anew, from where we are."""
@@ -115,16 +123,16 @@ class ClockEstimate:
         if self.local:
             return wall_offset_ns()
         at_ns, offset_ns, drift = self._line
-        return offset_ns + round(drift * (now_ns - at_ns))
+        return offset_ns + round((drift or 0.0) * (now_ns - at_ns))
 
-    def clock(self) -> Clock | None:
+    def clock(self, now_ns: int) -> Clock | None:
         """Return this host's clock beside that of the registry's host; None: it has not answered yet."""
         if self.local:
             return Clock(0, 0, 0.0)
         samples = list(self._samples)
         if not samples:
             return None
-        now_ns = time.monotonic_ns()
-        ahead_ns = wall_offset_ns() - self.offset_ns(now_ns)
-        drift = -self._line[2] * 1e6 if self._has_drift else None
-        return Clock(ahead_ns, min(sample.trip_ns for sample in samples) // 2, drift)
+        ahead_ns, drift = wall_offset_ns() - self.offset_ns(now_ns), self._line[2]
+        unknown_drift = DRIFT_USUAL if drift is None else DRIFT_ERROR_MAX
+        error_ns = min(sample.error_ns(now_ns, unknown_drift) for sample in samples)
+        return Clock(ahead_ns, round(error_ns), None if drift is None else -drift * 1e6)

@@ -174,7 +174,7 @@ class Directory:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
                 message, header = parse_control(frames[0], self._link_types)
                 if isinstance(message, Alive):
-                    self._read_clock(header, now_ns)
+                    self._read_clock(header, time.monotonic_ns())
                 self._on_message(link, message, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1

@@ -76,7 +76,7 @@ class Info(NamedTuple):
     publish_ns: int
     """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
     latency_ns: int
-    """From `publish` to now [ns]; between hosts as good as `Node.clock` says."""
+    """From `publish` to now [ns]; between hosts as good as `Node.clock` of both says, but for 1 ms."""
     size: int
     """Bytes of the body."""
 

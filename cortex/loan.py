@@ -44,7 +44,8 @@ class Loan:
 
         Args:
             message: What to send in place of the draft, in half the time: one whose arrays are those of the
-                draft, where they are. Any other is copied, as by `Publisher.publish`.
+                draft, where they are. Any other is copied, as by `Publisher.publish`; so is each one if its
+                type has arrays of fixed shape, or where a subscriber reads through a socket.
 
         Returns:
             As `Publisher.publish`.

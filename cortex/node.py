@@ -329,7 +329,7 @@ class Node:
 
     def clock(self) -> Clock | None:
         """Return this host's clock beside that of the registry's host; None: it has not answered yet."""
-        return self._directory.clock.clock()
+        return self._directory.clock.clock(time.monotonic_ns())
 
     def wait_for_registry(self, timeout_s: float = 5.0) -> bool:
         """Wait until the registry has told of all nodes; False if it has not in time."""

@@ -130,8 +130,11 @@ def _check_curve(options: argparse.Namespace) -> str:
         raise Fault(
             "this libzmq has no CURVE, so tcp cannot be encrypted: `pip install pyzmq` brings one that has"
         )
-    directory = options.keys or Path(os.environ.get("CORTEX_KEYS") or default_directory())
+    given = options.keys or os.environ.get("CORTEX_KEYS")
+    directory = Path(given or default_directory())
     if not (directory / PUBLIC_FILE).exists():
+        if given:
+            raise Fault(f"no keys in {directory}, so no node can start: `cortex keys new --dir {directory}`")
         return f"there; no keys in {directory} (`cortex keys new` makes some)"
     keys = load_keys(directory)
     return f"keys in {directory}, {len(keys.authorized) - 1} others are authorised"

@@ -34,7 +34,7 @@ def deploy(
     max_thrust_n: float | None = None,
     say: Callable[[str], None] = print,
 ) -> int:
-    """Fly a vehicle by a policy until its simulator ends; in lockstep it answers every odometry.
+    """Fly a vehicle by a policy until it is interrupted; in lockstep it answers every odometry.
 
     The rates of odometry and events must be that of the policy (`neurosim deploy --print-config`).
 
@@ -103,7 +103,7 @@ def deploy(
                 count += 1
                 if duration_s is not None and state.stamp_ns >= 1e9 * duration_s:
                     break
-        except Closed:
+        except (Closed, KeyboardInterrupt):
             pass
     latency = f"; each took {1e3 * np.median(times_s):.2f} ms (median) of computing" if times_s else ""
     say(f"{count} commands{latency}")

@@ -86,7 +86,8 @@ class Env:
         device: Of all tensors.
         sim: The simulator.
         view: What the task sees.
-        observation: What all sensors yielded last.
+        observation: What all sensors yielded last. Events are there until episodes begin anew, which on CUDA
+            is asked for in each step: read them in `Task.advance`.
         episode_steps: Steps after which an episode is truncated.
         action_count: Numbers in an action, each in [-1, 1].
         episode_length: Steps since each episode began, int32, shape [N].

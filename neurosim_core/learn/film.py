@@ -12,7 +12,7 @@ import torch
 from neurosim_core.flight import saved_flight
 from neurosim_core.learn.env import CAMERA, Env
 from neurosim_core.learn.evaluate import EPISODE_SEED, Actor
-from neurosim_core.learn.task import Task
+from neurosim_core.learn.task import Task, View
 from neurosim_core.packets import Events, Image, Odometry, Packet
 
 _HEIGHT_PX = 220
@@ -43,22 +43,32 @@ def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED
         ValueError: The file is neither.
         OSError: It cannot be written.
     """
+    advance = env.task.advance
     with saved_flight(file, env.sim.model) as write:
+
+        def film(view: View) -> None:
+            _write(env, write)  # before episodes begin anew, which leaves no events
+            advance(view)
+
         observations, _ = env.reset(seed=seed)
+        _write(env, write)
+        env.task.advance = film  # type: ignore[method-assign]
         begun = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-        for sequence in range(env.episode_steps):
-            _write(env, sequence, write)
-            observations, _, terminated, truncated, _ = env.step(actor(observations, begun))
-            begun = terminated | truncated
-            if begun[0]:
-                return
+        try:
+            for _ in range(env.episode_steps):
+                observations, _, terminated, truncated, _ = env.step(actor(observations, begun))
+                begun = terminated | truncated
+                if begun[0]:
+                    break
+        finally:
+            env.task.advance = advance  # type: ignore[method-assign]
 
 
-def _write(env: Env, sequence: int, write: Callable[[Packet], None]) -> None:
+def _write(env: Env, write: Callable[[Packet], None]) -> None:
     """Write what the sensors of the first world yielded."""
     seen = env.observation
     stamp_ns = int(seen.clock_ns.numpy()[0])
-    header: dict[str, Any] = {"stamp_ns": stamp_ns, "sequence": sequence}
+    header: dict[str, Any] = {"stamp_ns": stamp_ns, "sequence": round(1e-9 * stamp_ns * env.task.rate_hz)}
     write(Image(**header, sensor="rgb", data=np.array(seen.images["rgb"].numpy()[0]), encoding="rgb8"))
     state = {name: rows.numpy()[-1, 0] for name, rows in seen.samples["odometry"].arrays.items()}
     write(Odometry(**header, sensor="odometry", **state))

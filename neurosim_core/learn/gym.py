@@ -92,11 +92,15 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
 def observation_space(observations: Observations, names: Collection[str] | None) -> Dict:
     """Return the space of a world for observations of these names; None: of all."""
     spaces: dict[str, gymnasium.Space[Any]] = {
-        name: Box(-np.inf, np.inf, shape=tuple(value.shape[1:]), dtype=np.float32)
+        name: Box(*_bounds(value), shape=tuple(value.shape[1:]), dtype=value[:0].cpu().numpy().dtype.type)
         for name, value in observations.items()
         if names is None or name in names
     }
     return Dict(spaces)
+
+
+def _bounds(value: torch.Tensor) -> tuple[float, float]:
+    return (-np.inf, np.inf) if value.is_floating_point() else (0, torch.iinfo(value.dtype).max)
 
 
 def action_space(env: Env) -> Box:

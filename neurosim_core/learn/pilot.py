@@ -127,7 +127,8 @@ class Pilot:
         turn = 2.0 * np.cross(xyz, down)
         gravity = down - w * turn + np.cross(xyz, turn)  # rotated by the inverse
         vector = np.concatenate([gravity, 0.3 * np.asarray(body_rate), self.action]).astype(np.float32)
-        inputs = {"events": self._surface.array.numpy(), "vector": vector[None], "memory": self._memory}
+        surface = self._surface.array.numpy().astype(np.float32, copy=False)
+        inputs = {"events": surface, "vector": vector[None], "memory": self._memory}
         action, self._memory = self._session.run(None, inputs)
         self.action = action[0]
         card = self.card

@@ -1,16 +1,16 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
-# mypy: disable-error-code="no-untyped-call"
+# mypy: disable-error-code="no-untyped-call,no-redef,var-annotated"
 """Event surfaces: the events of a step of many worlds as pictures for a network, on the device.
 
-A surface is [world, channel, row, column], float32, written in place by one or two kernels after each step;
-nothing is allocated and nothing waits for the device. Sums are of fixed-point numbers, so that the order in
-which threads add does not change a bit.
+A surface is [world, channel, row, column], float32 unless told otherwise, written in place by one or two
+kernels after each step; nothing is allocated and nothing waits for the device. Sums are of fixed-point
+numbers, so that the order in which threads add does not change a bit.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import warp as wp
 
@@ -20,10 +20,24 @@ _ONE = wp.constant(65536.0)  # of the fixed-point sums: a pixel has room for 32,
 _NEVER_US = wp.constant(wp.int64(-(1 << 60)))
 _THREADS_ON_CUDA = 256
 """Threads that share the events of a world."""
+_DTYPES: dict[str, Any] = {"float32": wp.float32, "float16": wp.float16, "uint8": wp.uint8}
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimeSurface:
+class _Shown:
+    dtype: Literal["float32", "float16", "uint8"] = "float32"
+    """Of the surface. What is remembered from step to step stays float32 or whole microseconds."""
+
+    uint8_levels: ClassVar[tuple[float, float]] = (1.0, 0.0)
+    """Levels that 1 and 0 are apart, and level of 0, in uint8: values are rounded, and held in [0, 255]."""
+
+    def __post_init__(self) -> None:
+        if self.dtype not in _DTYPES:
+            raise ValueError(f"dtype must be {', '.join(_DTYPES)}, got {self.dtype!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeSurface(_Shown):
     """exp(-(now - t) / tau) of the last event of each pixel: channels off and on for each tau.
 
     Reference: Lagorce et al. (2017), "HOTS", eq. (3).
@@ -32,7 +46,10 @@ class TimeSurface:
     tau_s: tuple[float, ...] = (0.01, 0.05)
     """Time constants [s]."""
 
+    uint8_levels: ClassVar[tuple[float, float]] = (255.0, 0.0)
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_tau(self.tau_s)
 
     @property
@@ -42,7 +59,7 @@ class TimeSurface:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeakySurface:
+class LeakySurface(_Shown):
     """The sum of exp(-(now - t) / tau) over all events of a pixel: channels off and on for each tau.
 
     It shows how recent and how frequent events are.
@@ -51,7 +68,10 @@ class LeakySurface:
     tau_s: tuple[float, ...] = (0.01,)
     """Time constants [s]."""
 
+    uint8_levels: ClassVar[tuple[float, float]] = (16.0, 0.0)
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_tau(self.tau_s)
 
     @property
@@ -61,7 +81,7 @@ class LeakySurface:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Counts:
+class Counts(_Shown):
     """The events of the last step in each pixel: channels off and on."""
 
     @property
@@ -71,7 +91,7 @@ class Counts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VoxelGrid:
+class VoxelGrid(_Shown):
     """Polarity (-1, 1) of the events of the last step, shared between the two nearest of B moments of it.
 
     Moment b is at b / (B - 1) of the step; with one bin all events are in it.
@@ -83,7 +103,10 @@ class VoxelGrid:
     bins: int = 5
     """B."""
 
+    uint8_levels: ClassVar[tuple[float, float]] = (16.0, 128.0)
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1 <= self.bins <= 64:
             raise ValueError(f"bins must be in [1, 64], got {self.bins}")
 
@@ -100,6 +123,21 @@ SurfaceConfig = TimeSurface | LeakySurface | Counts | VoxelGrid
 def _check_tau(tau_s: tuple[float, ...]) -> None:
     if not tau_s or not all(0.0 < tau < float("inf") for tau in tau_s):
         raise ValueError(f"tau_s must be one or more numbers > 0, got {tau_s}")
+
+
+@wp.func
+def _as_shown(value: wp.float32, zero: wp.float32, levels: wp.vec2) -> wp.float32:
+    return value
+
+
+@wp.func
+def _as_shown(value: wp.float32, zero: wp.float16, levels: wp.vec2) -> wp.float16:
+    return wp.float16(value)
+
+
+@wp.func
+def _as_shown(value: wp.float32, zero: wp.uint8, levels: wp.vec2) -> wp.uint8:
+    return wp.uint8(int(wp.clamp(wp.rint(value * levels[0] + levels[1]), 0.0, 255.0)))
 
 
 @wp.kernel
@@ -125,18 +163,19 @@ def _note_last(
 def _show_last(
     # Model:
     tau_us: wp.array[wp.float32],
+    levels: wp.vec2,
     # In:
     last_us: wp.array4d[wp.int64],
     now_ns: wp.array[wp.int64],
     # Out:
-    surface_out: wp.array4d[wp.float32],
+    surface_out: wp.array4d[Any],
 ) -> None:
     world, channel, row, column = wp.tid()
     last = last_us[world, channel % 2, row, column]
     value = wp.float32(0.0)
     if last != _NEVER_US:
         value = wp.exp(-wp.float32(now_ns[world] / wp.int64(1000) - last) / tau_us[channel / 2])
-    surface_out[world, channel, row, column] = value
+    surface_out[world, channel, row, column] = _as_shown(value, surface_out.dtype(0), levels)
 
 
 @wp.func
@@ -220,10 +259,13 @@ def _add_voxels(
 def _show_sums(
     # Model:
     decay: wp.array[wp.float32],
+    levels: wp.vec2,
     stride: int,
     # In/out:
     sums: wp.array2d[wp.int32],
-    surface: wp.array2d[wp.float32],
+    values: wp.array2d[wp.float32],
+    # Out:
+    surface_out: wp.array2d[Any],
 ) -> None:
     plane, lane = wp.tid()  # two axes: with four, CUDA spends more on indices than on sums
     share = decay[plane % decay.shape[0]]
@@ -231,19 +273,24 @@ def _show_sums(
         added = sums[plane, pixel]
         if added != 0:
             sums[plane, pixel] = 0
-        surface[plane, pixel] = surface[plane, pixel] * share + wp.float32(added) / _ONE
+        value = values[plane, pixel] * share + wp.float32(added) / _ONE
+        values[plane, pixel] = value
+        if surface_out.shape[0] > 0:  # else the values are what is shown
+            surface_out[plane, pixel] = _as_shown(value, surface_out.dtype(0), levels)
 
 
 @wp.kernel
 def _forget(
     # In:
     mask: wp.array[wp.int32],
+    levels: wp.vec2,
     stride: int,
     # In/out:
     last_us: wp.array4d[wp.int64],
-    surface: wp.array4d[wp.float32],
+    values: wp.array4d[wp.float32],
+    surface: wp.array4d[Any],
     # Out:
-    ended_out: wp.array4d[wp.float32],
+    ended_out: wp.array4d[Any],
 ) -> None:
     world, lane = wp.tid()
     if mask[world] == 0:
@@ -257,10 +304,19 @@ def _forget(
         column = place % columns
         if world < ended_out.shape[0]:
             ended_out[world, channel, row, column] = surface[world, channel, row, column]
-        surface[world, channel, row, column] = 0.0
+        surface[world, channel, row, column] = _as_shown(0.0, surface.dtype(0), levels)
+        if channel < values.shape[1]:
+            values[world, channel, row, column] = 0.0
         if channel < last_us.shape[1]:
             last_us[world, channel, row, column] = _NEVER_US
         place += stride
+
+
+for _dtype in _DTYPES.values():  # all at once: a module is built anew for each that is added later
+    _planes, _worlds = wp.array2d(dtype=_dtype), wp.array4d(dtype=_dtype)
+    wp.overload(_show_last, {"surface_out": _worlds})
+    wp.overload(_show_sums, {"surface_out": _planes})
+    wp.overload(_forget, {"surface": _worlds, "ended_out": _worlds})
 
 
 class EventSurface:
@@ -276,7 +332,8 @@ class EventSurface:
         keep_ended: Keep what `forget` clears.
 
     Attributes:
-        array: The surfaces, float32, shape [N, channel, H, W]; overwritten by `update` and `forget`.
+        array: The surfaces, of the dtype of the config, shape [N, channel, H, W]; overwritten by `update` and
+            `forget`.
         ended: What each showed when it was cleared last, likewise; empty if it is not kept.
     """
 
@@ -296,8 +353,11 @@ class EventSurface:
         self._step_us = 1e6 * step_s
         self._lanes = _THREADS_ON_CUDA if self._device.is_cuda else 1
         shape = (world_count, config.channel_count, height, width)
-        self.array: Any = wp.zeros(shape, dtype=wp.float32, device=device)
-        self.ended: Any = wp.zeros(shape if keep_ended else (0, 0, 0, 0), dtype=wp.float32, device=device)
+        none, dtype = (0, 0, 0, 0), _DTYPES[config.dtype]
+        self._levels = wp.vec2(*config.uint8_levels)
+        nothing = int(config.uint8_levels[1]) if config.dtype == "uint8" else 0
+        self.array: Any = wp.full(shape, value=nothing, dtype=dtype, device=device)
+        self.ended: Any = wp.zeros(shape if keep_ended else none, dtype=dtype, device=device)
         tau_us = [1e6 * tau for tau in getattr(config, "tau_s", ())]
         self._tau_us: Any = wp.array(tau_us, dtype=wp.float32, device=device)
         decays = [0.0] * config.channel_count
@@ -306,10 +366,17 @@ class EventSurface:
         self._decay: Any = wp.array(decays, dtype=wp.float32, device=device)
         is_last = isinstance(config, TimeSurface)
         self._last: Any = wp.full(
-            (world_count, 2, height, width) if is_last else (0, 0, 0, 0),
+            (world_count, 2, height, width) if is_last else none,
             value=wp.int64(-(1 << 60)), dtype=wp.int64, device=device,
         )  # fmt: skip
-        self._sums: Any = wp.zeros((0, 0, 0, 0) if is_last else shape, dtype=wp.int32, device=device)
+        self._sums: Any = wp.zeros(none if is_last else shape, dtype=wp.int32, device=device)
+        self._values, converted = self.array, wp.zeros((0, 0), dtype=dtype, device=device)
+        planes = (world_count * config.channel_count, height * width)
+        if is_last or config.dtype != "float32":
+            self._values = wp.zeros(none if is_last else shape, dtype=wp.float32, device=device)
+            converted = self.array.reshape(planes)
+        if not is_last:
+            self._flat = [self._sums.reshape(planes), self._values.reshape(planes), converted]
 
     def update(self, events: Any, now_ns: Any) -> None:
         """Add the events of a step, and show them.
@@ -338,17 +405,19 @@ class EventSurface:
     def show(self, now_ns: Any) -> None:
         """Write the surfaces at the end of a step."""
         if isinstance(self.config, TimeSurface):
-            self._launch(_show_last, self.array.shape, [self._tau_us, self._last, now_ns], [self.array])
+            self._launch(
+                _show_last, self.array.shape, [self._tau_us, self._levels, self._last, now_ns], [self.array]
+            )
             return
-        planes = (self.array.shape[0] * self.array.shape[1], self.array.shape[2] * self.array.shape[3])
-        flat = [self._sums.reshape(planes), self.array.reshape(planes)]
-        stride = -(-planes[1] // 4) if self._device.is_cuda else 1
-        self._launch(_show_sums, (planes[0], stride), [self._decay, stride], flat)
+        count, size = self._flat[0].shape
+        stride = -(-size // 4) if self._device.is_cuda else 1
+        self._launch(_show_sums, (count, stride), [self._decay, self._levels, stride], self._flat)
 
     def forget(self, mask: Any) -> None:
         """Clear the surfaces of worlds that begin anew; `mask` is a device array of int32, shape [N]."""
         dim = (self.array.shape[0], self._lanes)
-        self._launch(_forget, dim, [mask, self._lanes], [self._last, self.array, self.ended])
+        changed = [self._last, self._values, self.array, self.ended]
+        self._launch(_forget, dim, [mask, self._levels, self._lanes], changed)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

@@ -448,5 +448,6 @@ class Antialiasing:
             return
         self._lists.count.zero_()
         even = even_thread_count(pixel_count, view.instant_count)
-        for kernel, dim in zip(self._kernels, (even, *2 * [self._lists.threads]), strict=True):
+        threads = self._lists.threads
+        for kernel, dim in zip(self._kernels, (even, threads // 4, threads), strict=True):
             launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)

@@ -46,8 +46,8 @@ _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
 _COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
-_THREADS_PER_MULTIPROCESSOR = 1280
-"""Threads of kernels that go through lists: more than run at a time, since some take longer than others."""
+_THREADS_PER_MULTIPROCESSOR = 5120
+"""Threads of the kernel of rays: far more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
@@ -65,7 +65,7 @@ class BlockLists:
     count: wp.array[int]
     """Length of the two lists, and how many entries of the first are taken."""
     threads: int
-    """Threads of the kernels that go through them."""
+    """Threads of the kernel that goes through the second one; a quarter as many take entries of the first."""
 
 
 class GroupKernels(NamedTuple):

@@ -293,6 +293,8 @@ def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> Non
     assert status == 0, output
     assert output.count("ok  ") == 7
     assert "shared memory" in output.splitlines()[-1]
+    status, output, _ = cortex("doctor", environment={**environment, "CORTEX_KEYS": str(tmp_path / "none")})
+    assert (status, output.count("WRONG"), output.count("none, so no node can start")) == (1, 1, 1)
     status, output, _ = cortex("doctor", environment={**environment, "CORTEX_PURE_PYTHON": "1"})
     assert status == 1
     assert "WRONG  C module: CORTEX_PURE_PYTHON leaves it out" in output

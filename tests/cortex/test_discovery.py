@@ -305,6 +305,35 @@ def test_no_clock_but_the_monotonic_one():
         assert "datetime" not in text
 
 
+def test_an_answer_that_comes_while_others_are_read_took_until_it_is_read(make, monkeypatch):
+    """Else the round trip, and with it the error of the clock, seems shorter than it was."""
+    with serving(listen="tcp://127.0.0.1:0") as registry:
+        one = make("one", registry=str(registry.address))
+        drive([one], lambda: one.directory.clock.clock(time.monotonic_ns()))
+        directory, link, waits_s = one.directory, one.directory._link, 0.2
+        alive = Alive(link.epoch, link.version, directory._own.revision)
+
+        class Slow:
+            """Has an answer to what was asked after `handle` has begun."""
+
+            frames = iter([True])
+
+            def recv_multipart(self, flags):
+                if not next(self.frames, False):
+                    raise zmq.Again
+                asked_ns = time.monotonic_ns()
+                time.sleep(waits_s)
+                return [control_frame(alive, asked_ns, told_ns=time.time_ns())]
+
+        added = []
+        with monkeypatch.context() as slow:
+            slow.setattr(directory.clock, "add", lambda *times: added.append(times))
+            slow.setattr(link, "socket", Slow())
+            directory.handle()
+        ((asked_ns, _, answered_ns),) = added
+        assert answered_ns - asked_ns >= waits_s * 1e9
+
+
 def test_files_of_a_node_that_left_are_gone(base):
     with node_process("one", node=5) as one:
         read_until(one, lambda seen: seen["connected"])

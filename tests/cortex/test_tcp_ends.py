@@ -108,21 +108,22 @@ def read(node, generator):
 
 
 def publish(child, reading, generator):
-    """Begin to publish, once both ends know of each other, and then close; how many it will be."""
+    """Begin to publish, once both ends know of each other, and then close; how many, and by which port."""
     count = generator.randrange(1, 1500)
     child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
     assert reading.subscriber.wait_for_publisher(SOON_S)
+    (link,) = reading.subscriber._links
     rate_hz = generator.choice([0.0, 5000.0])
     child.say(do="publish", topic="/blocks", count=count, sizes=generator.choice(SIZES), rate_hz=rate_hz)
     child.say(do="counters", topic="/blocks")
     child.say(do="close", topic="/blocks")
-    return count
+    return count, int(link.address.rpartition(":")[2])
 
 
 def a_publisher_closes(node, child, start_child, generator, tmp_path):
     reading = read(node, generator)
-    count = publish(child, reading, generator)
+    count, _ = publish(child, reading, generator)
     delivered, published = child.hear()["delivered"], child.hear()
     child.hear()
     reading.wait_for_end()
@@ -136,9 +137,7 @@ def a_publisher_closes(node, child, start_child, generator, tmp_path):
 def connections_are_cut(node, child, start_child, generator, tmp_path):
     """Those that the reader has to its publisher; ZeroMQ makes new ones, and what was on its way is lost."""
     reading = read(node, generator)
-    count = publish(child, reading, generator)
-    (link,) = wait_for(lambda: reading.subscriber._links)
-    port = int(link.address.rpartition(":")[2])
+    count, port = publish(child, reading, generator)
     for _ in range(generator.randrange(1, 4)):
         time.sleep(generator.uniform(0.0, 0.15))
         cut_connections(port)

@@ -113,7 +113,7 @@ def test_hot_pixels_are_told_among_pixels_of_many_rates():
 def test_a_dead_time_is_found_in_fast_noise(rate_hz, refractory_s):
     """It is more than a tenth of the time between two events of most pixels, or of the hot ones."""
     truth = {"shot_noise.rate_hz": rate_hz, "shot_noise.bright_factor": 1.0, "refractory_s": refractory_s}
-    hot = {"hot_pixels.fraction": 0.02, "hot_pixels.rate_hz": 400.0, "hot_pixels.on_fraction": 0.9}
+    hot = {"hot_pixels.fraction": 0.05, "hot_pixels.rate_hz": 400.0, "hot_pixels.on_fraction": 0.9}
     still = record_still(truth | (hot if rate_hz > 10.0 else {}), seed=5)
     fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=still, span_s=SPAN_S), repeats=2)
     assert fit.settings["refractory_s"] == pytest.approx(refractory_s, rel=0.01)

@@ -119,6 +119,17 @@ def test_observations_share_memory_with_the_simulator(make):
     assert observations["events"].dtype == torch.float32
 
 
+@pytest.mark.parametrize("dtype", ["float16", "uint8"])
+def test_surfaces_come_in_the_type_that_is_asked_for(make, dtype):
+    shown = ns.learn.Counts(dtype=dtype)
+    (exact, _), (seen, _) = (
+        roll(make(surface=each), actions_of(12, 3)) for each in (ns.learn.Counts(), shown)
+    )
+    assert seen["events"].dtype == getattr(torch, dtype)
+    assert seen["events"].any()
+    assert torch.equal(seen["events"].float(), exact["events"])  # also where episodes began anew
+
+
 def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors):
     drawn = Randomisation(lag_s=(0.01, 0.05), mass_factor=(0.9, 1.1), wind_m_s=1.0)
     env = make(randomise=drawn)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -106,5 +107,59 @@ def test_the_neighbours_of_a_world_change_no_bit_of_it():
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="tau_s must be"):
         TimeSurface(tau_s=())
+    with pytest.raises(ValueError, match="dtype must be"):
+        Counts(dtype="int8")
     with pytest.raises(ValueError, match="bins must be"):
         VoxelGrid(bins=0)
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{type(c).__name__}-{c.channel_count}")
+@pytest.mark.parametrize("dtype", ["float16", "uint8"])
+def test_other_types_show_the_same_values_rounded(config, dtype):
+    """Also after worlds began anew: what is remembered is not rounded."""
+    steps, forget = draw_steps(3, 5, 3), {1: [0, 1, 0]}
+    exact = show(config, steps, forget)
+    expected = exact.astype(np.float16)
+    if dtype == "uint8":
+        gain, zero = config.uint8_levels
+        expected = np.clip(np.rint(exact * np.float32(gain) + np.float32(zero)), 0, 255).astype(np.uint8)
+    seen = show(dataclasses.replace(config, dtype=dtype), steps, forget)
+    assert seen.dtype == dtype
+    assert len(np.unique(seen)) > 3
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_in_uint8_nothing_is_the_level_of_zero_and_much_is_held():
+    config = VoxelGrid(bins=1, dtype="uint8")
+    assert (show(config, [[np.zeros((4, 0), np.int64)]]) == 128).all()
+    steps = draw_steps(0, 1, 2)
+    seen = show(config, steps, forget={0: [1, 0]})
+    assert (seen[0] == 128).all()
+    assert (seen[1] != 128).any()
+    many = np.array([[5_000] * 20, [1] * 20, [2] * 20, [1] * 20])
+    assert show(config, [[many]])[0, 0, 2, 1] == 255
+
+
+def test_surfaces_are_those_of_tonic():
+    """Its voxel grids last from the first event to the last, and leave out the moment at the end."""
+    functional = pytest.importorskip("tonic", reason="tonic is not installed").functional
+    size, steps = (WIDTH, HEIGHT, 2), [rows[0] for rows in draw_steps(5, 4, 1)]
+    for step, rows in enumerate(steps):
+        rows[0] = np.minimum(rows[0], (step + 1) * STEP_US - 1)  # its slices do not contain their end
+    steps[0][0, 0] = 0
+    all_events, last = (
+        np.rec.fromarrays(list(rows), names=["t", "x", "y", "p"])
+        for rows in (np.concatenate(steps, axis=1), steps[-1])
+    )
+    tau_us = 10_000
+    expected = functional.to_timesurface_numpy(all_events, size, STEP_US, tau_us, include_incomplete=True)
+    seen = show(TimeSurface(tau_s=(1e-6 * tau_us,)), [[rows] for rows in steps])
+    np.testing.assert_allclose(seen[0], expected[-1], atol=2e-4)
+    seen = show(Counts(), [[rows] for rows in steps])
+    np.testing.assert_array_equal(seen[0], functional.to_frame_numpy(last, size, n_event_bins=1)[0])
+    rows = steps[0]
+    rows[0, -1] = STEP_US
+    events = np.rec.fromarrays(list(rows), names=["t", "x", "y", "p"])
+    seen = show(VoxelGrid(bins=6), [[rows]])
+    grid = functional.to_voxel_grid_numpy(events, size, n_time_bins=5)
+    np.testing.assert_allclose(seen[0, :5], grid[:, 0], atol=2e-4)

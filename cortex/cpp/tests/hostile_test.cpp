@@ -383,8 +383,8 @@ class Attacked {
 
   void run(std::uint64_t writes) {
     std::atomic<bool> done{false};
-    std::thread attacker([&] {
-      Random random(random_());
+    std::thread attacker([&, seed = random_()] {
+      Random random(seed);
       for (std::uint64_t count = 0; count < writes; count += batch) {
         steps_.wait();
         const std::lock_guard<std::mutex> lock(mutex_);

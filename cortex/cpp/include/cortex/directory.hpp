@@ -224,7 +224,7 @@ class Directory {
     if (frame.is<records::Welcome>()) {
       on_welcome(frame.as<records::Welcome>(), now_ns);
     } else if (frame.is<records::Alive>()) {
-      read_clock(frame.header, now_ns);
+      read_clock(frame.header, monotonic_ns());
       on_alive(frame.as<records::Alive>(), now_ns);
     } else if (frame.is<records::Changed>()) {
       on_changed(frame.as<records::Changed>());

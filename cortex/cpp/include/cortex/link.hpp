@@ -168,7 +168,10 @@ class Link {
       reject(error.what());
       // A message that was rejected is accounted for, if it is the one that was to come.
       const bool large = (header.kind == 'L' || header.kind == 'S') && header.source == source_;
-      if (large && known_ && header.sequence == expected_) ++expected_;
+      if (large && known_ && header.sequence == expected_) {
+        ++expected_;
+        is_told_ = false;
+      }
       return false;
     }
   }
