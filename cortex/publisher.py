@@ -155,6 +155,7 @@ class Publisher(Generic[T]):
         if self._back_pressure.is_waiting:
             self._prepare(now_ns)
         self._check_open()
+        self._back_pressure.begin()
         exact = self.codec.fixed_size is not None
         return self._fanout.ring.acquire(size, exact=exact, may_wait=may_wait)
 
@@ -213,7 +214,6 @@ class Publisher(Generic[T]):
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
-                self._back_pressure.begin()
                 slot = self._acquire(size, now_ns, may_wait=may_wait)
                 if slot is None and self._fanout.ring.has_slots(size):
                     return None

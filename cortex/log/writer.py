@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 from pathlib import Path
 from types import TracebackType
@@ -60,15 +61,15 @@ class LogWriter:
             OSError: The disk is full.
         """
         codec = codec_of(type(message))
+        body = codec.encode(message, BODY_LIMIT)
+        if body is None:
+            raise ValueError(f"{topic}: the message has more than {BODY_LIMIT} bytes")
         key = check_topic(topic), codec.fingerprint
         if key not in self._channels:
             self._channels[key] = self._add_channel(topic, codec), 0
         channel, count = self._channels[key]
         self._channels[key] = channel, count + 1
         self._last_ns = max(self._last_ns, at_ns)
-        body = codec.encode(message, BODY_LIMIT)
-        if body is None:
-            raise ValueError(f"{topic}: the message has more than {BODY_LIMIT} bytes")
         self._writer.add_message(
             channel, log_time=self._last_ns, data=body, publish_time=max(at_ns, 0), sequence=count
         )
@@ -90,11 +91,15 @@ class LogWriter:
         return int(self._writer.register_channel(topic, MESSAGE_ENCODING, number, metadata))
 
     def close(self) -> None:
-        """Write the file's summary. Closing twice is allowed."""
-        if self._writer is not None:
-            self._writer.finish()
-            self._writer = None
-            self._sink.close()
+        """Write the file's summary. Closing twice is allowed.
+
+        Raises:
+            OSError: The disk is full; the file is closed all the same.
+        """
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with contextlib.closing(self._sink):
+                writer.finish()
 
     def __enter__(self) -> LogWriter:
         return self

@@ -73,6 +73,7 @@ class Policy {
   }
 
   void add(const Events& events, std::int64_t now_ns) {
+    if (events.width != width_ || events.height != height_) throw std::runtime_error("events of another camera");
     for (std::size_t event = 0; event < events.t.size(); ++event) {
       const double age_s = 1e-6 * static_cast<double>(now_ns / 1000 - events.t[event]);
       for (std::size_t scale = 0; scale < tau_s_.size(); ++scale) {

@@ -20,7 +20,12 @@ def _vehicles() -> dict[str, MultirotorConfig]:
     inertia = tuple(
         tuple(moment * (row == column) for column in range(3)) for row, moment in enumerate(moments)
     )
-    table = {"inertia_kg_m2": inertia, "torque_coefficient_n_m_s2": 7.8e-10}
+    table = {
+        "inertia_kg_m2": inertia,
+        "torque_coefficient_n_m_s2": 7.8e-10,
+        "motor_time_constant_s": 0.072,
+        "rotor_position_m": tuple((x, y, 0.0) for x, y, _ in preset("crazyflie").rotor_position_m),
+    }
     return {"crazyflie": preset("crazyflie"), "RotorPy 3.0.0's table": preset("crazyflie", **table)}
 
 

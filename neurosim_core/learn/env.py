@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import torch
 import warp as wp
 
-from neurosim_core.learn.actions import hover_command
+from neurosim_core.learn.actions import COMMANDS, hover_command
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
@@ -350,14 +350,15 @@ class Env:
         )
         for array in (view.action, view.last_action):
             array.masked_fill_(mask, 0.0)
-        self._queue = torch.where(mask, self._hover, self._queue)
-        self._lagging = torch.where(mask, self._hover, self._lagging)
         self.episode_length.masked_fill_(self._mask, 0)
         view.elapsed_s.masked_fill_(self._mask, 0.0)
         if self._surface is not None:
             self._mask_int.copy_(self._mask)
             self._surface.forget(wp.from_torch(self._mask_int))
         self._look(observation)
+        hover = COMMANDS["attitude"](self.task, view) if self.task.mode == "attitude" else self._hover
+        self._queue = torch.where(mask, hover, self._queue)
+        self._lagging = torch.where(mask, hover, self._lagging)
         self.task.begin(view, self._mask)
 
     def _throw(self) -> None:

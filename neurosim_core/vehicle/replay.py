@@ -2,16 +2,18 @@
 
 The log is cut into windows. Each begins with the measured body rate and is flown open loop with the logged
 commands. What differs from one specimen to the next is estimated from the flight before the window only: the
-thrust for a command, which falls with the battery, and a torque that the model misses, as of a battery that
-sits off centre, or of a gust.
+thrust for a command, which falls with the battery, and the torque that the model misses. A Kalman filter
+takes that for the sum of two: one hardly changes, as of a battery that sits off centre, and one is forgotten,
+as of a gust; within the window the first stays and the second fades.
 """
 
 from __future__ import annotations
 
 import gzip
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +35,16 @@ Reference: Crazyflie firmware, power_distribution_quadrotor.c, pwmToThrustB and 
 _G_M_S2 = 9.80665  # the unit of the log's accelerometer
 _STEP_S = 1e-3
 _STRIDE = 50  # samples from the beginning of a window to that of the next
-_PAST_S = 0.15  # flight before a window that it is calibrated on; more of it holds other gusts
+_PAST_S = 0.15  # flight before a window that tells the thrust for a command
+_DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.CRAZYFLIE
+_FILTER_STEP_S = 0.01
+# what the model misses, about x, y, z: maximum likelihood of what the filter predicts for its next step, the
+# geometric mean of two flights of 50 and 62 s; alike about x and y
+_FADING_RAD_S2 = np.array([8.0, 8.0, 0.89])  # the flights: 7.6 and 8.5; 0.71 and 1.10
+_FADING_S = np.array([0.13, 0.13, 0.037])  # 0.136 and 0.124; 0.078 and 0.018
+_NOISE_RAD_S2 = np.array([0.91, 0.91, 0.68])  # of the mean over a step; 1.25 and 0.66; 0.88 and 0.53
+_DRIFT_RAD_S2_PER_SQRT_S = np.array([1.4, 1.4, 0.13])  # of the steady part; 1.46 and 1.35; 0.08 and 0.21
+_STEADY_RAD_S2 = 20.0  # before anything is known
 _TILT_S = 3.0  # how slowly the mean direction of the specific force corrects the integrated attitude
 _FORCE_S = 0.02  # the accelerometer is averaged over this where it tells the air speed
 _FORCE_EVERY = 10
@@ -101,7 +112,9 @@ def rotor_thrust_n(pwm: Array) -> Array:
     return duty * (PWM_THRUST_N[0] + duty * PWM_THRUST_N[1])
 
 
-def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -> Replay:
+def replay(
+    log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3, delay_s: float = _DELAY_S
+) -> Replay:
     """Fly a vehicle open loop through every window of a log in which the real one flew.
 
     The air speed at the beginning of a window is what the accelerometer says in the plane of the rotors, by
@@ -111,6 +124,7 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
         log: Of a Crazyflie.
         config: The vehicle; rotors front left, front right, rear right, rear left, with rotor drag.
         window_s: Length of a window [s].
+        delay_s: From a logged command to its effect in the log, beside the lag of the motors [s].
 
     Raises:
         ValueError: The vehicle has not these rotors or no rotor drag, or the log has no such flight.
@@ -123,6 +137,8 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
             f"rotor_drag_kg = {config.rotor_drag_kg:g} and rotor_position_m = {config.rotor_position_m}"
         )
     size = round(window_s / _STEP_S)
+    late = round(delay_s / _STEP_S)
+    log = replace(log, pwm=np.concatenate([np.repeat(log.pwm[:1], late, axis=0), log.pwm])[: len(log.pwm)])
     flying = _flying(log)
     flown = np.concatenate([[0], np.cumsum(flying)])
     past = round(_PAST_S / _STEP_S)
@@ -133,11 +149,11 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
         raise ValueError(f"the log has no {window_s:g} s of flight after {_PAST_S:g} s of it")
 
     begin = _states(log, config)
-    scale, lift = _calibrate(log, config, begin, flying, first, past)
+    calibration = _calibrate(log, config, begin, flying, first, past)
     vehicle = Multirotor(config, count=len(first))
-    gain = (lift * scale[:, None], scale)
     start = MultirotorState(*(rows[first] for rows in begin))
-    vehicle.reset(**start._replace(rotor_speed=_speeds(config, start.rotor_speed, *gain))._asdict())
+    speed = _speeds(config, start.rotor_speed, calibration.lift(0.0), calibration.scale)
+    vehicle.reset(**start._replace(rotor_speed=speed)._asdict())
     rates, forces, measured_forces = [], [], []
     for sample in range(size):
         now = first + sample
@@ -146,7 +162,8 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
             forces.append(_specific_force(vehicle)[:, 2])
             measured_forces.append(log.specific_force[now, 2])
         command = np.sqrt(rotor_thrust_n(log.pwm[now]) / config.thrust_coefficient_n_s2)
-        vehicle.step(_speeds(config, command, *gain), round(_STEP_S * 1e9))
+        lift = calibration.lift(sample * _STEP_S)
+        vehicle.step(_speeds(config, command, lift, calibration.scale), round(_STEP_S * 1e9))
     unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
     pushed, felt = np.array(forces), np.array(measured_forces)
     return Replay(
@@ -220,6 +237,24 @@ def _specific_force(vehicle: Multirotor) -> Array:
     return np.asarray(Rotation.from_quat(vehicle.state.orientation).inv().apply(felt))
 
 
+class _Calibration(NamedTuple):
+    """What makes the model agree, in the mean, with the flight before each window."""
+
+    scale: Array
+    """Factor of the thrust for a command, shape [N]."""
+    steady: Array
+    """Missing angular acceleration that stays [rad/s^2], shape [N, 3]."""
+    fading: Array
+    """Missing angular acceleration that fades, as it is when the window begins [rad/s^2], shape [N, 3]."""
+    lift_per_turning: Array
+    """Thrust of each rotor that gives an angular acceleration, and no thrust in all, shape [4, 3]."""
+
+    def lift(self, elapsed_s: float) -> Array:
+        """Return the thrust to add to each rotor [N], shape [N, 4]."""
+        missing = self.steady + self.fading * np.exp(-elapsed_s / _FADING_S)
+        return np.asarray(missing @ self.lift_per_turning.T)
+
+
 def _calibrate(
     log: FlightLog,
     config: MultirotorConfig,
@@ -227,13 +262,7 @@ def _calibrate(
     flying: NDArray[np.bool_],
     first: NDArray[np.int64],
     past: int,
-) -> tuple[Array, Array]:
-    """Return what makes the model agree, in the mean, with the flight before each window.
-
-    Returns:
-        Factor of the thrust for a command, shape [N], and the thrust to add to each rotor before that factor,
-        which gives the missing torque and no thrust [N], shape [N, 4].
-    """
+) -> _Calibration:
     vehicle = Multirotor(config, count=len(flying))
     vehicle.reset(**states._asdict())
     drawn = np.where(flying, _specific_force(vehicle)[:, 2], 0.0)
@@ -241,13 +270,10 @@ def _calibrate(
     turning = np.gradient(log.body_rate, _STEP_S, axis=0) - vehicle.acceleration.angular
 
     def over_past(rows: Array) -> Array:
-        total = np.concatenate([np.zeros((1, *rows.shape[1:])), np.cumsum(rows, axis=0)])
+        total = np.concatenate([[0.0], np.cumsum(rows)])
         return np.asarray(total[first] - total[first - past])
 
-    scale = over_past(measured) / over_past(drawn)
-    count = over_past(flying.astype(np.float64))
-    missing = over_past(np.where(flying[:, None], turning, 0.0)) / count[:, None]
-    torque = missing @ np.array(config.inertia_kg_m2).T
+    steady, fading = _missing(turning, flying)
     weights = quadratic_weights(
         np.array(config.rotor_position_m),
         np.array(config.rotor_direction),
@@ -255,8 +281,46 @@ def _calibrate(
         torque=config.torque_coefficients_n_m_s2,
     )
     mix = weights.T / config.thrust_coefficients_n_s2  # thrusts of rotors to thrust and torque
-    lift = np.linalg.solve(mix, np.concatenate([np.zeros((len(torque), 1)), torque], axis=1).T).T
-    return scale, lift / scale[:, None]
+    wanted = np.concatenate([np.zeros((1, 3)), np.array(config.inertia_kg_m2)])
+    step = round(_FILTER_STEP_S / _STEP_S)
+    return _Calibration(
+        scale=over_past(measured) / over_past(drawn),
+        steady=steady[first // step],
+        fading=fading[first // step],
+        lift_per_turning=np.linalg.solve(mix, wanted),
+    )
+
+
+def _missing(turning: Array, flying: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Split what the model misses, by a Kalman filter for each axis.
+
+    Args:
+        turning: Measured less modelled angular acceleration at every sample [rad/s^2], shape [n, 3].
+        flying: Which samples count, shape [n].
+
+    Returns:
+        The steady and the fading part after 0, 1, 2, ... steps of the filter, shape [n / 10 + 1, 3] each.
+    """
+    step = round(_FILTER_STEP_S / _STEP_S)
+    count = len(turning) // step
+    means = turning[: count * step].reshape(count, step, 3).mean(axis=1)
+    known = np.all(flying[: count * step].reshape(count, step), axis=1).tolist()
+    keep = np.exp(-_FILTER_STEP_S / _FADING_S)
+    states = np.zeros((count + 1, 2, 3))
+    covariance = np.zeros((2, 2, 3))
+    covariance[0, 0], covariance[1, 1] = _STEADY_RAD_S2**2, _FADING_RAD_S2**2
+    transition = np.stack([np.ones(3), keep])
+    grown = np.stack([_DRIFT_RAD_S2_PER_SQRT_S**2 * _FILTER_STEP_S, (1.0 - keep**2) * _FADING_RAD_S2**2])
+    for k in range(count):
+        states[k + 1] = transition * states[k]
+        covariance *= transition[:, None] * transition[None, :]
+        covariance[[0, 1], [0, 1]] += grown
+        if known[k]:
+            shared = covariance.sum(axis=1)
+            gain = shared / (shared.sum(axis=0) + _NOISE_RAD_S2**2)
+            states[k + 1] += gain * (means[k] - states[k + 1].sum(axis=0))
+            covariance -= gain[:, None] * shared[None, :]
+    return states[:, 0], states[:, 1]
 
 
 def _speeds(config: MultirotorConfig, speed: Array, lift_n: Array, scale: Array) -> Array:

@@ -420,6 +420,51 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
     assert len(received) + subscriber.counters.lost == last + 1
 
 
+def fill_slots(publisher):
+    """Publish until a reader that stands still has all slots."""
+    ring = publisher._fanout.ring
+    while (slot := ring._ring.acquire(100_000)) is not None or not ring._ring.slots:
+        del slot
+        assert publisher.publish(scan(0, 25_000))
+
+
+def recorded_waits_s(monkeypatch):
+    """How long publishers are ready to wait for readers, each time that they do [s]."""
+    waits_s = []
+
+    class Recording(Backoff):
+        def __init__(self, timeout_s):
+            waits_s.append(max(timeout_s, 0.0))
+            super().__init__(timeout_s)
+
+    monkeypatch.setattr(cortex.back_pressure, "Backoff", Recording)
+    return waits_s
+
+
+def test_a_large_message_has_all_its_time_after_one_that_was_held_up(node, monkeypatch):
+    """Of another thread, whose turn came between this one's check and its own turn."""
+    publisher = node.publisher("/scans", Scan, max_wait_s=0.5)
+    subscriber = node.subscriber("/scans", Scan, policy=reliable(1, SOON_S))
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    assert subscriber.wait_for_publisher(SOON_S)
+    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
+    fill_slots(publisher)
+    lock = publisher._large_lock
+
+    class Turn:
+        def __enter__(self):
+            lock.acquire()
+            publisher._back_pressure.waited_s = 0.4
+
+        def __exit__(self, *_):
+            lock.release()
+
+    monkeypatch.setattr(publisher, "_large_lock", Turn())
+    waits_s = recorded_waits_s(monkeypatch)
+    assert not publisher.publish(scan(1, 25_000))
+    assert waits_s[0] == 0.5
+
+
 def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkeypatch):
     """One reads the ring and has all slots, for one there is no memory: `max_wait_s` is that of a message."""
     publisher = node.publisher("/scans", Scan, max_wait_s=0.5)
@@ -430,20 +475,9 @@ def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkey
         assert publisher.wait_for_subscribers(len(readers), SOON_S)
         assert readers[-1].wait_for_publisher(SOON_S)
         monkeypatch.setattr(readers[-1], "top_up", lambda now_ns: None)
-    while (
-        slot := publisher._fanout.ring._ring.acquire(100_000)
-    ) is not None or not publisher._fanout.ring._ring.slots:
-        del slot
-        assert publisher.publish(scan(0, 25_000))
+    fill_slots(publisher)
     monkeypatch.setattr(cortex.large, "STRICT_BYTES", 0)
-    waits_s = []
-
-    class Recording(Backoff):
-        def __init__(self, timeout_s):
-            waits_s.append(max(timeout_s, 0.0))
-            super().__init__(timeout_s)
-
-    monkeypatch.setattr(cortex.back_pressure, "Backoff", Recording)
+    waits_s = recorded_waits_s(monkeypatch)
     assert not publisher.publish(scan(1, 25_000))
     assert len(waits_s) > 1
     assert 0.5 <= sum(waits_s) < 0.6

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -284,6 +286,24 @@ def test_actions_command_an_attitude(make):
     view = fly(make, [0.0, 0.0, 0.0, 1.0], 10, mode="attitude").view
     assert view.body_rate[:, 2].min() > 0.1
     assert fly(make, [1.0, 0.0, 0.0, 0.0], 10, mode="attitude").view.velocity[:, 2].min() > 0.5
+
+
+def test_attitudes_begin_and_go_on_with_the_heading(make):
+    """A command that is late, or lags, is one of the same heading: no vehicle is turned aside."""
+    task = calm()
+    task.mode, task.tilt_max_rad, task.episode_s = "attitude", 0.4, 8.0
+    late = dataclasses.replace(still(), latency_steps=3, lag_s=(0.05, 0.05))
+    env = make(8, task, observe=["state"], randomise=late)
+    env.reset(seed=1)
+    env.step(torch.zeros(8, 4))
+    assert env.view.body_rate.abs().max() < 1e-3
+    turning = []
+    for _ in range(120):  # more than a turn, so each passes +-180 degrees
+        env.step(torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(8, 1))
+        turning.append(env.view.body_rate.clone())
+    settled = torch.stack(turning[30:])
+    assert settled[..., 2].min() > 0.8 * settled[..., 2].max() > 0.5
+    assert settled[..., :2].abs().max() < 0.05
 
 
 def test_actions_command_a_velocity(make):

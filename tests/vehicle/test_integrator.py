@@ -74,7 +74,7 @@ def test_figure_eight_at_9_m_s(device):
 
 
 def test_flip_at_700_deg_s(device):
-    """A crazyflie rolls over: up to speed, on, and down again, with motors that lag 72 ms."""
+    """A crazyflie rolls over: up to speed, on, and down again, with motors that lag."""
     config = preset("crazyflie")
     vehicle = Multirotor(config, device=device)
     start = one(vehicle.state)

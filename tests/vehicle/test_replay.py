@@ -8,14 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.presets import CRAZYFLIE
 from neurosim_core.vehicle.replay import (
+    _FADING_RAD_S2,
+    _FADING_S,
+    _FILTER_STEP_S,
+    _NOISE_RAD_S2,
     PWM_MAX,
     PWM_THRUST_N,
     Replay,
+    _missing,
     read_crazyflie_log,
     replay,
     rotor_thrust_n,
@@ -37,6 +43,37 @@ def test_the_specific_force_of_real_flights_is_followed(name):
     found = real_replay(name)
     assert found.window_count > 200
     assert found.force_error < 0.05
+
+
+def test_rates_of_real_flights_are_followed():
+    """About an axis where the flight is restless; the other flight hovers, and little but gusts turns it."""
+    found = real_replay("log15")
+    assert (found.rate_rms_rad_s[:2] < 0.7 * found.unchanged_rms_rad_s[:2]).all()
+    position = np.array(CRAZYFLIE.rotor_position_m) * [1.0, 1.0, 0.0]
+    for name in ("log10", "log15"):
+        better = real_replay(name).rate_rms_rad_s[:2]
+        assert (
+            real_replay(name, rotor_position_m=tuple(map(tuple, position))).rate_rms_rad_s[:2] > 1.15 * better
+        ).all()
+
+
+def test_the_filter_tells_what_stays_from_what_fades():
+    """It is fed with its own model, a Gauss-Markov process on a constant, with pauses on the ground."""
+    rng = np.random.default_rng(3)
+    steps, constant = 20_000, np.array([12.0, -7.0, 1.5])
+    keep = np.exp(-_FILTER_STEP_S / _FADING_S)
+    kick = _FADING_RAD_S2 * np.sqrt(1.0 - keep**2) * rng.standard_normal((steps, 3))
+    gust = np.stack([lfilter([1.0], [1.0, -keep[axis]], kick[:, axis]) for axis in range(3)], axis=1)
+    seen = constant + gust + _NOISE_RAD_S2 * rng.standard_normal((steps, 3))
+    flying = np.arange(steps) % 1000 > 100
+    seen[~flying] = 1e3  # what is no flight must not count
+    steady, fading = _missing(np.repeat(seen, 10, axis=0), np.repeat(flying, 10))
+    assert steady.shape == (steps + 1, 3)
+    late = np.flatnonzero(flying)[2000:]
+    assert (np.abs(steady[late + 1] - constant).mean(axis=0) < 0.35 * _FADING_RAD_S2).all()
+    error = steady[late + 1] + fading[late + 1] - constant - gust[late]
+    assert (error.std(axis=0) < _NOISE_RAD_S2).all()  # better than the last measurement alone
+    assert (error.std(axis=0) < 0.8 * _FADING_RAD_S2).all()  # better than the mean alone
 
 
 def test_a_strong_reaction_torque_is_found_out():
@@ -78,12 +115,12 @@ def test_a_simulated_flight_is_followed_closely(weak, tmp_path):
     """The same vehicle with a weak battery; what is left is the air speed, which is known 20 ms late."""
     write_flight(tmp_path / "flight.csv.gz", CRAZYFLIE, weak=weak)
     log = read_crazyflie_log(tmp_path / "flight.csv.gz")
-    found = replay(log, CRAZYFLIE)
+    found = replay(log, CRAZYFLIE, delay_s=0.0)
     assert found.window_count > 20
     assert (found.rate_rms_rad_s < 0.5 * found.unchanged_rms_rad_s).all()
     assert found.force_error < 0.02
     heavy = preset("crazyflie", inertia_kg_m2=tuple(map(tuple, 3.0 * np.array(CRAZYFLIE.inertia_kg_m2))))
-    assert (replay(log, heavy).rate_rms_rad_s > 1.5 * found.rate_rms_rad_s).all()
+    assert (replay(log, heavy, delay_s=0.0).rate_rms_rad_s > 1.5 * found.rate_rms_rad_s).all()
 
 
 def test_what_cannot_be_replayed_is_refused(tmp_path):
