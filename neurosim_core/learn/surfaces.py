@@ -97,11 +97,14 @@ class VoxelGrid(_Shown):
     Moment b is at b / (B - 1) of the step; with one bin all events are in it.
 
     Reference: Zhu et al. (2019), "Unsupervised Event-based Learning of Optical Flow, Depth, and Egomotion",
-    eq. (1-2).
+    eq. (1-2). With `split` it is an event spike tensor of the measurement 1 and a trilinear kernel, as in
+    Gehrig et al. (2019), "End-to-End Learning of Representations for Asynchronous Event-Based Data".
     """
 
     bins: int = 5
     """B."""
+    split: bool = False
+    """Channels of their own for each polarity, B off and B on, where each event counts as 1."""
 
     uint8_levels: ClassVar[tuple[float, float]] = (16.0, 128.0)
 
@@ -112,8 +115,8 @@ class VoxelGrid(_Shown):
 
     @property
     def channel_count(self) -> int:
-        """One for each bin."""
-        return self.bins
+        """One for each bin, or one for each bin and polarity."""
+        return self.bins * (2 if self.split else 1)
 
 
 SurfaceConfig = TimeSurface | LeakySurface | Counts | VoxelGrid
@@ -236,12 +239,12 @@ def _add_voxels(
     offsets: wp.array[wp.int32],
     now_ns: wp.array[wp.int64],
     duration_us: float,
+    bins: int,
     stride: int,
     # In/out:
     sums: wp.array4d[wp.int32],
 ) -> None:
     world, lane = wp.tid()
-    bins = sums.shape[1]
     event = offsets[world] + lane
     while event < offsets[world + 1]:
         sign = 2.0 * float(polarity[event]) - 1.0
@@ -249,9 +252,13 @@ def _add_voxels(
         place = wp.clamp((1.0 - age_us / duration_us) * float(bins - 1), 0.0, float(bins - 1))
         first = wp.min(int(place), bins - 1)
         share = place - float(first)
-        _add(sums, world, first, int(y[event]), int(x[event]), sign * (1.0 - share))
+        channel = int(first)
+        if sums.shape[1] > bins:  # polarities are apart
+            sign = 1.0
+            channel += bins * int(polarity[event])
+        _add(sums, world, channel, int(y[event]), int(x[event]), sign * (1.0 - share))
         if first + 1 < bins:
-            _add(sums, world, first + 1, int(y[event]), int(x[event]), sign * share)
+            _add(sums, world, channel + 1, int(y[event]), int(x[event]), sign * share)
         event += stride
 
 
@@ -399,7 +406,7 @@ class EventSurface:
         elif isinstance(self.config, Counts):
             self._launch(_add_counts, dim, [*where, self._lanes], [self._sums])
         else:
-            inputs = [events.t, *where, end_ns, self._step_us, self._lanes]
+            inputs = [events.t, *where, end_ns, self._step_us, self.config.bins, self._lanes]
             self._launch(_add_voxels, dim, inputs, [self._sums])
 
     def show(self, now_ns: Any) -> None:

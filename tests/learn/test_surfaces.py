@@ -72,11 +72,22 @@ def oracle(config, steps: list[np.ndarray]) -> np.ndarray:
         else:
             place = (config.bins - 1) * (1.0 - (now - t) / STEP_US)
             for b in range(config.bins):
-                out[b, y, x] += (2 * p - 1) * max(0.0, 1.0 - abs(place - b))
+                share = max(0.0, 1.0 - abs(place - b))
+                if config.split:
+                    out[b + p * config.bins, y, x] += share
+                else:
+                    out[b, y, x] += (2 * p - 1) * share
     return out
 
 
-CONFIGS = [TimeSurface(), LeakySurface(tau_s=(0.01, 0.1)), Counts(), VoxelGrid(bins=5), VoxelGrid(bins=1)]
+CONFIGS = [
+    TimeSurface(),
+    LeakySurface(tau_s=(0.01, 0.1)),
+    Counts(),
+    VoxelGrid(bins=5),
+    VoxelGrid(bins=1),
+    VoxelGrid(bins=3, split=True),
+]
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{type(c).__name__}-{c.channel_count}")
