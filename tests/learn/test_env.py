@@ -130,6 +130,40 @@ def test_surfaces_come_in_the_type_that_is_asked_for(make, dtype):
     assert torch.equal(seen["events"].float(), exact["events"])  # also where episodes began anew
 
 
+def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
+    """In the same environment and in another one, with all that is drawn, sensors, and a world that ended."""
+    drawn = Randomisation(lag_s=(0.01, 0.05), latency_steps=2, mass_factor=(0.9, 1.1), wind_m_s=1.0)
+    options = {"randomise": drawn, "sensors": {"imu": {"kind": "imu", "rate_hz": 100}}}
+    actions = actions_of(25, 3)
+    actions[:, 0, 0] = -1.0
+
+    def go_on(env):
+        rows = []
+        for action in actions[13:]:
+            observations, reward, terminated, truncated, _ = env.step(action)
+            samples = env.observation.samples["imu"].arrays.values()
+            imu = [torch.from_numpy(array.numpy().copy()) for array in samples if array.size]
+            seen = [*observations.values(), *imu, reward, terminated, truncated]
+            rows.append(torch.cat([each.flatten().double() for each in seen]))
+        return torch.cat(rows)
+
+    env = make(**options)
+    env.reset(seed=3, spread=True)
+    for action in actions[:13]:
+        observations = env.step(action)[0]
+    before = {name: value.clone() for name, value in observations.items()}
+    torch.save(env.state_dict(), tmp_path / "state.pt")
+    expected = go_on(env)
+    for other in (env, make(**options, seed=8)):
+        seen = other.load_state_dict(torch.load(tmp_path / "state.pt"))
+        assert all(torch.equal(value, before[name]) for name, value in seen.items())
+        assert torch.equal(go_on(other), expected)
+    other.reset()
+    assert not torch.equal(go_on(other)[:100], expected[:100])
+    with pytest.raises(ValueError, match="another kind of environment"):
+        make(worlds=2, **options).load_state_dict(torch.load(tmp_path / "state.pt"))
+
+
 def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors):
     drawn = Randomisation(lag_s=(0.01, 0.05), mass_factor=(0.9, 1.1), wind_m_s=1.0)
     env = make(randomise=drawn)
