@@ -44,6 +44,8 @@ class Policy {
     if (card.find("LeakySurface") == std::string::npos) throw std::runtime_error("only LeakySurface is known here");
     if (card.find("\"mode\":") != std::string::npos && card.find("\"mode\": \"rates\"") == std::string::npos)
       throw std::runtime_error("only policies that command thrust and body rates are flown here");
+    if (card.find("\"dtype\":") != std::string::npos && card.find("\"dtype\": \"float32\"") == std::string::npos)
+      throw std::runtime_error("only surfaces of float32 are known here");
     rate_hz_ = numbers(card, "rate_hz").at(0);
     tau_s_ = numbers(card, "tau_s");
     width_ = static_cast<std::size_t>(numbers(card, "width").at(0));
@@ -73,6 +75,7 @@ class Policy {
   }
 
   void add(const Events& events, std::int64_t now_ns) {
+    if (events.width != width_ || events.height != height_) throw std::runtime_error("events of another camera");
     for (std::size_t event = 0; event < events.t.size(); ++event) {
       const double age_s = 1e-6 * static_cast<double>(now_ns / 1000 - events.t[event]);
       for (std::size_t scale = 0; scale < tau_s_.size(); ++scale) {

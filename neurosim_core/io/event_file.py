@@ -350,7 +350,7 @@ def are_seconds(t: NDArray[Any]) -> bool:
 def in_microseconds(t: NDArray[Any], unit_us: float | None) -> NDArray[Any]:
     """Return times in whole microseconds, of a unit; None: they are microseconds already."""
     if unit_us == 1e-3 and t.dtype.kind in "iu":  # of nanoseconds since 1970 float64 has not all
-        return (t + 500) // 1000
+        return t // 1000 + (t % 1000 >= 500)  # no sum that 32 bits might not hold
     return t if unit_us is None else np.rint(t * unit_us)
 
 

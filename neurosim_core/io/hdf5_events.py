@@ -67,7 +67,10 @@ class Hdf5Source:
         try:
             with damage_of(path):
                 self._open(sensor)
-                self.knows_unit = unit_us is not None or self._file.attrs.get("format") == FORMAT
+                is_own = self._file.attrs.get("format") == FORMAT
+                if is_own and unit_us is not None:
+                    raise EventFileError(f"{path}: times of a recording of Neurosim are microseconds")
+                self.knows_unit = is_own or unit_us is not None
                 attributes = self._group.attrs
                 is_told = "width" in attributes and "height" in attributes
                 self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None

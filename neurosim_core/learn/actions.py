@@ -33,7 +33,10 @@ def _attitude(task: Task, view: View) -> torch.Tensor:
     (cx, sx), (cy, sy), (cz, sz) = ((half.cos(), half.sin()) for half in (roll, pitch, yaw))
     x, y = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz
     z, w = cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz
-    return torch.cat([_thrust_n(task, view), torch.stack([x, y, z, w], dim=1)], dim=1)
+    q = torch.stack([x, y, z, w], dim=1)
+    # q and -q are one attitude, and commands that lag must not mix them
+    near = (q * view.orientation).sum(1, keepdim=True) >= 0.0
+    return torch.cat([_thrust_n(task, view), torch.where(near, q, -q)], dim=1)
 
 
 def _velocity(task: Task, view: View) -> torch.Tensor:
@@ -66,7 +69,7 @@ COMMANDS: dict[str, Callable[[Task, View], torch.Tensor]] = {
 
 
 def hover_command(mode: ActionMode, vehicle: MultirotorConfig) -> list[float]:
-    """Return what is commanded before the first action takes effect.
+    """Return what is commanded before the first action takes effect; an attitude is turned to the heading.
 
     Raises:
         ValueError: There is no such mode, or it does not suit the vehicle.

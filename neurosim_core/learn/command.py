@@ -156,7 +156,7 @@ def _learn(arguments: argparse.Namespace) -> int:
         return _learn_dense(arguments)
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
-    from neurosim_core.learn.train import default_config, train
+    from neurosim_core.learn.train import default_config, read_config, train
 
     config = default_config(
         arguments.what,
@@ -177,6 +177,14 @@ def _learn(arguments: argparse.Namespace) -> int:
     if arguments.resume and changed:
         raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what
+    if arguments.resume:
+        kept = read_config(folder)
+        asked = {"task": arguments.what, "seed": arguments.seed or kept.seed, "device": config.device}
+        if arguments.device is None:
+            del asked["device"]
+        for name, value in asked.items():
+            if value != (was := getattr(kept, name)):
+                raise ValueError(f"--resume: the {name} of the run in {folder} is {was}, not {value}")
     if (folder / "checkpoint.pt").exists() and not arguments.resume:
         raise ValueError(f"{folder} holds a run: give --resume, or another --out")
     if arguments.ray is not None:

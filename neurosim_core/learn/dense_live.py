@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -46,7 +48,10 @@ def flight_settings(
 
 @contextlib.contextmanager
 def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> Iterator[list[str]]:
-    """Run processes that stream flights, and end them; yield their namespaces, for `ns.data.LiveSource`."""
+    """Run processes that stream flights, and end them; yield their namespaces, for `ns.data.LiveSource`.
+
+    They end, too, when this process is killed: their input ends.
+    """
     from neurosim_core.render.launch import core_count
 
     names = [f"/flight{index}" for index in range(count)]
@@ -57,9 +62,8 @@ def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> I
     ]
     with contextlib.ExitStack() as stack:
         for command in commands:
-            process = subprocess.Popen(command, env=single_threaded_blas())
-            stack.callback(process.wait)
-            stack.callback(process.terminate)
+            process = subprocess.Popen(command, env=single_threaded_blas(), stdin=subprocess.PIPE)
+            stack.callback(stack.enter_context(process).terminate)
         yield names
 
 
@@ -100,5 +104,11 @@ def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int, cores
                 publishers[packet.sensor].publish(to_message(packet))
 
 
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    os._exit(0)
+
+
 if __name__ == "__main__":
+    threading.Thread(target=_end_with_input, daemon=True).start()
     stream_flights(sys.argv[1], json.loads(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

@@ -111,7 +111,7 @@ class Descent:
         """Go on from there."""
         self._module.load_state_dict(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.rate_factor = state["rate_factor"]
+        self.rate_factor = state.get("rate_factor", 1.0)  # 1: of a version without
 
     def _backward(self) -> None:
         loss = self._loss()

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 import torch
 import warp as wp
 
-from neurosim_core.learn.actions import hover_command
+from neurosim_core.learn.actions import COMMANDS, hover_command
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
@@ -22,6 +22,7 @@ from neurosim_core.learn.episodes import (
     make_routes,
     probe,
 )
+from neurosim_core.learn.snapshot import Place, find_state
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.registry import find
@@ -282,6 +283,52 @@ class Env:
         self._begin(everywhere=False)
         return self._observations(), reward, terminated, truncated, info
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of all worlds, episodes and the task, as tensors and numbers.
+
+        Raises:
+            ValueError: A sensor remembers what is not in it: noise of event cameras, automatic exposure.
+        """
+        found = self._find_state()
+        return {path: v.clone() if isinstance(v, torch.Tensor) else v for path, _, _, v in found}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Observations:
+        """Go on from a state, of this environment or one that was made alike: on a CPU to the same bits.
+
+        Returns:
+            What is observed there.
+
+        Raises:
+            ValueError: The environment that it is of was made otherwise; this one has begun anew then.
+        """
+        self.reset()
+        self.step(torch.zeros_like(self.view.action))  # some arrays are made only when they are needed
+        found = self._find_state()
+        here, there = (
+            {path: getattr(value, "shape", None) for path, value in rows}
+            for rows in ([(path, value) for path, _, _, value in found], state.items())
+        )
+        if here != there:
+            path = min(path for path, _ in here.items() ^ there.items())
+            raise ValueError(f"the state is of another kind of environment: they differ in {path}")
+        for path, owner, name, value in found:
+            if isinstance(value, torch.Tensor):
+                value.copy_(state[path])
+            else:
+                setattr(owner, name, state[path])
+        wp.synchronize_device(self.sim.device)
+        return self._observations()
+
+    def _find_state(self) -> list[Place]:
+        cameras = [pair for group in self.sim._state.groups for pair in group.world_frames.items()]
+        sensors = self.sim.model.config.sensors
+        forgetful = [name for name, sensor in sensors.items() if getattr(sensor, "remembers", False)]
+        forgetful += [name for name, camera in cameras if camera.terms]
+        if forgetful:
+            raise ValueError(f"{', '.join(forgetful)}: noise and automatic exposure cannot be saved")
+        wp.synchronize_device(self.sim.device)
+        return list(find_state(self))
+
     def close(self) -> None:
         """Nothing to close: memory is freed with the object."""
 
@@ -303,14 +350,15 @@ class Env:
         )
         for array in (view.action, view.last_action):
             array.masked_fill_(mask, 0.0)
-        self._queue = torch.where(mask, self._hover, self._queue)
-        self._lagging = torch.where(mask, self._hover, self._lagging)
         self.episode_length.masked_fill_(self._mask, 0)
         view.elapsed_s.masked_fill_(self._mask, 0.0)
         if self._surface is not None:
             self._mask_int.copy_(self._mask)
             self._surface.forget(wp.from_torch(self._mask_int))
         self._look(observation)
+        hover = COMMANDS["attitude"](self.task, view) if self.task.mode == "attitude" else self._hover
+        self._queue = torch.where(mask, hover, self._queue)
+        self._lagging = torch.where(mask, hover, self._lagging)
         self.task.begin(view, self._mask)
 
     def _throw(self) -> None:

@@ -116,6 +116,9 @@ class Pilot:
             stamp_ns: Now [ns].
             orientation: q_WB, xyzw; only the direction of gravity in it is used.
             body_rate: w_WB in B, as a gyroscope measures it [rad/s].
+
+        Raises:
+            ValueError: An event is of no pixel of the camera that it was trained with.
         """
         self._show(t, x, y, polarity, stamp_ns)
         q = np.asarray(orientation, dtype=np.float64)
@@ -135,6 +138,9 @@ class Pilot:
         )
 
     def _show(self, t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike, stamp_ns: int) -> None:
+        height, width = self._surface.array.shape[2:]
+        if np.max(x, initial=0) >= width or np.max(y, initial=0) >= height:
+            raise ValueError(f"the policy was trained with {width}x{height} pixels, and got events of others")
         columns: list[Any] = [
             wp.array(np.ascontiguousarray(column, dtype=kind), device="cpu")
             for column, kind in ((t, np.int64), (x, np.uint16), (y, np.uint16), (polarity, np.uint8))

@@ -432,6 +432,18 @@ def test_nanoseconds_from_zero_are_asked_for(tmp_path, capsys):
     assert "--time-unit ns" in capsys.readouterr().out
 
 
+def test_nanoseconds_of_32_bits_do_not_run_over(tmp_path):
+    t = np.array([0, 1_499, 1_500, 2**32 - 1], dtype=np.uint32)
+    np.savez(tmp_path / "a.npz", t=t, x=t % 5, y=t % 3, p=t % 2)
+    np.testing.assert_array_equal(read(tmp_path / "a.npz", time_unit="ns").t, [0, 1, 2, 4_294_967])
+
+
+def test_the_unit_of_a_recording_cannot_be_told(tmp_path):
+    write(tmp_path / "a.h5", draw(100, span_us=2_000))
+    with pytest.raises(EventFileError, match="times of a recording of Neurosim are microseconds"):
+        open_events(tmp_path / "a.h5", time_unit="ns")
+
+
 def test_the_command(tmp_path, capsys):
     events = draw(3000, span_us=2_000_000, begin_us=7_000_000)
     write(tmp_path / "a.raw", events)

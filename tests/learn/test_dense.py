@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn import dense_train, dense_worlds  # noqa: E402
 from neurosim_core.learn.dense import DenseNet  # noqa: E402
+from neurosim_core.learn.dense_live import live_flights  # noqa: E402
 from neurosim_core.learn.dense_train import (  # noqa: E402
     HEADS,
     DenseConfig,
@@ -255,6 +257,22 @@ def test_worlds_give_the_windows_of_runs(scene):
     assert torch.equal(counts.target.sum((1, 2, 3)) > 0, counts.voxel.abs().sum((1, 2, 3)) > 0)
     with pytest.raises(ValueError, match="whole periods"):
         next(world_windows(config, HEADS["flow"], worlds=2, bins=5, window_s=0.0505))
+
+
+def test_live_flights_end_with_their_input(scene, monkeypatch):
+    """As it does when the process that learns from them is killed."""
+    begun = []
+    popen = subprocess.Popen
+
+    def begin(*arguments, **options):
+        begun.append(popen(*arguments, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    with live_flights(1, settings(scene)):
+        (process,) = begun
+        process.stdin.close()
+        assert process.wait(timeout=60.0) == 0
 
 
 def test_worlds_draw_thresholds_and_render_as_often_as_is_said(scene, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,40 @@ def test_surfaces_come_in_the_type_that_is_asked_for(make, dtype):
     assert torch.equal(seen["events"].float(), exact["events"])  # also where episodes began anew
 
 
+def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
+    """In the same environment and in another one, with all that is drawn, sensors, and a world that ended."""
+    drawn = Randomisation(lag_s=(0.01, 0.05), latency_steps=2, mass_factor=(0.9, 1.1), wind_m_s=1.0)
+    options = {"randomise": drawn, "sensors": {"imu": {"kind": "imu", "rate_hz": 100}}}
+    actions = actions_of(25, 3)
+    actions[:, 0, 0] = -1.0
+
+    def go_on(env):
+        rows = []
+        for action in actions[13:]:
+            observations, reward, terminated, truncated, _ = env.step(action)
+            samples = env.observation.samples["imu"].arrays.values()
+            imu = [torch.from_numpy(array.numpy().copy()) for array in samples if array.size]
+            seen = [*observations.values(), *imu, reward, terminated, truncated]
+            rows.append(torch.cat([each.flatten().double() for each in seen]))
+        return torch.cat(rows)
+
+    env = make(**options)
+    env.reset(seed=3, spread=True)
+    for action in actions[:13]:
+        observations = env.step(action)[0]
+    before = {name: value.clone() for name, value in observations.items()}
+    torch.save(env.state_dict(), tmp_path / "state.pt")
+    expected = go_on(env)
+    for other in (env, make(**options, seed=8)):
+        seen = other.load_state_dict(torch.load(tmp_path / "state.pt"))
+        assert all(torch.equal(value, before[name]) for name, value in seen.items())
+        assert torch.equal(go_on(other), expected)
+    other.reset()
+    assert not torch.equal(go_on(other)[:100], expected[:100])
+    with pytest.raises(ValueError, match="another kind of environment"):
+        make(worlds=2, **options).load_state_dict(torch.load(tmp_path / "state.pt"))
+
+
 def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors):
     drawn = Randomisation(lag_s=(0.01, 0.05), mass_factor=(0.9, 1.1), wind_m_s=1.0)
     env = make(randomise=drawn)
@@ -250,6 +286,24 @@ def test_actions_command_an_attitude(make):
     view = fly(make, [0.0, 0.0, 0.0, 1.0], 10, mode="attitude").view
     assert view.body_rate[:, 2].min() > 0.1
     assert fly(make, [1.0, 0.0, 0.0, 0.0], 10, mode="attitude").view.velocity[:, 2].min() > 0.5
+
+
+def test_attitudes_begin_and_go_on_with_the_heading(make):
+    """A command that is late, or lags, is one of the same heading: no vehicle is turned aside."""
+    task = calm()
+    task.mode, task.tilt_max_rad, task.episode_s = "attitude", 0.4, 8.0
+    late = dataclasses.replace(still(), latency_steps=3, lag_s=(0.05, 0.05))
+    env = make(8, task, observe=["state"], randomise=late)
+    env.reset(seed=1)
+    env.step(torch.zeros(8, 4))
+    assert env.view.body_rate.abs().max() < 1e-3
+    turning = []
+    for _ in range(120):  # more than a turn, so each passes +-180 degrees
+        env.step(torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(8, 1))
+        turning.append(env.view.body_rate.clone())
+    settled = torch.stack(turning[30:])
+    assert settled[..., 2].min() > 0.8 * settled[..., 2].max() > 0.5
+    assert settled[..., :2].abs().max() < 0.05
 
 
 def test_actions_command_a_velocity(make):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import sys
 
 import pytest
@@ -33,6 +35,24 @@ def test_wrong_use_is_said(arguments, message, tmp_path, capsys):
     (tmp_path / "checkpoint.pt").touch()
     assert main([argument.format(folder=tmp_path) for argument in arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["avoid"], "the task of the run in {folder} is hover, not avoid"),
+        (["hover", "--seed", "4"], "the seed of the run in {folder} is 3, not 4"),
+        (["hover", "--device", "cuda:0"], "the device of the run in {folder} is cpu, not cuda:0"),
+    ],
+)
+def test_no_other_run_is_resumed_than_is_asked_for(arguments, message, tmp_path, capsys):
+    pytest.importorskip("torch", reason="needs the extra learn")
+    from neurosim_core.learn.train import default_config
+
+    kept = dataclasses.asdict(default_config("hover", device="cpu", seed=3))
+    (tmp_path / "run.json").write_text(json.dumps(kept))
+    assert main(["learn", *arguments, "--out", str(tmp_path), "--resume"]) == 1
+    assert message.format(folder=tmp_path) in capsys.readouterr().err
 
 
 def test_without_the_extra_the_error_names_it(monkeypatch, capsys):

@@ -126,7 +126,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     for step in range(1, 6):
         count = 40
         t = np.sort(rng.integers(20_000 * (step - 1) + 1, 20_000 * step + 1, count))
-        x, y, polarity = (rng.integers(0, top, count) for top in (8, 8, 2))
+        x, y, polarity = (rng.integers(0, top, count, dtype=np.uint16) for top in (8, 8, 2))
         rate = rng.normal(size=3)
         command = pilot.act(
             t, x, y, polarity, stamp_ns=20_000_000 * step, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate
@@ -143,6 +143,9 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
         thrust_n = card["hover_thrust_n"] * (1.0 + card["thrust_span"] * pilot.action[0])
         assert command.thrust_n == pytest.approx(thrust_n)
     ns.load_config(pilot_settings(pilot.card))
+    for x, y in ((8, 0), (0, 8)):
+        with pytest.raises(ValueError, match="trained with 8x8 pixels, and got events of others"):
+            pilot.act([1], [x], [y], [1], stamp_ns=1000, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate)
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
     export_onnx(policy, {**card, "mode": "velocity"}, tmp_path / "other.onnx")
@@ -379,6 +382,15 @@ def test_runs_of_another_version_are_refused(tmp_path, hall):
     for read in (training.resume, lambda: load_student(tmp_path, torch.device("cpu"))):
         with pytest.raises(ValueError, match="of another version"):
             read()
+
+
+def test_a_run_from_before_rates_adapted_goes_on(tmp_path, hall):
+    training = run(tmp_path, hall)
+    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert state["teacher"].pop("rate_factor") != 1.0
+    torch.save(state, tmp_path / "checkpoint.pt")
+    training.resume()
+    assert training._trainers["teacher"].descent.rate_factor == 1.0
 
 
 def test_a_task_that_lacks_what_training_needs_says_so(tmp_path, hall):

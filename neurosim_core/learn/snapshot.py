@@ -1,0 +1,59 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""The state of an environment: what its objects hold on the device, and how far they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+import warp as wp
+
+from neurosim_core.learn.task import Task
+
+_COUNTERS = {"_now_ns", "_stamp_ns", "launched_ns", "launched_count", "parity", "_queue_place", "_started"}
+_LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
+    "_scenes", "_model", "_routes", "_timetable", "_observations", "observation", "_status", "buffers",
+    "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_pose_launches", "_hosts",
+}  # fmt: skip
+
+Place = tuple[str, Any, str, Any]
+"""A path, who is there, its attribute, and what that is: memory as a tensor, or a number."""
+
+
+def find_state(owner: Any, path: str = "", seen: set[Any] | None = None) -> Iterator[Place]:
+    """Yield all that a step changes of an object and of what it holds, memory once."""
+    seen = set() if seen is None else seen
+    if id(owner) in seen:
+        return
+    seen.add(id(owner))
+    rows = dict(enumerate(owner)) if isinstance(owner, list | tuple) else owner
+    for name, value in (rows if isinstance(rows, dict) else vars(rows)).items():
+        place = f"{path}.{name}" if path else str(name)
+        if name in _LEFT_OUT:
+            continue
+        memory = _bytes_of(value) if isinstance(value, wp.array) else value
+        if isinstance(memory, torch.Tensor):
+            key = (memory.data_ptr(), memory.shape, memory.stride(), memory.dtype)
+            if memory.numel() and key not in seen:
+                seen.add(key)
+                yield place, owner, name, memory
+        elif name in _COUNTERS:
+            yield place, owner, name, value
+        elif isinstance(value, dict | list | tuple | Task) or _is_own(value):
+            yield from find_state(value, place, seen)
+
+
+def _is_own(value: Any) -> bool:
+    """Objects of the simulator, and structures of kernels."""
+    module = type(value).__module__
+    return hasattr(value, "__dict__") and (module.startswith("neurosim_core.") or hasattr(value, "_ctype"))
+
+
+def _bytes_of(array: Any) -> torch.Tensor:
+    """Return the memory of an array; none of what holds addresses, which are of this process."""
+    fields = getattr(array.dtype, "vars", {}).values()
+    if not array.size or not array.is_contiguous or any(isinstance(f.type, wp.array) for f in fields):
+        return torch.empty(0)
+    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+    return wp.to_torch(wp.array(ptr=array.ptr, shape=size, dtype=wp.uint8, device=array.device))
