@@ -44,6 +44,8 @@ class Policy {
     if (card.find("LeakySurface") == std::string::npos) throw std::runtime_error("only LeakySurface is known here");
     if (card.find("\"mode\":") != std::string::npos && card.find("\"mode\": \"rates\"") == std::string::npos)
       throw std::runtime_error("only policies that command thrust and body rates are flown here");
+    if (card.find("\"dtype\":") != std::string::npos && card.find("\"dtype\": \"float32\"") == std::string::npos)
+      throw std::runtime_error("only surfaces of float32 are known here");
     rate_hz_ = numbers(card, "rate_hz").at(0);
     tau_s_ = numbers(card, "tau_s");
     width_ = static_cast<std::size_t>(numbers(card, "width").at(0));

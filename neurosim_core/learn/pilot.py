@@ -139,7 +139,7 @@ class Pilot:
 
     def _show(self, t: ArrayLike, x: ArrayLike, y: ArrayLike, polarity: ArrayLike, stamp_ns: int) -> None:
         height, width = self._surface.array.shape[2:]
-        if max(np.max(x, initial=0) - width, np.max(y, initial=0) - height) >= 0:
+        if np.max(x, initial=0) >= width or np.max(y, initial=0) >= height:
             raise ValueError(f"the policy was trained with {width}x{height} pixels, and got events of others")
         columns: list[Any] = [
             wp.array(np.ascontiguousarray(column, dtype=kind), device="cpu")

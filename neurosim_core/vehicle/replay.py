@@ -38,12 +38,12 @@ _STRIDE = 50  # samples from the beginning of a window to that of the next
 _PAST_S = 0.15  # flight before a window that tells the thrust for a command
 _DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.CRAZYFLIE
 _FILTER_STEP_S = 0.01
-# what the model misses, about x, y, z: maximum likelihood of what the filter predicts for its next step, the
-# geometric mean of two flights of 50 and 62 s; alike about x and y
-_FADING_RAD_S2 = np.array([8.0, 8.0, 0.89])  # the flights: 7.6 and 8.5; 0.71 and 1.10
-_FADING_S = np.array([0.13, 0.13, 0.037])  # 0.136 and 0.124; 0.078 and 0.018
-_NOISE_RAD_S2 = np.array([0.91, 0.91, 0.68])  # of the mean over a step; 1.25 and 0.66; 0.88 and 0.53
-_DRIFT_RAD_S2_PER_SQRT_S = np.array([1.4, 1.4, 0.13])  # of the steady part; 1.46 and 1.35; 0.08 and 0.21
+# what the model misses, about x, y, z: maximum likelihood of what the filter predicts for its next step, over
+# two flights of 50 and 62 s together, alike about x and y; in brackets each alone, about x and z
+_FADING_RAD_S2 = np.array([8.0, 8.0, 0.88])  # (4.5 and 8.5; 0.73 and 1.11)
+_FADING_S = np.array([0.13, 0.13, 0.038])  # (0.042 and 0.124; 0.085 and 0.021)
+_NOISE_RAD_S2 = np.array([1.0, 1.0, 0.8])  # of the mean over a step (0.93 and 0.66; 0.88 and 0.57)
+_DRIFT_RAD_S2_PER_SQRT_S = np.array([1.4, 1.4, 0.0])  # of the steady part (10.4 and 1.3; 0 and 0)
 _STEADY_RAD_S2 = 20.0  # before anything is known
 _TILT_S = 3.0  # how slowly the mean direction of the specific force corrects the integrated attitude
 _FORCE_S = 0.02  # the accelerometer is averaged over this where it tells the air speed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -36,6 +37,7 @@ def test_a_policy_in_cpp_commands_what_one_in_python_does(tmp_path, runtime):
     options = (f"-DONNXRUNTIME_ROOT={RUNTIME}", f"-DPython3_EXECUTABLE={sys.executable}")
     subprocess.run(["cmake", "-S", source, "-B", tmp_path, *options], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", tmp_path], check=True, capture_output=True)
+    _refuses_surfaces_of_bytes(file, tmp_path)
     ensure_registry(0)
     rng, pilot = np.random.default_rng(0), Pilot(file)
     program = subprocess.Popen(
@@ -78,3 +80,14 @@ def test_a_policy_in_cpp_commands_what_one_in_python_does(tmp_path, runtime):
         program.kill()
         program.communicate()
     assert np.ptp(acted, axis=0).min() > 0.05  # a constant would agree, too
+
+
+def _refuses_surfaces_of_bytes(policy, folder):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(policy)
+    (card,) = (each for each in model.metadata_props if each.key == "neurosim")
+    card.value = json.dumps({**json.loads(card.value), "surface": {"kind": "LeakySurface", "dtype": "uint8"}})
+    onnx.save(model, folder / "bytes.onnx")
+    done = subprocess.run([folder / "policy", folder / "bytes.onnx"], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "only surfaces of float32 are known here" in done.stderr

@@ -126,7 +126,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     for step in range(1, 6):
         count = 40
         t = np.sort(rng.integers(20_000 * (step - 1) + 1, 20_000 * step + 1, count))
-        x, y, polarity = (rng.integers(0, top, count) for top in (8, 8, 2))
+        x, y, polarity = (rng.integers(0, top, count, dtype=np.uint16) for top in (8, 8, 2))
         rate = rng.normal(size=3)
         command = pilot.act(
             t, x, y, polarity, stamp_ns=20_000_000 * step, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate
