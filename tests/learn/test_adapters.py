@@ -300,3 +300,15 @@ def test_a_policy_flies_in_this_process(policy, hall, tmp_path):
     assert said[-1].startswith("mean speed of the last 0.2 s")
     with pytest.raises(ValueError, match="unknown policy 'nobody', known: "):
         shipped_policy("nobody")
+
+
+def test_gymnasium_knows_that_surfaces_are_bytes(hall):
+    from neurosim_core.learn.gym import NumpyEnv
+
+    surface = ns.learn.Counts(dtype="uint8")
+    bare = ns.learn.make_env("hover", worlds=2, device="cpu", pixels=8, models=[hall], surface=surface)
+    env = NumpyEnv(bare)
+    observations, _ = env.reset(seed=1)
+    space = env.single_observation_space["events"]
+    assert (space.dtype, space.low.max(), space.high.min()) == (np.uint8, 0, 255)
+    assert env.observation_space.contains(observations)

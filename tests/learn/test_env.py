@@ -164,6 +164,14 @@ def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
         make(worlds=2, **options).load_state_dict(torch.load(tmp_path / "state.pt"))
 
 
+def test_what_sensors_remember_elsewhere_is_not_saved(make):
+    noisy = {"pixel": {"threshold_on": 0.2, "threshold_off": 0.2, "shot_noise": {"rate_hz": 5.0}}}
+    env = make(task=type("Noisy", (Brief,), noisy)(), randomise=False)
+    env.reset()
+    with pytest.raises(ValueError, match="front: noise"):
+        env.state_dict()
+
+
 def test_a_step_with_endings_makes_no_tensor_of_host_numbers(make, host_tensors):
     drawn = Randomisation(lag_s=(0.01, 0.05), mass_factor=(0.9, 1.1), wind_m_s=1.0)
     env = make(randomise=drawn)
