@@ -57,8 +57,7 @@ class Matcher:
         for source, (node, publisher) in wanted.items():
             offset_ns = 0 if node.host == self._host else node.clock_offset_ns - own.clock_offset_ns
             if source in present or subscriber.revive(source):
-                if present.get(source) != offset_ns:
-                    subscriber.set_clock(source, offset_ns)
+                subscriber.set_clock(source, offset_ns)
             else:
                 self._connect(subscriber, node, publisher, offset_ns)
 

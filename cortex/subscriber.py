@@ -399,9 +399,9 @@ class Subscriber(Generic[T]):
             self._links_changed()
 
     def sources(self) -> dict[int, int]:
-        """The publishers that are connected and have not left, and what to add to their clocks [ns]."""
+        """The publishers that are connected and have not left, and the sequence that comes next of each."""
         with self._receive_lock:
-            return {link.source: link.clock_offset_ns for link in self._links if link not in self._leaving}
+            return {link.source: link.expected for link in self._links if link not in self._leaving}
 
     def revive(self, source: int) -> bool:
         """A publisher that had left is back: keep its connection; False if there is none. For the node."""
