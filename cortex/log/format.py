@@ -56,6 +56,40 @@ def open_writer(sink: Sink, compression: str) -> Any:
         raise ImportError(f"the compression {compression} needs: pip install {library}") from error
 
 
+def add_channel(
+    writer: Any,
+    schemas: dict[int, int],
+    topic: str,
+    schema: Schema,
+    *,
+    source: int,
+    node: str = "",
+    latch: bool = False,
+) -> int:
+    """Add the channel of a publisher, and its schema where that is new; return MCAP's number of the channel.
+
+    Args:
+        writer: From `open_writer`.
+        schemas: MCAP's numbers of those that the file has, by fingerprint; gets the new one.
+        topic: Of the messages.
+        schema: Of the messages.
+        source: The publisher's number.
+        node: Name of its node.
+        latch: Whether it latches.
+    """
+    number = schemas.get(schema.fingerprint)
+    if number is None:
+        number = writer.register_schema(schema.name, SCHEMA_ENCODING, schema.to_json().encode())
+        schemas[schema.fingerprint] = number
+    metadata = {
+        "fingerprint": f"{schema.fingerprint:016x}",
+        "source": f"{source:016x}",
+        "node": node,
+        "latch": "1" if latch else "0",
+    }
+    return int(writer.register_channel(topic, MESSAGE_ENCODING, number, metadata))
+
+
 class LogInfo(NamedTuple):
     """What is known of a recorded message besides its content."""
 

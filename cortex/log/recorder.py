@@ -25,10 +25,9 @@ from cortex.link import Info
 from cortex.log.format import (
     END,
     FORMAT_VERSION,
-    MESSAGE_ENCODING,
     PROFILE,
-    SCHEMA_ENCODING,
     START,
+    add_channel,
     open_writer,
     require_mcap,
 )
@@ -363,22 +362,14 @@ class Recorder:
         return channel
 
     def _add_channel(self, info: Info, schema: Schema) -> int:
-        number = self._schemas.get(schema.fingerprint)
-        if number is None:
-            number = self._writer.register_schema(schema.name, SCHEMA_ENCODING, schema.to_json().encode())
-            self._schemas[schema.fingerprint] = number
         node, latch = "", False
         for record in self._node.nodes():
             for publisher in record.publishers:
                 if publisher.source == info.source:
                     node, latch = record.name, publisher.latch
-        metadata = {
-            "fingerprint": f"{schema.fingerprint:016x}",
-            "source": f"{info.source:016x}",
-            "node": node,
-            "latch": "1" if latch else "0",
-        }
-        channel = int(self._writer.register_channel(info.topic, MESSAGE_ENCODING, number, metadata))
+        channel = add_channel(
+            self._writer, self._schemas, info.topic, schema, source=info.source, node=node, latch=latch
+        )
         self._channels[info.topic, info.source] = channel
         return channel
 

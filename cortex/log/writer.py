@@ -11,10 +11,9 @@ from typing import Any
 from cortex.codec import codec_of
 from cortex.log.format import (
     FORMAT_VERSION,
-    MESSAGE_ENCODING,
     PROFILE,
-    SCHEMA_ENCODING,
     START,
+    add_channel,
     open_writer,
     require_mcap,
 )
@@ -66,29 +65,15 @@ class LogWriter:
             raise ValueError(f"{topic}: the message has more than {BODY_LIMIT} bytes")
         key = check_topic(topic), codec.fingerprint
         if key not in self._channels:
-            self._channels[key] = self._add_channel(topic, codec), 0
+            source = secrets.randbits(64) | 1
+            channel = add_channel(self._writer, self._schemas, topic, codec.schema, source=source)
+            self._channels[key] = channel, 0
         channel, count = self._channels[key]
         self._channels[key] = channel, count + 1
         self._last_ns = max(self._last_ns, at_ns)
         self._writer.add_message(
             channel, log_time=self._last_ns, data=body, publish_time=max(at_ns, 0), sequence=count
         )
-
-    def _add_channel(self, topic: str, codec: Any) -> int:
-        schema = codec.schema
-        if schema.fingerprint not in self._schemas:
-            text = schema.to_json().encode()
-            self._schemas[schema.fingerprint] = self._writer.register_schema(
-                schema.name, SCHEMA_ENCODING, text
-            )
-        metadata = {
-            "fingerprint": f"{schema.fingerprint:016x}",
-            "source": f"{secrets.randbits(64) | 1:016x}",
-            "node": "",
-            "latch": "0",
-        }
-        number = self._schemas[schema.fingerprint]
-        return int(self._writer.register_channel(topic, MESSAGE_ENCODING, number, metadata))
 
     def close(self) -> None:
         """Write the file's summary. Closing twice is allowed.
