@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # isort: off
         data as data,
         learn as learn,
         packets as packets,
+        random as random,
         registry as registry,
         scene as scene,
         sensors as sensors,
