@@ -64,7 +64,7 @@ class LinLogConfig(NoiseTermConfig):
     """Light at which the logarithm begins [white / 255]."""
 
     def numbers(self, white_radiance: float) -> tuple[float, ...]:
-        """Return radiance where the logarithm begins, its logarithm, and log radiance seen over that light."""
+        """Return radiance where the logarithm begins, its logarithm, and log radiance over that light."""
         begin = white_radiance * self.linear_below / 255.0
         return begin, math.log(begin), math.log(self.linear_below)
 

@@ -42,9 +42,9 @@ class NoiseTermConfig(Settings):
     signal: ClassVar[Any] = None
     """Device function (`wp.func`): from a `SignalTerm`, the seed of numbers that change with time (uint64),
     the index of the pixel, row by row (int32), the time since the reset [ns] (int64) and log radiance
-    (float64) to what the pixel sees at that time (float64). Between two frames that is linear in time. Random
-    numbers are addressed: `random_bits(seed, term.stream, since_reset_ns, pixel)` for what changes with every frame,
-    `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
+    (float64) to what the pixel sees at that time (float64). Between two frames that is linear in time.
+    Random numbers are addressed: `random_bits(seed, term.stream, since_reset_ns, pixel)` for what changes
+    with every frame, `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
 
     def numbers(self, white_radiance: float) -> tuple[float, ...]:
         """Return what `SignalTerm.numbers` holds, at most four."""
