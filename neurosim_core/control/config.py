@@ -52,7 +52,7 @@ class ControllerConfig(Settings):
     rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
     """Commands a second [Hz]; each is held until the next."""
     gains: Se3Config = Se3Config()
-    """Gains and limits of the geometric controller; it also turns setpoints from outside into rotor speeds."""
+    """Gains and limits of the geometric controller; it also turns outside setpoints into rotor speeds."""
 
     def make(self, context: ControllerContext) -> PathController:
         """Return the controller of all worlds."""
