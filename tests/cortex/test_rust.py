@@ -31,8 +31,7 @@ CARGO = shutil.which(
 OLDEST = (1, 89)
 DEBIAN = Path("/usr/share/cargo/registry")
 """Where `apt install librust-zmq-dev` and the like put crates: they are taken from there, if they are."""
-CRATES = ["librust-zmq-dev", "librust-serde-json-dev", "librust-serde-derive-dev", "librust-anyhow-dev"]
-CRATES += ["librust-blake2b-simd-dev", "librust-hex-dev", "librust-nix-dev", "librust-rand-dev", "libzmq3-dev"]
+CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-derive,serde-json,zmq}-dev"
 PATIENCE_S = 900.0
 """After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
 
@@ -58,7 +57,7 @@ def _missing() -> str:
     if found is None or (int(found[1]), int(found[2])) < OLDEST:
         return f"cargo {OLDEST[0]}.{OLDEST[1]} or newer is needed, this is {shown.strip()!r}"
     found_crates = _cargo("fetch", timeout_s=60.0)
-    return f"no crates: apt install {' '.join(CRATES)}" if found_crates.returncode else ""
+    return f"no crates: apt install {CRATES}" if found_crates.returncode else ""
 
 
 MISSING = _missing()
