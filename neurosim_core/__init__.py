@@ -11,9 +11,11 @@ from neurosim_core.lazy import lazy_names
 
 if TYPE_CHECKING:  # isort: off
     from neurosim_core import (
+        control as control,
         data as data,
         learn as learn,
         packets as packets,
+        random as random,
         registry as registry,
         scene as scene,
         sensors as sensors,

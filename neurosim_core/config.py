@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from neurosim_core.config_errors import describe_errors, explain, suggestion
-from neurosim_core.control import Se3Config
+from neurosim_core.control import ControllerConfig, Se3ControllerConfig
 from neurosim_core.live.config import LinkConfig, LiveConfig
 from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
 from neurosim_core.registry import kinds, on_change
@@ -47,15 +47,6 @@ class ConfigError(ValueError):
     """A settings file or dict is wrong; the message names each key, its value and what is allowed."""
 
 
-class ControlConfig(Settings):
-    """The controller that flies the path."""
-
-    rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
-    """Commands a second [Hz]; each is held until the next."""
-    gains: Se3Config = Se3Config()
-    """Gains and limits of the geometric controller."""
-
-
 def _default_sensors() -> dict[str, SensorConfig]:
     return {
         "events": EventSensorConfig(),
@@ -66,8 +57,10 @@ def _default_sensors() -> dict[str, SensorConfig]:
     }
 
 
-_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "renderer": "warp"}
+_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "control": "se3", "renderer": "warp"}
 """Kinds of settings that do not say which they are."""
+_KEY_OF = {"controller": "control"}
+"""Key of the settings of a seam, where it is not its name."""
 
 
 def _any_kind(seam: str, *, default: str | None = None) -> Any:
@@ -97,11 +90,13 @@ if TYPE_CHECKING:
     AnySensor = SensorConfig
     AnyScene = SceneConfig
     AnyVehicle = VehicleConfig
+    AnyController = ControllerConfig
     AnyRenderer = RendererConfig
 else:
     AnySensor = _any_kind("sensor")
     AnyScene = _any_kind("scene", default=_DEFAULT_KINDS["scene"])
     AnyVehicle = _any_kind("vehicle", default=_DEFAULT_KINDS["vehicle"])
+    AnyController = _any_kind("controller", default=_DEFAULT_KINDS["control"])
     AnyRenderer = _any_kind("renderer", default=_DEFAULT_KINDS["renderer"])
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
@@ -129,7 +124,7 @@ class FleetMember(Settings):
     """The multirotor; null: the common one."""
     path: PathConfig | None = None
     """Where it flies; null: as the common one, a tour with a seed of its own."""
-    control: ControlConfig | None = None
+    control: AnyController | None = None
     """What flies it; null: as the common one."""
     sensors: Sensors | None = None
     """Its sensors; null: the common ones."""
@@ -166,8 +161,8 @@ class SimulationConfig(Settings):
     path: PathConfig = TourConfig()
     """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
     {kind: poses, file: poses.txt, format: tum} moves the sensors along poses, without a vehicle."""
-    control: ControlConfig = ControlConfig()
-    """What flies it."""
+    control: AnyController = Se3ControllerConfig()
+    """What flies it: `se3`, the geometric controller, or a controller of a plug-in by its kind."""
     sensors: Sensors = Field(default_factory=_default_sensors)
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
     exist, nor does one that is null, as in --set sensors.depth=null. Under the key `sensors+` they change the
@@ -261,12 +256,12 @@ def _take_new_kinds(seam: str) -> None:
         sensors: Any = Annotated[dict[Name, _any_kind("sensor")], AfterValidator(expand_stereo)]  # type: ignore[misc]
         SimulationConfig.model_fields["sensors"].annotation = sensors
         FleetMember.model_fields["sensors"].annotation = sensors | None
-    elif seam in _DEFAULT_KINDS:
-        field = SimulationConfig.model_fields[seam]  # which keeps its validator
+    elif (key := _KEY_OF.get(seam, seam)) in _DEFAULT_KINDS:
+        field = SimulationConfig.model_fields[key]  # which keeps its validator
         field.annotation = functools.reduce(operator.or_, kinds(seam).values())
-        field.discriminator = "kind"
-        if seam in FleetMember.model_fields:
-            FleetMember.model_fields[seam].annotation = _any_kind(seam, default=_DEFAULT_KINDS[seam]) | None
+        field.discriminator = "kind" if len(kinds(seam)) > 1 else None
+        if key in FleetMember.model_fields:
+            FleetMember.model_fields[key].annotation = _any_kind(seam, default=_DEFAULT_KINDS[key]) | None
     else:
         return
     for settings in (FleetMember, SimulationConfig):

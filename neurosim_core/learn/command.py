@@ -58,9 +58,11 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument(
         "--ray",
+        nargs="?",
+        const="auto",
         metavar="ADDRESS",
-        help="a Ray cluster (local, auto, host:port): one training for each of --seeds; depth, flow: the "
-        "flights of --live",
+        help="a Ray cluster (local, host:port; auto, the default: one that runs here): one training for each "
+        "of --seeds; depth, flow: the flights of --live",
     )
     learn.add_argument("--wandb", action="store_true", help="send what TensorBoard gets to Weights & Biases")
     learn.add_argument(
