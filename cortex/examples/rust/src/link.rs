@@ -5,7 +5,7 @@ use std::thread;
 use std::time::Instant;
 
 use crate::json::Json;
-use crate::wire::{BODY_MAX, CONFIRMS, HEADER, Header, STRICT, key, parse_answer, prefix};
+use crate::wire::{BODY_MAX, CONFIRMS, CONFIRMS_END, HEADER, Header, LAST, STRICT, key, parse_answer, prefix};
 use crate::zmtp::{Message, Writer, connect};
 use crate::{Result, ensure, node, schema};
 
@@ -39,8 +39,8 @@ pub struct Link {
     expected: Option<u64>,
     /// The publisher has given away all sequences below this.
     reached: u64,
-    /// The sequence that the publisher last said would come next.
-    told: u64,
+    /// The sequence at which the publisher said that the stream ends.
+    ended: Option<u64>,
 }
 
 impl Link {
@@ -53,7 +53,7 @@ impl Link {
         );
         let (source, address) = (publisher.get("source").int() as u64, address.to_string());
         let (stamped, writer, expected) = (schema::is_stamped(&schema), None, None);
-        let (connected, left, reader, reached, told) = (false, None, 0, 0, 0);
+        let (connected, left, reader, reached, ended) = (false, None, 0, 0, None);
         Ok(Link {
             source,
             schema,
@@ -67,12 +67,12 @@ impl Link {
             writer,
             expected,
             reached,
-            told,
+            ended,
         })
     }
 
     fn attach_key(&self) -> Vec<u8> {
-        let options = if self.reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS } else { 0 };
+        let options = if self.reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS | CONFIRMS_END } else { 0 };
         key(b'A', self.stamped, self.source, self.reader, options)
     }
 
@@ -102,12 +102,18 @@ impl Link {
         }
         self.expected = Some(sequence + count);
         counters.lost += sequence - expected;
-        self.told = if count == 0 { sequence } else { self.told };
-        if let (true, true, Some(writer)) = (self.reliable, sequence > expected || count == 0, &self.writer) {
+        if sequence > expected {
+            self.confirm(sequence);
+        }
+        Ok(true)
+    }
+
+    /// Tell the publisher that all below a sequence is accounted for [E3].
+    fn confirm(&self, sequence: u64) {
+        if let (true, Some(writer)) = (self.reliable, &self.writer) {
             let confirmed = key(b'R', self.stamped, self.source, self.reader, sequence);
             let _ = [1, 0].map(|on| writer.send(&[[&[on], &confirmed[..]].concat()])); // its end is an event
         }
-        Ok(true)
     }
 
     /// The bodies that a ZeroMQ message brings.
@@ -115,8 +121,10 @@ impl Link {
         let frame = &message[0];
         if frame.starts_with(&self.attach_key()) {
             let (next, latched) = parse_answer(frame)?;
-            (self.reached, self.told) = (self.reached.max(next), self.told.max(next));
-            if self.expected.replace(self.expected.unwrap_or(next)).is_some() || latched.is_empty() {
+            self.reached = self.reached.max(next);
+            let known = self.expected.replace(self.expected.unwrap_or(next));
+            self.confirm(known.unwrap_or(next));
+            if known.is_some() || latched.is_empty() {
                 return Ok(vec![]);
             }
             return self.check(latched, &latched[HEADER.min(latched.len())..]).map(|(_, body)| vec![body]);
@@ -135,6 +143,10 @@ impl Link {
             kind => return Err(format!("kind {kind}")),
         };
         let is_new = self.advance(header.sequence, bodies.len() as u64, counters)?;
+        if is_new && header.kind == b'N' {
+            self.ended = if header.aux & LAST != 0 { Some(header.sequence) } else { self.ended };
+            self.confirm(header.sequence + (header.aux & LAST));
+        }
         Ok(if is_new { bodies } else { vec![] })
     }
 
@@ -147,15 +159,14 @@ impl Link {
         Ok((header, body))
     }
 
-    /// Whether all has come that the publisher told of at its end.
+    /// Whether the publisher has said that nothing follows, or can say nothing any more.
     pub fn is_complete(&self) -> bool {
-        !self.connected || self.expected == Some(self.told)
+        !self.connected || self.ended.is_some()
     }
 
     /// Count what has not come of a publisher that has left [E5].
     pub fn end(&self, counters: &mut Counters) {
-        let expected = self.expected.unwrap_or(0);
         counters.lost += self.expected.map_or(0, |expected| self.reached.saturating_sub(expected));
-        counters.cut_off += (self.reliable && expected > self.told) as u64;
+        counters.cut_off += (self.reliable && self.expected.is_some() && self.ended < self.expected) as u64;
     }
 }

@@ -7,11 +7,13 @@ use std::time::{Duration, Instant};
 
 use crate::json::Json;
 use crate::node::{monotonic_ns, random};
-use crate::wire::{CONFIRMS, Header, number};
+use crate::wire::{CONFIRMS, CONFIRMS_END, Header, LAST, number};
 use crate::zmtp::{Message, Reader, Writer};
 use crate::{Result, body, schema};
 
 const QUEUE: usize = 1000;
+/// In the answer: the end of the stream will be said.
+const MARKS_END: u64 = 1;
 const INLINE_MAX: usize = 16_384;
 /// The longest that a reader may ask for.
 const MAX_WAIT: Duration = Duration::from_secs(60);
@@ -26,7 +28,10 @@ struct Wishes {
     reader: u64,
     wait: Duration,
     confirms: bool,
+    confirms_end: bool,
     confirmed: u64,
+    /// Whether it has its answer, as far as it says so: from then on it counts what it loses [E7].
+    counts: bool,
     /// The sequence that it must have accounted for before it is waited for again; 0: it is in time.
     lagging: u64,
 }
@@ -95,20 +100,22 @@ impl Publisher {
                 let (mut wishes, options) = (peer.wishes.lock().unwrap(), number(key, 24));
                 wishes.wait = Duration::from_millis(options >> 32).min(MAX_WAIT);
                 (wishes.reader, wishes.confirms) = (number(key, 16), options & CONFIRMS != 0);
+                wishes.confirms_end = options & CONFIRMS_END != 0;
+                wishes.counts = !wishes.confirms_end;
                 wishes.prefixes.push(key.to_vec());
                 drop(wishes);
-                let rest = [next.0, 0, 0, 0].map(u64::to_le_bytes).concat();
+                let rest = [next.0, MARKS_END, 0, 0].map(u64::to_le_bytes).concat();
                 peer.push(&Arc::new(vec![[key, &rest].concat()]), next.0);
             }
             (b'R', true) => {
                 let (mut wishes, sequence) = (peer.wishes.lock().unwrap(), number(key, 24));
-                wishes.confirmed = wishes.confirmed.max(sequence);
+                (wishes.confirmed, wishes.counts) = (wishes.confirmed.max(sequence), true);
                 wishes.lagging = if sequence >= wishes.lagging { 0 } else { wishes.lagging };
             }
             (_, true) => peer.wishes.lock().unwrap().prefixes.push(key.to_vec()),
             (kind, false) => {
                 let mut wishes = peer.wishes.lock().unwrap();
-                wishes.reader = if kind == b'A' { 0 } else { wishes.reader };
+                (wishes.reader, wishes.counts) = if kind == b'A' { (0, false) } else { (wishes.reader, wishes.counts) };
                 let found = wishes.prefixes.iter().position(|prefix| prefix == key);
                 found.map(|index| wishes.prefixes.swap_remove(index));
             }
@@ -116,7 +123,7 @@ impl Publisher {
     }
 
     pub fn readers(&self) -> usize {
-        self.peers.lock().unwrap().iter().filter(|peer| peer.wishes.lock().unwrap().reader != 0).count()
+        self.peers.lock().unwrap().iter().filter(|peer| peer.wishes.lock().unwrap().counts).count()
     }
 
     fn push(&self, message: Message, sequence: u64) -> bool {
@@ -141,18 +148,18 @@ impl Publisher {
         Ok(self.push(frames, header.sequence))
     }
 
-    /// Which sequence comes next, and the readers to whom that is to be sent.
-    fn news(&self, next: u64) -> (Arc<Message>, Vec<Arc<Peer>>) {
+    /// Which sequence comes next, or that none does, and the readers to whom that is to be sent.
+    fn news(&self, next: u64, aux: u64) -> (Arc<Message>, Vec<Arc<Peer>>) {
         let peers = self.peers.lock().unwrap().clone();
         let readers = peers.into_iter().filter(|peer| peer.wishes.lock().unwrap().reader != 0).collect();
-        (Arc::new(vec![self.header(b'N', next).pack()]), readers)
+        (Arc::new(vec![Header { aux, ..self.header(b'N', next) }.pack()]), readers)
     }
 
     /// Tell readers after a silence how many messages there have been [G2]; to be called now and then.
     pub fn tell(&self) {
         let mut next = self.next.lock().unwrap();
         if next.1.elapsed() > SILENCE && next.2 != next.0 {
-            let (news, readers) = self.news(next.0);
+            let (news, readers) = self.news(next.0, 0);
             let told = readers.iter().all(|peer| peer.queue.try_send(news.clone()).is_ok());
             next.2 = if told { next.0 } else { next.2 };
         }
@@ -161,12 +168,13 @@ impl Publisher {
     /// Say that the stream is over [E1], and wait until reliable readers have confirmed all of it [E2].
     pub fn close(&self) {
         let (next, begin) = (self.next.lock().unwrap().0, Instant::now());
-        let (last, mut untold) = self.news(next);
+        let (last, mut untold) = self.news(next, LAST);
         loop {
             untold.retain(|peer| matches!(peer.queue.try_send(last.clone()), Err(TrySendError::Full(_))));
             let owes = |peer: &Arc<Peer>| {
                 let wishes = peer.wishes.lock().unwrap();
-                wishes.confirms && wishes.confirmed < next && begin.elapsed() < wishes.wait
+                let needed = next + wishes.confirms_end as u64;
+                wishes.confirms && wishes.confirmed < needed && begin.elapsed() < wishes.wait
             };
             let written = untold.is_empty() && Arc::strong_count(&last) == 1; // else it waits in some queue
             if (written || begin.elapsed() > LINGER) && !self.peers.lock().unwrap().iter().any(owes) {

@@ -10,6 +10,9 @@ pub const HEADER: usize = 64;
 pub const BODY_MAX: u64 = 1 << 30;
 pub const STRICT: u64 = 1 << 1;
 pub const CONFIRMS: u64 = 1 << 2;
+pub const CONFIRMS_END: u64 = 1 << 3;
+/// In `aux` of kind `N`: the stream ends here [E1].
+pub const LAST: u64 = 1;
 
 #[derive(Clone, Copy, Default)]
 pub struct Header {
