@@ -412,12 +412,13 @@ class RingImpostor(Impostor):
         self.listener = native.listen(str(directory / "data.ring"))
         self.ring = native.Broadcast(self.SOURCE, zmq.Again)
 
-    def take_in(self, key: bytes) -> None:
+    def take_in(self, key: bytes, *, answers: bool = True) -> None:
         fd = native.accept(self.listener)
         source, number, page, bell = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
         self.ring.add(fd, page, bell, False, 0, 0)
-        self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
+        if answers:
+            self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
 
     def close(self) -> None:
         super().close()
@@ -499,6 +500,22 @@ def test_ring_that_ends(programs: Path, impostor: RingImpostor) -> None:
     impostor.xpub.send(make_frame(b"M", 4, codec_of(Scan).encode(scan(-1, 0), 1000)))
     result = result_of(peer)
     assert (result["received"], result["wrong"], result["rejected"], result["lost"]) == (4, 0, 0, 0)
+    peer.end()
+
+
+def test_ring_of_a_publisher_that_is_gone_before_its_answer_came(
+    programs: Path, impostor: RingImpostor
+) -> None:
+    """What is in it is read, and nobody has said that this is all."""
+    peer = Peer([programs / "peer", "count", "/scan", "reliable", 0, 0])
+    impostor.take_in(impostor.await_key(), answers=False)
+    for number in range(3):
+        assert impostor.ring.send(make_frame(b"M", number, body_of(number)))
+    impostor.leave()
+    peer.await_complaint("ended without saying how much it had sent")
+    peer.close_input()
+    result = result_of(peer)
+    assert (result["received"], result["lost"], result["rejected"], result["cut_off"]) == (3, 0, 0, 1)
     peer.end()
 
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import select
 import shutil
 import time
 from collections.abc import Iterator
@@ -20,7 +18,7 @@ import pytest
 from cpp_client import Impostor, Peer, make_frame
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs
-from processes import SOON_S, wait_for
+from processes import wait_for
 
 import cortex
 from cortex import records, reliable, wire
@@ -104,11 +102,6 @@ class Leavers(Impostor):
         else:
             self.xpub.send(make_frame(b"N", number, b"", aux=int(what == "end"), source=source))
 
-    def leave(self) -> None:
-        """Be gone."""
-        self.welcome = wire.control_frame(records.Welcome(1, 2, [], []))
-        self.record = wire.control_frame(records.Gone(2, 5, ""))
-
 
 @pytest.fixture
 def leavers(runtime: Path) -> Iterator[Leavers]:
@@ -150,16 +143,10 @@ def test_cpp_reports_what_it_has_not_heard_the_end_of(
     peers = [Peer([programs / "peer", "count", f"/cut{number}", "reliable", 0, 0]) for number in (0, 1)]
     leavers.speak()
     leavers.leave()
-    stderr, said = peers[1].process.stderr, b""
-    assert stderr is not None
-    while b"ended without saying how much it had sent" not in said:
-        assert select.select([stderr], [], [], SOON_S)[0], said
-        said += os.read(stderr.fileno(), 4096)
+    peers[1].await_complaint("ended without saying how much it had sent")
     time.sleep(0.5)  # for the other, which has nothing to say
     for number, peer in enumerate(peers):
-        assert peer.process.stdin is not None
-        peer.process.stdin.close()
+        peer.close_input()
         counted = json.loads(peer.line())
         assert {name: counted[name] for name in COUNTERS} == expected(number), number
-        peer.process.stdin = None  # it was closed
         peer.end()

@@ -62,7 +62,7 @@ class Reading:
 
     def wait_for_end(self):
         """Until its publisher has left, and all that came of it was read."""
-        wait_for(lambda: not self.subscriber.sources() and not self.subscriber._links)
+        wait_for(lambda: not (self.subscriber._links or self.subscriber._queue))
 
     def close(self):
         self.subscriber.close()

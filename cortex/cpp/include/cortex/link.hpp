@@ -80,6 +80,11 @@ class Link {
     if (leaving_ns != 0) leaving_ns = now_ns;
   }
 
+  // The publisher has left: what it wrote into its ring counts, also if its answer never came.
+  void leave() {
+    if (!attached_ && end_ != nullptr && end_->welcomed() > 0) enter_ring();
+  }
+
   // The publisher has left, and all that came of it has been read: what it has published besides is lost.
   void end() {
     try {
@@ -287,11 +292,12 @@ class Link {
     attached_ = true;
     reached_ = std::max(reached_, answer.sequence);
     marks_end_ = answer.marks_end;
+    const bool known = known_;
     if (first && !use_ring()) {
       attached_ = false;
       return;  // it is asked again
     }
-    const bool known = std::exchange(known_, true);
+    known_ = true;
     if (!known) expected_ = answer.sequence;
     if (policy_.is_reliable && !in_ring_) confirm(expected_);
     if (!known && !answer.latched.empty()) latched(answer.latched, queue);
@@ -309,10 +315,14 @@ class Link {
   bool use_ring() {
     const int welcomed = end_ == nullptr ? 0 : end_->welcomed();
     if (welcomed < 0) go_without_memory("its ring cannot be mapped");
-    if (welcomed <= 0) return welcomed == 0;
-    in_ring_ = true;
+    if (welcomed > 0) enter_ring();
+    return welcomed >= 0;
+  }
+
+  void enter_ring() {
+    in_ring_ = attached_ = true;
+    if (!std::exchange(known_, true)) expected_ = end_->first();  // what is lost counts from there on
     for (const char kind : {'M', 'N', 'L'}) subscribe(kind, false);
-    return true;
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
