@@ -16,10 +16,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import zmq
+from processes import ROOT, SOON_S, wait_for
 
 from cortex.control import LEASE_NS, control_types, make_control_socket
 from cortex.discovery import Directory
@@ -39,10 +40,7 @@ from cortex.records import (
 from cortex.registry import Registry
 from cortex.wire import parse_control
 
-ROOT = Path(__file__).resolve().parents[2]
 NODE = Path(__file__).with_name("discovery_node.py")
-SOON_S = 60.0
-"""Deadline of things that take milliseconds, on a machine that does a lot besides."""
 LEASE_S = LEASE_NS / 1e9
 
 
@@ -56,13 +54,6 @@ def private_runtime(monkeypatch) -> Iterator[Path]:
         os.kill(pid, signal.SIGKILL)
         wait_for(lambda: registry_pid() is None)
     shutil.rmtree(path)
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "the condition did not come true in time"
-        time.sleep(0.005)
 
 
 def registry_pid(domain: int = 0) -> int | None:

@@ -391,7 +391,6 @@ def test_cpp_reader_counts_a_stream_that_was_cut_off(
     reader = start("count", "/scan", "reliable", 0, 0)
     for orderly in (True, False):
         child = start_child("peer")
-        child.hear()
         child.ask(do="publisher", topic="/scan", type="Scan")
         assert child.ask(do="await_subscribers", topic="/scan")["ok"]
         child.say(do="leave", topic="/scan", count=10, orderly=orderly)

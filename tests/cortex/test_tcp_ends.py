@@ -94,7 +94,6 @@ def test_reliable_over_tcp(make_node, start_child, runtime, tmp_path, kind):
         KINDS[3]: connections_are_cut,
     }[kind]
     child = start_child("peer", **ELSEWHERE)
-    child.hear()
     for _ in range(max(RUNS // len(KINDS), 1)):
         run(node, child, start_child, generator, tmp_path)
     child.finish()
@@ -191,7 +190,6 @@ def a_publisher_is_killed(node, child, start_child, generator, tmp_path):
         **ELSEWHERE,
     )
     reading = read(node, generator)
-    victim.hear()
     wait_for(lambda: reading.accounted() > generator.randrange(1, 100))
     time.sleep(generator.uniform(0.0, 0.05))
     victim.kill()
@@ -211,7 +209,6 @@ def a_subscriber_leaves(node, child, start_child, generator, tmp_path):
         policy=["reliable", {"depth": generator.choice([1, 64]), "timeout_s": SOON_S}],
         **ELSEWHERE,
     )
-    victim.hear()
     child.ask(do="subscriber", topic="/numbers", type="Block", policy=["reliable", {"timeout_s": SOON_S}])
     longest_s = 0.0
     with node.publisher("/numbers", Block, max_wait_s=SOON_S) as publisher:
