@@ -44,6 +44,11 @@ def add_parsers(commands: _Commands) -> None:
     learn.add_argument(
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
+    learn.add_argument(
+        "--surface",
+        choices=("leaky", "time", "counts", "voxels"),
+        help="how the student sees events (default: as the task says)",
+    )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="train with N seeds from --seed on; with --ray"
@@ -170,12 +175,13 @@ def _learn(arguments: argparse.Namespace) -> int:
     config = _changed(
         config,
         pixels=arguments.pixels,
+        surface=arguments.surface,
         randomise=arguments.randomise,
         wandb=arguments.wandb,
         student=_changed(config.student, worlds=arguments.worlds, iterations=arguments.student_iterations),
         teacher=_changed(config.teacher, iterations=arguments.teacher_iterations),
     )
-    changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
+    changes = ("worlds", "pixels", "surface", "teacher_iterations", "student_iterations", "randomise")
     changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
     if arguments.resume and changed:
         raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
@@ -291,7 +297,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.train import evaluate_run
 
-    film = arguments.run / f"{Path(arguments.scenes).stem}.webp"
+    speed = "" if arguments.speed is None else f"-{arguments.speed:g}m_s"
+    film = arguments.run / f"{Path(arguments.scenes).stem}{speed}.webp"
     for name, evaluation in evaluate_run(
         arguments.run,
         scenes=arguments.scenes,

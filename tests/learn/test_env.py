@@ -133,6 +133,7 @@ def test_surfaces_come_in_the_type_that_is_asked_for(make, dtype):
 def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
     """In the same environment and in another one, with all that is drawn, sensors, and a world that ended."""
     drawn = Randomisation(lag_s=(0.01, 0.05), latency_steps=2, mass_factor=(0.9, 1.1), wind_m_s=1.0)
+    drawn = dataclasses.replace(drawn, mount_rad=0.1, focal_factor=(0.9, 1.1), light_factor=(0.02, 1.0))
     options = {"randomise": drawn, "sensors": {"imu": {"kind": "imu", "rate_hz": 100}}}
     actions = actions_of(25, 3)
     actions[:, 0, 0] = -1.0
