@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # isort: off
         scene as scene,
         sensors as sensors,
         sim as sim,
+        sinks as sinks,
         vehicle as vehicle,
     )
     from neurosim_core.config import (
