@@ -83,6 +83,16 @@ def number_of(received: Any) -> int:
     return received.number if isinstance(received, Block) else received.stamp_ns
 
 
+def connect(
+    node: Node, topic: str, kind: Any, policy: Policy | None = None, callback: Any = None, **options: Any
+) -> tuple[Any, Any]:
+    """A publisher of a node, and a subscriber of the same node that is attached to it."""
+    publisher = node.publisher(topic, kind, **options)
+    subscriber = node.subscriber(topic, kind, callback, policy=policy)
+    assert publisher.wait_for_subscribers(timeout_s=60.0)
+    return publisher, subscriber
+
+
 def policy_of(words: list[Any]) -> Policy:
     """A policy from its name and arguments."""
     return getattr(cortex, words[0])(**(words[1] if len(words) > 1 else {}))
