@@ -69,7 +69,8 @@ def add_parsers(commands: _Commands) -> None:
         "--algorithm",
         choices=("dagger", "ppo"),
         default="dagger",
-        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher",
+        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher "
+        "(rate: how fast that is, too)",
     )
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
     learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
@@ -217,10 +218,12 @@ def _changed(settings: Any, **given: Any) -> Any:
 
 
 def _measure_rate(arguments: argparse.Namespace) -> int:
-    """Print steps a second of a task, with one and two renders in each, and what endings cost."""
+    """Print steps a second of a task, with one and two renders in each, and what endings (and PPO) cost."""
     from neurosim_core.learn.env import find_task, make_env
-    from neurosim_core.learn.rate import measure_steps
+    from neurosim_core.learn.rate import measure_steps, measure_updates
+    from neurosim_core.learn.train import prepare_torch
 
+    prepare_torch()
     where: dict[str, Any] = {}
     for renders in (1, 2):
         task = find_task(str(arguments.run or "hover"))
@@ -240,6 +243,9 @@ def _measure_rate(arguments: argparse.Namespace) -> int:
             f"steps_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f}; {renders} renders a step, {env.device})"
         )
         print(f"step_with_endings {rate / ended:.3f} (1 % of the worlds, or one, in each step)", flush=True)
+        if arguments.algorithm == "ppo":
+            rate, least, most = measure_updates(env)
+            print(f"steps_with_updates_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f})", flush=True)
     return 0
 
 

@@ -11,7 +11,7 @@ import cortex.node
 from cortex import reliable
 from cortex.context import new_socket
 from cortex.matching import Matcher
-from cortex.places import reach
+from cortex.places import network, reach
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
 from cortex.wire import BODY_LIMIT, CONTROL_LIMIT, HEADER_SIZE
@@ -137,6 +137,18 @@ def test_a_latch_over_tcp(pair):
 
 
 # Security
+
+
+def test_what_the_environment_says_of_other_hosts_can_be_overridden(runtime, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    keys = new_keys(tmp_path / "keys")
+    for name, value in (("LISTEN", "127.0.0.1"), ("REGISTRY", "tcp://127.0.0.1:9"), ("KEYS", "~/keys")):
+        monkeypatch.setenv(f"CORTEX_{name}", value)
+    found = network(None, None, None)
+    assert (found.registry, found.listen) == ("tcp://127.0.0.1:9", "127.0.0.1")
+    assert found.keys is not None
+    assert found.keys.public == keys.public
+    assert network("auto", "", keys) == ("auto", None, keys)
 
 
 def test_plain_tcp_stays_on_this_host(runtime):

@@ -83,6 +83,8 @@ keys = st.builds(
     strict=st.booleans(),
     quota=u8,
     timeout_ms=u32,
+    confirms=st.booleans(),
+    confirms_end=st.booleans(),
 )
 
 
@@ -103,6 +105,7 @@ answers = st.builds(
     AttachAnswer,
     sequence=u64,
     latched=st.binary(max_size=200),
+    marks_end=st.booleans(),
 )
 
 

@@ -406,7 +406,7 @@ def test_a_fast_turn_loses_no_events(make):
 
 def test_the_rate_counts_steps_of_all_worlds(hall):
     """Episodes are cut where that is asked for only, and as many as that in each step."""
-    from neurosim_core.learn.rate import measure_steps
+    from neurosim_core.learn.rate import measure_steps, measure_updates
 
     env = ns.learn.make_env("hover", worlds=8, device="cpu", pixels=8, models=[hall])
     cut = 0
@@ -424,3 +424,5 @@ def test_the_rate_counts_steps_of_all_worlds(hall):
     assert cut == 0
     measure_steps(env, ending=2, seconds=0.1)
     assert cut >= 2 * (5 + 3 + 5)
+    rate, least, most = measure_updates(env)
+    assert 0.0 < least <= rate <= most

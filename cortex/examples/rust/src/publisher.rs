@@ -12,7 +12,7 @@ use zmq::{Context, DONTWAIT, Socket, XPUB};
 use crate::body;
 use crate::node::{Node, clock_ns};
 use crate::schema::Schema;
-use crate::wire::{CONFIRMS, Header, number};
+use crate::wire::{CONFIRMS, CONFIRMS_END, Header, LAST, MARKS_END, number};
 
 const SUBSCRIPTION_MAX: i64 = 1024;
 /// The longest that a reader may ask for.
@@ -22,12 +22,14 @@ const SILENCE: Duration = Duration::from_millis(100);
 const AGAIN: Duration = Duration::from_millis(20);
 const PAUSE: Duration = Duration::from_micros(200);
 
-/// What a reader has asked for, and below which sequence it has accounted for everything.
+/// What a reader has asked for, and below which sequence it has accounted for everything; none: it has no answer yet.
 struct Reader {
     strict: bool,
     wait: Duration,
     confirms: bool,
-    confirmed: u64,
+    /// How many sequences more than there were messages it confirms at the end.
+    end: u64,
+    confirmed: Option<u64>,
 }
 
 pub struct Publisher {
@@ -89,8 +91,9 @@ impl Publisher {
         })
     }
 
+    /// How many readers count what they lose from here on [E7].
     pub fn subscribers(&self) -> usize {
-        self.readers.len()
+        self.readers.values().filter(|reader| reader.confirmed.is_some()).count()
     }
 
     /// Send through the lossy or the strict socket; false if a reliable reader has no room.
@@ -110,7 +113,7 @@ impl Publisher {
 
     /// The longest that readers of the strict socket wait; of those that have not confirmed a sequence.
     fn longest_wait(&self, below: u64) -> Duration {
-        let waits = self.readers.values().filter(|reader| reader.strict && reader.confirmed < below);
+        let waits = self.readers.values().filter(|reader| reader.strict && reader.confirmed < Some(below));
         waits.map(|reader| reader.wait).max().unwrap_or_default()
     }
 
@@ -146,7 +149,7 @@ impl Publisher {
         }
         if self.next > 0 && self.silent.elapsed() > self.tell_after {
             self.tell_after *= 2;
-            self.tell()?;
+            self.tell(0)?;
         }
         Ok(())
     }
@@ -160,8 +163,10 @@ impl Publisher {
         match (kind, on) {
             (b'A', 1) => {
                 let (wait, confirms) = (Duration::from_millis(last >> 32).min(MAX_WAIT), last & CONFIRMS != 0);
-                self.readers.insert(key.to_vec(), Reader { strict, wait, confirms, confirmed: 0 });
-                let answer = [key, &[self.next, 0, 0, 0].map(u64::to_le_bytes).concat()].concat();
+                let end = (last & CONFIRMS_END != 0) as u64;
+                let confirmed = (end == 0).then_some(0);
+                self.readers.insert(key.to_vec(), Reader { strict, wait, confirms, end, confirmed });
+                let answer = [key, &[self.next, MARKS_END, 0, 0].map(u64::to_le_bytes).concat()].concat();
                 if !self.send(strict, &answer)? {
                     self.send_anyway(&answer)?;
                 }
@@ -169,7 +174,7 @@ impl Publisher {
             (b'A', _) => drop(self.readers.remove(key)),
             (b'R', 1) => {
                 let who = self.readers.iter_mut().find(|(key, _)| number(key, 16) == reader);
-                who.into_iter().for_each(|(_, found)| found.confirmed = found.confirmed.max(last));
+                who.into_iter().for_each(|(_, found)| found.confirmed = found.confirmed.max(Some(last)));
                 self.late = self.late.filter(|late| last < *late);
             }
             _ => {}
@@ -177,10 +182,10 @@ impl Publisher {
         Ok(())
     }
 
-    /// Tell readers how many messages there were; false if a reliable one has no room for it.
-    fn tell(&self) -> Result<bool> {
+    /// Tell readers how many messages there were, or with `LAST` will be; false if a reliable one has no room for it.
+    fn tell(&self, aux: u64) -> Result<bool> {
         let publish_ns = clock_ns(ClockId::CLOCK_MONOTONIC)?;
-        let frame = Header { kind: b'N', sequence: self.next, publish_ns, ..self.head }.pack();
+        let frame = Header { kind: b'N', sequence: self.next, publish_ns, aux, ..self.head }.pack();
         self.send(false, &frame)?;
         self.send(true, &frame)
     }
@@ -188,14 +193,16 @@ impl Publisher {
     /// Say that the stream is over [E1], and wait until those that say so have read all of it [E2].
     pub fn close(mut self) -> Result<()> {
         let (begin, mut told, mut again) = (Instant::now(), false, Duration::ZERO);
-        let owes = |readers: &HashMap<_, Reader>, next| readers.values().any(|r| r.confirms && r.confirmed < next);
+        let owes = |readers: &HashMap<_, Reader>, next| {
+            readers.values().any(|r| r.confirms && r.confirmed < Some(next + r.end))
+        };
         while !told || owes(&self.readers, self.next) {
-            if begin.elapsed() >= LINGER.max(self.longest_wait(self.next)) {
+            if begin.elapsed() >= LINGER.max(self.longest_wait(self.next + 1)) {
                 break;
             }
             if begin.elapsed() >= again {
                 again = begin.elapsed() + AGAIN;
-                told = self.tell()? && self.late.is_none();
+                told = self.tell(LAST)? && self.late.is_none();
             }
             thread::sleep(PAUSE);
             self.poll()?;

@@ -10,7 +10,7 @@ use zmq::{Context, DONTWAIT, POLLIN, SUB, Socket};
 use crate::body;
 use crate::node::Node;
 use crate::schema::Schema;
-use crate::wire::{BODY_MAX, CONFIRMS, HEADER, Header, STRICT, number, parse_answer};
+use crate::wire::{BODY_MAX, CONFIRMS, CONFIRMS_END, HEADER, Header, LAST, STRICT, number, parse_answer};
 
 const JUMP_MAX: u64 = 1 << 32;
 /// How long a publisher may wait for us, if it likes to.
@@ -38,8 +38,10 @@ pub struct Link {
     /// The attach key, with our number as its reader.
     key: Vec<u8>,
     expected: Option<u64>,
-    /// The sequence that the publisher last said would come next: all below it have been given away.
-    told: u64,
+    /// The publisher has given away all sequences below this.
+    reached: u64,
+    /// The sequence at which the publisher said that the stream ends.
+    end: Option<u64>,
     /// When the publisher was seen to have left.
     left: Option<Instant>,
 }
@@ -52,14 +54,14 @@ impl Link {
         ensure!(publisher["fingerprint"] == fingerprint, "another fingerprint than its schema's [S7]");
         let head =
             Header { source: publisher["source"].as_u64().unwrap_or(0), fingerprint, stamped, ..Header::default() };
-        let options = if reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS } else { 0 };
+        let options = if reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS | CONFIRMS_END } else { 0 };
         let (socket, key) = (context.socket(SUB)?, head.key(b'A', reader, options));
         socket.set_maxmsgsize(BODY_MAX as i64 + 4096)?;
         socket.connect(address)?;
         for wanted in [head.prefix(b'M'), head.prefix(b'N'), head.prefix(b'L'), key.clone()] {
             socket.set_subscribe(&wanted)?;
         }
-        Ok(Link { socket, schema, head, reliable, key, expected: None, told: 0, left: None })
+        Ok(Link { socket, schema, head, reliable, key, expected: None, reached: 0, end: None, left: None })
     }
 
     /// Account for messages from a sequence on; false if they were seen before [K2, K3, E3].
@@ -71,13 +73,20 @@ impl Link {
         }
         self.expected = Some(sequence + count);
         counters.lost += sequence - expected;
-        self.told = if count == 0 { sequence } else { self.told };
-        if self.reliable && (sequence > expected || count == 0) {
+        if sequence > expected {
+            self.confirm(sequence)?;
+        }
+        Ok(true)
+    }
+
+    /// Tell the publisher that all below a sequence is accounted for [E3].
+    fn confirm(&self, sequence: u64) -> Result<()> {
+        if self.reliable {
             let confirmed = self.head.key(b'R', number(&self.key, 16), sequence);
             self.socket.set_subscribe(&confirmed)?;
             self.socket.set_unsubscribe(&confirmed)?;
         }
-        Ok(true)
+        Ok(())
     }
 
     /// The body that a ZeroMQ message brings, if any.
@@ -85,8 +94,10 @@ impl Link {
         let frame = &frames[0];
         if frame.starts_with(&self.key) {
             let (next, latched) = parse_answer(frame)?;
-            self.told = self.told.max(next);
-            if self.expected.replace(self.expected.unwrap_or(next)).is_some() || latched.is_empty() {
+            self.reached = self.reached.max(next);
+            let known = self.expected.replace(self.expected.unwrap_or(next));
+            self.confirm(known.unwrap_or(next))?;
+            if known.is_some() || latched.is_empty() {
                 return Ok(None);
             }
             let body = latched.get(HEADER..).unwrap_or_default();
@@ -107,6 +118,10 @@ impl Link {
             kind => bail!("kind {kind}"),
         };
         let is_new = self.advance(header.sequence, count, counters)?;
+        if is_new && count == 0 {
+            self.end = (header.aux & LAST != 0).then_some(header.sequence).or(self.end);
+            self.confirm(header.sequence + (header.aux & LAST))?;
+        }
         Ok((is_new && count == 1).then(|| body.to_vec()))
     }
 
@@ -120,14 +135,13 @@ impl Link {
         Ok(header)
     }
 
-    /// Whether nothing more comes of a publisher; what has not come of it is counted then [E5].
+    /// Whether nothing more comes of a publisher; what has not come of it is counted then [E5, E6].
     fn is_over(&self, counters: &mut Counters) -> bool {
-        if self.left.is_none_or(|since| self.expected != Some(self.told) && since.elapsed() < LEAVING) {
+        if self.left.is_none_or(|since| self.end.is_none() && since.elapsed() < LEAVING) {
             return false;
         }
-        let expected = self.expected.unwrap_or(self.told);
-        counters.lost += self.told.saturating_sub(expected);
-        counters.cut_off += (self.reliable && expected > self.told) as u64;
+        counters.lost += self.expected.map_or(0, |expected| self.reached.saturating_sub(expected));
+        counters.cut_off += (self.reliable && self.end < self.expected) as u64;
         true
     }
 }

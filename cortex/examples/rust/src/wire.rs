@@ -13,6 +13,11 @@ pub const BODY_MAX: u64 = 1 << 30;
 /// Options of an attach key.
 pub const STRICT: u64 = 1 << 1;
 pub const CONFIRMS: u64 = 1 << 2;
+pub const CONFIRMS_END: u64 = 1 << 3;
+/// Options of an answer: the end of the stream will be marked [E1].
+pub const MARKS_END: u64 = 1;
+/// In `aux` of kind `N`: the stream ends here.
+pub const LAST: u64 = 1;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Header {
