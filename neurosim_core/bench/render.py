@@ -148,19 +148,17 @@ def _chapter(rows: list[Row], pan: dict[str, float], device: str, size: str) -> 
         mine = [row for row in rows if row["scene"] == scene]
         best = min(mine, key=lambda row: row["RMS error"])
         one = next(row for row in mine if (row["filter"], row["rays per pixel"]) == (_DEFAULT, 1))
-        adaptive = next(
-            row for row in mine if (row["filter"], row["rays per pixel"]) == (_DEFAULT, _ADAPTIVE)
-        )
-        cost, most = (row[TIME_MS] / one[TIME_MS] for row in (adaptive, best))
+        own = next(row for row in mine if (row["filter"], row["rays per pixel"]) == (_DEFAULT, _ADAPTIVE))
+        cost, most = (row[TIME_MS] / one[TIME_MS] for row in (own, best))
         said.append(
-            f"{scene}: {adaptive['RMS error']:.3f} by default, in {cost:.1f} times that of one ray, which has "
-            f"{one['RMS error']:.3f} with the default filter and {errors[scene, _POINT, 1]:.3f} by point "
-            f"sampling; {best['RMS error']:.3f} at best ({best['filter']}, {best['rays per pixel']} rays) in "
-            f"{most:.1f} times that."
+            f"{scene}: {own['RMS error']:.3f} by default, in {cost:.1f} times the time of one ray, which "
+            f"has {one['RMS error']:.3f} with the default filter and {errors[scene, _POINT, 1]:.3f} by point "
+            f"sampling; {best['RMS error']:.3f} at best ({best['filter']}, {best['rays per pixel']} rays), "
+            f"in {most:.1f} times the time."
         )
         event = {"one event": threshold}
         drawn = [{**row, "what": row["filter"]} for row in mine if row["rays per pixel"] != _ADAPTIVE]
-        drawn.append({**adaptive, "what": "the default"})
+        drawn.append({**own, "what": "the default"})
         panels.append(panel(drawn, TIME_MS, "RMS error", by="what", title=scene, log="xy", y_lines=event))
     default, point = pan[_DEFAULT], pan[_POINT]
     note = f"Natural logarithm; {size}; baked light; CPU time of all threads, or wall-clock time on CUDA."
