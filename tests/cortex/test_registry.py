@@ -280,6 +280,7 @@ def test_a_record_that_no_node_of_ours_would_send_is_rejected():
     for bad in (
         dataclasses.replace(good, node=0),
         dataclasses.replace(good, revision=0),
+        *(dataclasses.replace(good, clock_offset_ns=offset_ns) for offset_ns in (2**62, -(2**63))),
         dataclasses.replace(good, publishers=[publisher("no slash")]),
         dataclasses.replace(good, publishers=[publisher("/a/../b")]),
         dataclasses.replace(good, publishers=[dataclasses.replace(publisher("/a"), source=0)]),
