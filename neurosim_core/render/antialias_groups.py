@@ -46,8 +46,12 @@ _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
 _COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
-_THREADS_PER_MULTIPROCESSOR = 5120
-"""Threads of the kernel of rays: far more than run at a time, since some take longer than others."""
+_COVER_BLOCKS = 11
+"""Blocks of a multiprocessor that are launched. They run until all is done, and with one more nothing of the
+flight would fit beside them, which is ahead."""
+_RAY_THREADS = 5120
+"""Threads of a multiprocessor of the kernel of rays: far more than run at a time, since some take longer than
+others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
@@ -65,7 +69,7 @@ class BlockLists:
     count: wp.array[int]
     """Length of the two lists, and how many entries of the first are taken."""
     threads: int
-    """Threads of the kernel that goes through the second one; a quarter as many take entries of the first."""
+    """Threads of the kernel that goes through the second one."""
 
 
 class GroupKernels(NamedTuple):
@@ -82,8 +86,13 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
     lists.uneven = wp.zeros(block_count, dtype=wp.vec3i, device=device)
     lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
     lists.count = wp.zeros(3, dtype=int, device=device)
-    lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
+    lists.threads = _RAY_THREADS * max(1, wp.get_device(device).sm_count)
     return lists
+
+
+def cover_thread_count(lists: BlockLists) -> int:
+    """Return the threads that take entries of the list of uneven blocks."""
+    return lists.threads // _RAY_THREADS * _COVER_BLOCKS * _COVER_BOUNDS[0]
 
 
 def even_thread_count(pixel_count: int, instant_count: int) -> int:

@@ -116,6 +116,10 @@ class Scan:
             start = number * _COUNTERS_ROOM
             self.inputs.rows[start : start + _COUNTERS] = chunk.first_key, 0, 0
 
+    def has_invalid(self) -> bool:
+        """Return whether a sample was not finite or too large, after the scan."""
+        return any(chunk.counters_on_host.view(0, _COUNTERS)[1] > 0 for chunk in self.chunks)
+
     def has_room(self, counts: Sequence[int]) -> bool:
         """Return whether all events were written, of which each chunk has so many."""
         return all(chunk.has_room(count) for count, chunk in zip(counts, self.chunks, strict=True))

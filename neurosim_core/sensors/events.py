@@ -11,7 +11,7 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 
 import functools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -165,6 +165,8 @@ class EventCamera:
         self._make_stepper = functools.cache(new_stepper)
         self._stepper: EventCameraBatch | None = None
         """Has the pixels since the reset, if they step."""
+        self._begun: tuple[list[int], Callable[[], tuple[list[Any], list[int]]]] | None = None
+        """Ends of windows that are being cut, and what waits for them."""
         self._now_ns: int | None = None
         self._fed_ns = 0
         self._window_start_ns = 0
@@ -202,6 +204,8 @@ class EventCamera:
         event_input.check_reference(frame.numpy())
         for scan in (*self._idle, *self._under_way):
             scan.done.wait()  # it writes states, and reads what the host writes next
+        if self._begun is not None:
+            self._end_cut()
         self._pixels.reset(frame, int(stamp_ns))
         if self._readout is not None:
             self._readout.reset(int(stamp_ns))
@@ -327,6 +331,8 @@ class EventCamera:
             RuntimeError: If the camera was not reset.
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
+        if self._begun is not None:
+            raise RuntimeError("collect_windows() must be called after begin_windows()")
         with use_stream(self._reader):
             while self._under_way:
                 self._take_over()
@@ -358,6 +364,13 @@ class EventCamera:
         count = under_way if scan_count is None else min(scan_count, under_way)
         if ends and self._scan_count_max == 1:
             count = under_way  # in place it writes where keys are cut
+        if self._begun is not None:
+            if ends != self._begun[0]:
+                raise RuntimeError(f"windows that end at {self._begun[0]} ns were begun, got {ends}")
+            with use_stream(self._reader):
+                packets = self._end_cut()
+                self._taken.set()
+                return packets
         if self._in_place and not ends:  # nothing has to be launched
             for _ in range(count):
                 self._take_over()
@@ -378,6 +391,23 @@ class EventCamera:
             packets = self._cut(ends)
             self._taken.set()
             return packets
+
+    def begin_windows(self, ends_ns: Sequence[int]) -> None:
+        """Launch what the next `collect_windows`, of the same ends and at most one stack, waits for.
+
+        Nothing happens where that has to wait itself: for the scan, or with a readout; or where it is going
+        to raise an error.
+        """
+        ends = [int(end) for end in ends_ns]
+        if not ends or not self._under_way or self._begun is not None:
+            return
+        scan = self._under_way[0]
+        if self._in_place or self._readout is not None or not scan.done.passed or scan.has_invalid():
+            return
+        with use_stream(self._reader):
+            self._take_over()
+            self._begin_cut(ends)
+            self._taken.set()
 
     def _forget(self) -> None:
         scans = [*self._idle, *self._under_way]
@@ -465,12 +495,22 @@ class EventCamera:
 
     def _cut(self, ends: list[int]) -> list[Events]:
         """Sort the keys, hand out those of the windows that end so, and carry the others over."""
+        self._begin_cut(ends)
+        return self._end_cut()
+
+    def _begin_cut(self, ends: list[int]) -> None:
         if self._readout is not None:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
         # with a readout events may be read later than now
         end_bit = self._time_shift + (span_us + 1).bit_length() if self._readout is None else 63
-        columns, cuts = self._keys.cut(ends, end_bit)
+        self._begun = ends, self._keys.begin_cut(ends, end_bit)
+
+    def _end_cut(self) -> list[Events]:
+        assert self._begun is not None
+        ends, end_cut = self._begun
+        self._begun = None
+        columns, cuts = end_cut()
         packets = self._packets(ends, columns, cuts)
         self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
         return packets
