@@ -48,7 +48,9 @@ class Reader:
     member: int | None = None
     """Its number in the publisher's ring, through which its frames go; None: through the socket."""
     confirmed: int = 0
-    """It has accounted for all messages below this."""
+    """It has accounted for all messages below this; the end of the stream counts as one."""
+    has_answer: bool = False
+    """Whether it has said so, or need not."""
 
     @property
     def timeout_s(self) -> float:

@@ -130,8 +130,8 @@ def _record(
 @wp.kernel
 def _camera_poses(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     # In:
     states: wp.array3d[wp.float64],
@@ -149,8 +149,8 @@ def _camera_poses(
     q_WB = wp.quatd(
         states[slot, world, 3], states[slot, world, 4], states[slot, world, 5], states[slot, world, 6]
     )
-    p_WC = p_WB + wp.quat_rotate(q_WB, p_BC)
-    q_WC = q_WB * q_BC
+    p_WC = p_WB + wp.quat_rotate(q_WB, p_BC[world])
+    q_WC = q_WB * q_BC[world]
     p_WC_out[row] = wp.vec3(p_WC)
     q_WC_out[row] = wp.quat(q_WC)
     if stamps_out.shape[0] > 0:
@@ -160,8 +160,8 @@ def _camera_poses(
 @wp.kernel
 def _ray_poses(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     offsets_ns: wp.array[wp.int64],
     # In:
@@ -182,8 +182,8 @@ def _ray_poses(
     p_WB = at.position
     q_WB = at.orientation
     row = (world * stride + instant) * offsets_ns.shape[0] + part
-    p_WC_out[row] = wp.vec3(p_WB + wp.quat_rotate(q_WB, p_BC))
-    q_WC_out[row] = wp.quat(q_WB * q_BC)
+    p_WC_out[row] = wp.vec3(p_WB + wp.quat_rotate(q_WB, p_BC[world]))
+    q_WC_out[row] = wp.quat(q_WB * q_BC[world])
     if stamps_out.shape[0] > 0:
         stamps_out[row, 0] = stamp_ns
 
@@ -191,8 +191,8 @@ def _ray_poses(
 @wp.kernel
 def _camera_twists(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     # In:
     states: wp.array3d[wp.float64],
@@ -208,8 +208,8 @@ def _camera_twists(
     )
     v_W = wp.vec3d(states[slot, world, 7], states[slot, world, 8], states[slot, world, 9])
     w_B = wp.vec3d(states[slot, world, 10], states[slot, world, 11], states[slot, world, 12])
-    v_W += wp.quat_rotate(q_WB, wp.cross(w_B, p_BC))
-    w_C = wp.quat_rotate_inv(q_BC, w_B)
+    v_W += wp.quat_rotate(q_WB, wp.cross(w_B, p_BC[world]))
+    w_C = wp.quat_rotate_inv(q_BC[world], w_B)
     twist = wp.spatial_vectord(v_W[0], v_W[1], v_W[2], w_C[0], w_C[1], w_C[2])
     if status[slot, world] != STATUS_OK:
         twist = wp.spatial_vectord()
@@ -309,8 +309,8 @@ class Trace:
         slots: wp.array[int],
         *,
         count: int,
-        p_BC: wp.vec3d,
-        q_BC: wp.quatd,
+        p_BC: Any,
+        q_BC: Any,
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         stamps: Any,
@@ -320,8 +320,8 @@ class Trace:
         Args:
             slots: Slots of the instants, shape [K].
             count: How many of them to use.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
+            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
+            q_BC: Orientation of the camera against the body, xyzw, likewise.
             p_WC: Positions, shape [world K]; overwritten.
             q_WC: Orientations, shape [world K]; overwritten.
             stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
@@ -350,8 +350,8 @@ class Trace:
         offsets_ns: Any,
         *,
         count: int,
-        p_BC: wp.vec3d,
-        q_BC: wp.quatd,
+        p_BC: Any,
+        q_BC: Any,
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         stamps: Any,
@@ -373,17 +373,15 @@ class Trace:
             block_dim=BLOCK_DIM,
         )
 
-    def camera_twists(
-        self, slots: wp.array[int], twist: Any, *, count: int, p_BC: wp.vec3d, q_BC: wp.quatd
-    ) -> None:
+    def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
         Args:
             slots: Slots of the instants, shape [K].
             twist: spatial_vectord, shape [world K]; overwritten.
             count: How many of them to use.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
+            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
+            q_BC: Orientation of the camera against the body, xyzw, likewise.
         """
         world_count = self.states.shape[1]
         wp.launch(

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import os
 import random
 import secrets
-import selectors
-import shutil
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
+import pytest
 import zmq
+from processes import SOON_S
 
 from cortex.control import LEASE_NS, control_types, make_control_socket
 from cortex.discovery import Directory
@@ -39,30 +31,7 @@ from cortex.records import (
 from cortex.registry import Registry
 from cortex.wire import parse_control
 
-ROOT = Path(__file__).resolve().parents[2]
-NODE = Path(__file__).with_name("discovery_node.py")
-SOON_S = 60.0
-"""Deadline of things that take milliseconds, on a machine that does a lot besides."""
 LEASE_S = LEASE_NS / 1e9
-
-
-def private_runtime(monkeypatch) -> Iterator[Path]:
-    """A runtime directory for the test; whatever serves in it is ended with it."""
-    path = Path(tempfile.mkdtemp(prefix="cortex-test-"))
-    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(path))
-    yield path
-    pid = registry_pid()
-    if pid is not None:
-        os.kill(pid, signal.SIGKILL)
-        wait_for(lambda: registry_pid() is None)
-    shutil.rmtree(path)
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "the condition did not come true in time"
-        time.sleep(0.005)
 
 
 def registry_pid(domain: int = 0) -> int | None:
@@ -146,8 +115,16 @@ def drive_for(nodes, seconds):
     drive(nodes, lambda: time.monotonic() >= end, seconds + SOON_S)
 
 
-@contextlib.contextmanager
-def node_maker(context):
+@pytest.fixture
+def context():
+    """For sockets of the test."""
+    with zmq.Context() as made:
+        made.linger = 0
+        yield made
+
+
+@pytest.fixture
+def make(runtime, context):
     """Makes nodes, and closes them."""
     with contextlib.ExitStack() as stack:
 
@@ -172,42 +149,6 @@ def serving(domain=0, **options):
         thread.join(SOON_S)
         assert not thread.is_alive()
         registry.close()
-
-
-@contextlib.contextmanager
-def node_process(name, **options):
-    """A node in a process of its own."""
-    arguments = [sys.executable, str(NODE), json.dumps({"name": name, **options})]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipe = subprocess.PIPE
-    # No buffer: what lies in one, `select` does not see.
-    process = subprocess.Popen(arguments, env=environment, stdin=pipe, stdout=pipe, bufsize=0)
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(signal.SIGCONT)
-        process.stdin.close()
-        try:
-            process.wait(SOON_S)
-        finally:
-            process.kill()
-            process.wait()
-            process.stdout.close()
-
-
-def read_until(process, condition, timeout_s=SOON_S):
-    """Read what a node process prints until a line satisfies the condition, and return it."""
-    deadline = time.monotonic() + timeout_s
-    with selectors.DefaultSelector() as selector:
-        selector.register(process.stdout, selectors.EVENT_READ)
-        while selector.select(max(deadline - time.monotonic(), 0)):
-            line = process.stdout.readline()
-            assert line, "the node has ended"
-            seen = json.loads(line)
-            if "names" in seen and condition(seen):
-                return seen
-    raise AssertionError("the node did not print what was expected in time")
 
 
 def dealer(context):

@@ -212,6 +212,11 @@ class Peer:
         """How many calls have come."""
         return {"count": self.served_count}
 
+    def nodes(self) -> dict[str, Any]:
+        """The names of the nodes that are known, and whether the registry has told of all."""
+        names = sorted(record.name for record in self.node.nodes())
+        return {"names": names, "connected": self.node.wait_for_registry(0.0)}
+
     def memory(self) -> dict[str, Any]:
         """See `memory`."""
         return memory()

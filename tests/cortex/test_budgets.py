@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortex import Array, MalformedMessage, Node, TypeMismatch, message, reliable
+from cortex import Array, MalformedMessage, Node, message, reliable
 from cortex.body import Body
 from cortex.codec import codec_of
 from cortex.layout import VALUES_MAX
@@ -103,23 +103,6 @@ def test_a_chunk_unpacks_to_no_more_than_it_claims(tmp_path):
     finally:
         tracemalloc.stop()
     assert _decompress("lz4", lz4.compress(b"whole"), 5) == b"whole"
-
-
-def test_no_message_in_time_says_that_all_publishers_have_another_type(runtime):
-    with Node("one") as one, Node("other") as other:
-        subscriber = one.subscriber("/grid", Grid)
-        other.publisher("/grid", Cells)
-        with pytest.raises(TypeMismatch, match="publishes another type"):
-            subscriber.recv(2.0)
-        for _ in range(2):
-            with pytest.raises(TimeoutError, match="publishes another type") as caught:
-                subscriber.recv(0.05)
-            assert isinstance(caught.value.__cause__, TypeMismatch)
-        right = other.publisher("/grid", Grid)
-        right.wait_for_subscribers()
-        with pytest.raises(TimeoutError) as caught:
-            subscriber.recv(0.05)
-        assert caught.value.__cause__ is None
 
 
 def test_back_pressure_ends_when_the_publisher_says(runtime):

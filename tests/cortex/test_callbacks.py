@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 
@@ -32,33 +31,6 @@ def test_callbacks_are_called_in_order(node):
     assert [message.value for message in received] == list(range(3000))
     assert subscriber.counters.received == 3000
     assert sum(subscriber.counters.latency) >= 3000 / 8
-
-
-def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
-    received = []
-
-    def fail(message):
-        received.append(message)
-        raise KeyError(message.stamp_ns)
-
-    publisher = node.publisher("/scans", Scan)
-    node.subscriber("/scans", Scan, fail)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for number in range(3):
-        publisher.publish(scan(number, 1))
-    wait_for(lambda: len(received) == 3)
-    wait_for(lambda: sum(r.exc_info is not None and r.levelno == logging.ERROR for r in caplog.records) == 3)
-
-
-def test_callbacks_of_large_and_small_messages_keep_the_order(node):
-    received = []
-    publisher = node.publisher("/scans", Scan)
-    node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for number in range(300):
-        assert publisher.publish(scan(number, LARGE if number % 3 == 0 else 5))
-    wait_for(lambda: len(received) == 300)
-    assert received == list(range(300))
 
 
 def test_no_callback_after_close(node):

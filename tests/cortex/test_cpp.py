@@ -166,27 +166,6 @@ def test_loans_arrive_as_views_of_shared_memory(
         pictures.close()
 
 
-@pytest.mark.parametrize("size", [10, 20_000])
-def test_reliable_flood_arrives_whole(
-    start: Callable[..., Peer], make_node: Callable[..., Node], size: int
-) -> None:
-    """Frames and slots: every message of a flood from Python arrives once and in order."""
-    node = make_node()
-    scans = node.publisher("/scan", Scan)
-    peer = start("count", "/scan", "reliable", 0, 3)
-    assert scans.wait_for_subscribers(1, SOON_S)
-    for number in range(3000):
-        assert scans.publish(Scan(number, np.full(size, number, np.float32)))
-    assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
-    assert json.loads(peer.line()) == {
-        **CLEAN,
-        "received": 3000,
-        "sequence": 3000,
-        "sources": 1,
-        "last": 2999,
-    }
-
-
 @pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
 def test_slow_reader_knows_what_it_missed(
     start: Callable[..., Peer], make_node: Callable[..., Node], policy: str, size: int
@@ -205,19 +184,6 @@ def test_slow_reader_knows_what_it_missed(
     assert (result["wrong"], result["rejected"]) == (0, 0)
     assert result["received"] < 2000  # 0 if it was asleep until the end overtook them all
     assert result["received"] + result["lost"] + result["overtaken"] == result["sequence"]
-
-
-def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
-    node = make_node()
-    for size in (10, 20_000):
-        scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-        peer = start("publish", "/scan", 3000, size)
-        for number in range(3000):
-            scan = scans.recv(SOON_S)
-            assert (scan.stamp_ns, scan.ranges.size, scan.ranges[-1]) == (number, size, number)
-        assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
-        peer.end()
-        scans.close()
 
 
 def test_late_reliable_reader_of_python_is_told(

@@ -137,21 +137,6 @@ def test_drain_passes_errors_on_and_keeps_count():
             path.drain(link, messages, 4, False)
 
 
-def test_frames_that_are_none_of_this_publisher():
-    lock, messages, frame = ReceiveLock(), deque(), frame_of(3, Scan)
-    path = make_fast_receive(lock, deque(), SubscriberCounters(), lambda link, frame: None)
-    others = [b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)]
-    script = Script(lock.lock, *others, frame, frame)
-    link = SimpleNamespace(receive=script, coder=coder_with_head(Scan), expected=3, clock_offset_ns=0)
-    with lock.lock:
-        for other in others:
-            assert path.drain(link, messages, 4, False) == other
-        assert path.drain(link, messages, 1, False) is None
-        assert list(messages) == [make(Scan, 3, 40)]
-        link.coder, link.expected = coder_of(codec_of(Scan), b""), 3  # it has no head
-        assert path.drain(link, messages, 4, False) == frame
-
-
 def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
     """It is not taken where it is free, but nobody passes one who has it."""
     publisher, subscriber = numbers

@@ -601,18 +601,3 @@ def test_too_many_loans(node):
     message, info = subscriber.recv_with_info(SOON_S)
     assert message.stamp_ns == 9
     assert info.sequence == subscriber.counters.lost  # a loan that was refused may count as skipped
-
-
-def test_a_loan_while_the_rings_grow(node):
-    """Its ring may be given up meanwhile: the message is published all the same."""
-    publisher, subscriber = connected(node, Scan, keep_last(64))
-    with publisher.loan(n=5_000) as draft:
-        draft.stamp_ns = 100
-        draft.ranges[:] = 100.0
-        for number in range(7):
-            publisher.publish(scan(number, 5_000 * 2 ** (number + 1)))
-            assert subscriber.recv(SOON_S).stamp_ns == number
-    message = subscriber.recv(SOON_S)
-    assert message.stamp_ns == 100
-    assert (message.ranges == 100.0).all()
-    assert subscriber.counters.lost == 0

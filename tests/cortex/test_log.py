@@ -172,18 +172,6 @@ def test_all_topics_are_recorded_also_those_that_come_later(make_node: MakeNode,
             list(log.messages(types={"/second": Number}))
 
 
-def test_files_are_not_overwritten_by_mistake(node: Node, tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    path.write_bytes(b"precious")
-    with pytest.raises(FileExistsError):
-        Recorder(node, path)
-    assert path.read_bytes() == b"precious"
-    with Recorder(node, path, overwrite=True):
-        pass
-    with open_log(path) as log:
-        assert (log.message_count, log.topics, log.duration_s) == (0, (), 0.0)
-
-
 def test_a_node_that_closes_first_ends_the_recording_in_order(make_node: MakeNode, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     node = make_node("alone", registry="off")

@@ -18,7 +18,6 @@ from processes import SOON_S, wait_for
 from random_schemas import any_message, schemas
 from test_codec import Everything, Level, Mode, Point, everything
 from test_large import connected, slots_held
-from wire_vectors import load_vectors
 
 from cortex import reliable
 from cortex.codec import MalformedMessage, Plan, codec_of
@@ -26,7 +25,7 @@ from cortex.compiled import native
 from cortex.message import Array, message
 from cortex.messages import Image
 from cortex.native import make_coder
-from cortex.schema import Schema, schema_of, type_from_schema
+from cortex.schema import schema_of, type_from_schema
 
 pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
@@ -73,14 +72,6 @@ def check_decoding(cls: type, body: bytes) -> bool:
     return found is not None
 
 
-@given(any_message())
-def test_all_messages_are_served(value):
-    coder, body = coder_of(type(value)), python_body(value)
-    assert coder.encode(value, len(body)) == body
-    assert coder.encode(value, len(body) - 1) is None
-    assert check_decoding(type(value), body)
-
-
 @given(any_message(), st.data())
 def test_damaged_bodies_are_refused_alike(value, data):
     body = bytearray(python_body(value))
@@ -98,26 +89,6 @@ def test_damaged_bodies_are_refused_alike(value, data):
 @given(schemas, st.binary(max_size=300))
 def test_random_bytes_are_refused_alike(schema, data):
     check_decoding(type_from_schema(schema), data)
-
-
-@pytest.mark.parametrize("name", load_vectors())
-def test_vectors(name):
-    """The bodies of the test vectors, and the malformed ones with what is said of them."""
-    vector = load_vectors()[name]
-    cls = type_from_schema(Schema.from_json(vector["schema"]))
-    coder = coder_of(cls)
-    for case in vector["cases"]:
-        body = bytes.fromhex(case["body"])
-        assert check_decoding(cls, body)
-        assert coder.encode(coder.decode(body, 0, len(body)), len(body)) == body
-    for case in vector["malformed"]:
-        body = bytes.fromhex(case["body"])
-        assert not check_decoding(cls, body)
-        with pytest.raises(MalformedMessage) as after_c:
-            codec_of(cls).decode(body)
-        with pytest.raises(MalformedMessage) as by_python:
-            codec_of(cls)._body.read(body)
-        assert str(after_c.value) == str(by_python.value)
 
 
 class Count(int):

@@ -91,7 +91,6 @@ def test_latest_gives_the_newest_at_once(node):
 def test_the_newest_after_a_long_absence(make_node, start_child, policy):
     """A reader that was away for 20 000 messages, more than the sockets hold, finds the last ones."""
     child = start_child("peer")
-    child.hear()
     child.ask(do="publisher", topic="/numbers", type="Number")
     subscriber = make_node().subscriber("/numbers", Number, policy=policy)
     assert subscriber.wait_for_publisher(SOON_S)
@@ -106,7 +105,6 @@ def test_the_newest_after_a_long_absence(make_node, start_child, policy):
 def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
     """Age of the datum: with 5 ms of work for each message at 2 kHz, what is read was published just now."""
     child = start_child("peer")
-    child.hear()
     child.ask(do="publisher", topic="/numbers", type="Number")
     subscriber = make_node().subscriber("/numbers", Number, policy=latest())
     assert subscriber.wait_for_publisher(SOON_S)
@@ -136,7 +134,6 @@ def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
 def test_every_message_of_a_reliable_stream_comes_in_order(make_node, start_child, place):
     """Received + lost == sent, and lost 0, whatever the pace of the two; and neither of them grows by it."""
     child = start_child("peer", **place)
-    child.hear()
     child.ask(
         do="subscriber",
         topic="/numbers",
@@ -196,25 +193,6 @@ def test_back_pressure_has_an_end(node):
     assert publisher.counters.timeouts >= lost
 
 
-def test_back_pressure_of_large_messages(node):
-    """A reader that keeps its views holds up the publisher, and no longer than allowed."""
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=2, timeout_s=0.05))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    ranges = np.zeros(100_000, np.float32)
-    delivered = []
-    while all(delivered) or len(delivered) < 3:
-        assert len(delivered) < 1000
-        begin = time.monotonic()
-        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
-    assert 0.045 < time.monotonic() - begin < 10.0
-    received = [subscriber.recv(SOON_S).stamp_ns for _ in range(sum(delivered))]
-    assert received == [number for number, came in enumerate(delivered) if came]
-    assert publisher.publish(Scan(-1, ranges))
-    assert subscriber.recv(SOON_S).stamp_ns == -1
-    assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
-
-
 def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
     publisher = node.publisher("/scans", Scan)
@@ -223,7 +201,9 @@ def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     ranges = np.zeros(50_000, np.float32)
     delivered = []
     while all(delivered):
+        begin = time.monotonic()
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert 0.9 < time.monotonic() - begin < 10.0
     begin = time.monotonic()
     for _ in range(20):
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
@@ -236,23 +216,6 @@ def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
 
 
-def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
-    publisher, subscriber = connected(node, reliable(depth=4, timeout_s=60.0))
-    received = []
-
-    def take(message):
-        time.sleep(20e-6)
-        received.append(message.value)
-
-    other = node.subscriber("/numbers", Number, take, policy=reliable(depth=2, timeout_s=60.0))
-    assert publisher.wait_for_subscribers(2, SOON_S)
-    subscriber.close()
-    assert all(publisher.publish(Number(0, value)) for value in range(5000))
-    wait_for(lambda: len(received) == 5000)
-    assert received == list(range(5000))
-    assert other.counters.lost == 0
-
-
 def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_child):
     """On one topic: the first is stopped, the second gets everything, the publisher waits for neither."""
     stopped, steady = start_child("peer", name="stopped"), start_child("peer", name="steady")
@@ -260,7 +223,6 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
         (stopped, ["keep_last", {"depth": 10}]),
         (steady, ["reliable", {"timeout_s": 60.0}]),
     ):
-        child.hear()
         child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
     publisher = make_node().publisher("/numbers", Number)
     assert publisher.wait_for_subscribers(2, SOON_S)

@@ -57,6 +57,16 @@ def test_a_value_that_does_not_fit_takes_no_number(node):
     assert subscriber.counters.lost == 0
 
 
+def test_a_value_that_does_not_fit_takes_no_number_in_a_ring(numbers):
+    """A type of fixed size is written there before it is known that a field is of another type."""
+    publisher, subscriber = numbers
+    for number in range(4):
+        with pytest.raises(TypeError):
+            publisher.publish(Number(number, "none"))
+        assert publisher.publish(Number(number, number))
+        assert subscriber.recv_with_info(SOON_S)[1].sequence == number
+
+
 @pytest.mark.parametrize("topic", ["scan", "/", "/a//b", "/a b", "/ä", "", "/" + 200 * "x", 3])
 def test_a_topic_has_a_form(node, topic):
     for make in (node.publisher, node.subscriber):

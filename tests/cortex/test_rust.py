@@ -29,8 +29,24 @@ CARGO = shutil.which(
     "cargo", path=os.pathsep.join([os.environ.get("PATH", ""), str(Path.home() / ".cargo/bin")])
 )
 OLDEST = (1, 89)
+DEBIAN = Path("/usr/share/cargo/registry")
+"""Where `apt install librust-zmq-dev` and the like put crates: they are taken from there, if they are."""
+CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-derive,serde-json,zmq}-dev"
 PATIENCE_S = 900.0
 """After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
+
+
+def _cargo(*arguments: str, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
+    """Run cargo in the crate; builds are kept in `build/rust`, which cargo itself locks."""
+    assert CARGO is not None
+    command = [CARGO, *arguments]
+    if any(DEBIAN.glob("zmq-*")):
+        command += ["--offline", "--config", 'source.crates-io.replace-with="debian"']
+        command += ["--config", f'source.debian.directory="{DEBIAN}"']
+    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET)}
+    return subprocess.run(
+        command, cwd=CRATE, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False
+    )
 
 
 def _missing() -> str:
@@ -40,7 +56,8 @@ def _missing() -> str:
     found = re.match(r"cargo (\d+)\.(\d+)", shown)
     if found is None or (int(found[1]), int(found[2])) < OLDEST:
         return f"cargo {OLDEST[0]}.{OLDEST[1]} or newer is needed, this is {shown.strip()!r}"
-    return ""
+    found_crates = _cargo("fetch", timeout_s=60.0)
+    return f"no crates: apt install {CRATES}" if found_crates.returncode else ""
 
 
 MISSING = _missing()
@@ -48,10 +65,7 @@ pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"the Rust example cannot 
 
 
 def cargo(*arguments: str) -> str:
-    """Run cargo in the crate; builds are kept in `build/rust`, which cargo itself locks."""
-    assert CARGO is not None
-    command = [CARGO, arguments[0], "--offline", "--locked", "--target-dir", str(TARGET), *arguments[1:]]
-    done = subprocess.run(command, cwd=CRATE, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = _cargo(*arguments)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return done.stdout
 
@@ -222,7 +236,9 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     assert lost > 0
     publishing.publish(make_block(count, 5))
     assert subscriber.recv(SOON_S).number == count
-    assert publishing.close() == {"published": count + 1, "timeouts": lost}
+    counted = publishing.close()
+    assert counted["published"] == count + 1
+    assert lost <= counted["timeouts"] <= lost + 1  # it may not have heard yet that we read again
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
 
 

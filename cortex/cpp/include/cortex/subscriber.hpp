@@ -106,6 +106,7 @@ class SubscriptionCore {
                                       [&](const Source& source) { return source.source == link->source(); });
       const bool there = found != sources.end();
       if (there) link->clock_offset_ns = found->clock_offset_ns;
+      if (!there && link->leaving_ns == 0) link->leave();
       link->leaving_ns = there ? 0 : link->leaving_ns != 0 ? link->leaving_ns : monotonic_ns();
     }
     for (const auto& source : sources) {
