@@ -33,7 +33,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import cover_thread_count, even_thread_count, group_kernels, make_lists
+from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,
@@ -447,7 +447,6 @@ class Antialiasing:
             )
             return
         self._lists.count.zero_()
-        even = even_thread_count(pixel_count, view.instant_count)
-        dims = even, cover_thread_count(self._lists), self._lists.threads
+        dims = thread_counts(self._lists, pixel_count, view.instant_count)
         for kernel, dim in zip(self._kernels, dims, strict=True):
             launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)

@@ -47,11 +47,9 @@ _FAST = {"fast_math": True}
 _COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
 _COVER_BLOCKS = 11
-"""Blocks of a multiprocessor that are launched. They run until all is done, and with one more nothing of the
-flight would fit beside them, which is ahead."""
+"""Blocks of a multiprocessor that are launched: they run until all is done, and the flight needs room."""
 _RAY_THREADS = 5120
-"""Threads of a multiprocessor of the kernel of rays: far more than run at a time, since some take longer than
-others."""
+"""Threads of a multiprocessor: far more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
@@ -90,14 +88,10 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
     return lists
 
 
-def cover_thread_count(lists: BlockLists) -> int:
-    """Return the threads that take entries of the list of uneven blocks."""
-    return lists.threads // _RAY_THREADS * _COVER_BLOCKS * _COVER_BOUNDS[0]
-
-
-def even_thread_count(pixel_count: int, instant_count: int) -> int:
-    """Return the threads of the kernel of even blocks, for so many pixels of all instants of all worlds."""
-    return pixel_count // instant_count * -(-instant_count // _INSTANTS)
+def thread_counts(lists: BlockLists, pixel_count: int, instant_count: int) -> tuple[int, int, int]:
+    """Return the threads of the three kernels, for so many pixels of all instants of all worlds."""
+    even = pixel_count // instant_count * -(-instant_count // _INSTANTS)
+    return even, lists.threads // _RAY_THREADS * _COVER_BLOCKS * _COVER_BOUNDS[0], lists.threads
 
 
 @wp.func_native(read_native(__file__, "classify_block"))
@@ -467,13 +461,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             listed = lists.unresolved[begin + turn * (lists.threads // _RAYS)]
             block = listed[0]
             lane = index // RAY_COUNT
+            group = block // 4
             at = locate_pixel(
-                block // 4 // view.instant_count,
-                block // 4 % view.instant_count,
-                block % 4,
-                lane,
-                view,
-                worlds,
+                group // view.instant_count, group % view.instant_count, block % 4, lane, view, worlds
             )
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]

@@ -40,7 +40,7 @@ tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stand
 _PINNED_BLOCKS = 3
 """What a reader holds, what it reads next, and what is copied to."""
 _REPLAYED_COUNT_MAX = 1 << 16
-"""So many keys or less are cut by a graph, which sorts up to half as many more: launches would take longer."""
+"""So many keys or less are cut by a graph, which sorts up to half as many more: launches take longer."""
 _ROOM_MIN = 1024
 _BLOCK_COUNT_MAX = 1 << 26
 """Most events in one block of memory: Warp counts its bytes in 31 bits."""

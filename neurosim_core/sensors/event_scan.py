@@ -29,7 +29,7 @@ BLOCK_SIZE = wp.constant(256)
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
 SINGLY = wp.constant(wp.int32(4))
-"""Levels that are crossed one by one; few samples cross more than the last one did, and those are found at once."""
+"""Levels that are found one by one; few samples cross more, and theirs are found at once."""
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
 LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))

@@ -166,7 +166,7 @@ class EventCamera:
         self._stepper: EventCameraBatch | None = None
         """Has the pixels since the reset, if they step."""
         self._begun: tuple[list[int], Callable[[], tuple[list[Any], list[int]]]] | None = None
-        """Ends of windows that are being cut, and what waits for them."""
+        """Ends of windows that are cut, and what waits for that."""
         self._now_ns: int | None = None
         self._fed_ns = 0
         self._window_start_ns = 0
@@ -317,12 +317,7 @@ class EventCamera:
         event_input.check_stack(
             log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns
         )
-        span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
-        if span_us * NS_PER_US >= self.span_max_ns:
-            limit_s = self.span_max_ns / 1e9
-            raise ValueError(
-                f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
-            )
+        event_input.check_span(int(stamps[-1]), self._keys.origin_us, self.span_max_ns)
 
     def collect(self) -> Events:
         """Return all events up to the last frame fed, and wait for them.
@@ -336,7 +331,8 @@ class EventCamera:
         with use_stream(self._reader):
             while self._under_way:
                 self._take_over()
-            packets = self._cut([self._require_reset()])
+            self._begin_cut([self._require_reset()])
+            packets = self._end_cut()
             self._taken.set()
             return packets[0]
 
@@ -360,53 +356,41 @@ class EventCamera:
                 in which case the camera must be reset.
         """
         ends = [int(end) for end in ends_ns]
-        under_way = len(self._under_way)
-        count = under_way if scan_count is None else min(scan_count, under_way)
-        if ends and self._scan_count_max == 1:
-            count = under_way  # in place it writes where keys are cut
-        if self._begun is not None:
-            if ends != self._begun[0]:
-                raise RuntimeError(f"windows that end at {self._begun[0]} ns were begun, got {ends}")
-            with use_stream(self._reader):
-                packets = self._end_cut()
-                self._taken.set()
-                return packets
+        count = len(self._under_way)
+        if scan_count is not None and not (ends and self._scan_count_max == 1):
+            count = min(scan_count, count)  # else it writes where keys are cut
+        if self._begun is not None and ends != self._begun[0]:
+            raise RuntimeError(f"windows that end at {self._begun[0]} ns were begun, got {ends}")
         if self._in_place and not ends:  # nothing has to be launched
             for _ in range(count):
                 self._take_over()
             self._require_reset()
             return []
         with use_stream(self._reader):
-            for _ in range(count):
-                self._take_over()
-            self._taken.set()
-            now_ns = self._require_reset()
-            if not ends:
-                return []
-            if not event_input.are_ends(ends, self._window_start_ns, now_ns):
-                raise ValueError(
-                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
-                    f" and not pass {now_ns}, got {ends}"
-                )
-            packets = self._cut(ends)
+            if self._begun is None:
+                for _ in range(count):
+                    self._take_over()
+                self._taken.set()
+                now_ns = self._require_reset()
+                if not ends:
+                    return []
+                event_input.check_ends(ends, self._window_start_ns, now_ns)
+                self._begin_cut(ends)
+            packets = self._end_cut()
             self._taken.set()
             return packets
 
     def begin_windows(self, ends_ns: Sequence[int]) -> None:
         """Launch what the next `collect_windows`, of the same ends and at most one stack, waits for.
 
-        Nothing happens where that has to wait itself: for the scan, or with a readout; or where it is going
-        to raise an error.
+        Nothing happens if this would have to wait itself, with a readout, or if an error is to be raised.
         """
-        ends = [int(end) for end in ends_ns]
-        if not ends or not self._under_way or self._begun is not None:
-            return
-        scan = self._under_way[0]
-        if self._in_place or self._readout is not None or not scan.done.passed or scan.has_invalid():
+        ready = bool(self._under_way) and self._under_way[0].done.passed and not self._under_way[0].read()[1]
+        if not ready or not ends_ns or self._begun is not None or self._in_place or self._readout is not None:
             return
         with use_stream(self._reader):
             self._take_over()
-            self._begin_cut(ends)
+            self._begin_cut([int(end) for end in ends_ns])
             self._taken.set()
 
     def _forget(self) -> None:
@@ -423,12 +407,6 @@ class EventCamera:
         if self._now_ns is None:
             raise RuntimeError("reset() must be called before frames are fed")
         return self._now_ns
-
-    def _scan_again(self, scan: Scan) -> None:
-        """Scan a stack again."""
-        scan.begin()
-        self._pixels.launch(scan)
-        scan.done.set()
 
     def _take_over(self) -> None:
         """Wait for the oldest scan, redo it if there was too little room, and add its keys to the others."""
@@ -449,7 +427,8 @@ class EventCamera:
 
     def _redo(self, scan: Scan, counts: list[int]) -> list[int]:
         """Scan a stack again, within the limit and with room for all events; return how many there are."""
-        limited = sum(counts) > self.config.event_count_max and self._limit_rows(scan)
+        most = self.config.event_count_max
+        limited = sum(counts) > most and self._pixels.limit_rows(scan, most, self._lost)
         if limited:
             counts = self._read_counts(scan)
         if not scan.has_room(counts):
@@ -458,7 +437,7 @@ class EventCamera:
                 scan.chunks[0].keys = self._keys.room()
             else:
                 self._pixels.grow(scan, counts)
-            self._scan_again(scan)
+            self._pixels.launch_again(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
@@ -467,38 +446,18 @@ class EventCamera:
     def _read_counts(self, scan: Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
         scan.done.wait()
-        counters = [chunk.counters_on_host.view(0, 3).tolist() for chunk in scan.chunks]
-        if invalid_count := sum(invalid for _, invalid, _ in counters):
-            first = len(scan.stamps_ns) * self.width * self.height - max(place for *_, place in counters)
-            frame, pixel = divmod(first, self.width * self.height)
-            row, col = divmod(pixel, self.width)
+        counts, invalid_count, from_end = scan.read()
+        if invalid_count:
+            shape = len(scan.stamps_ns), self.height, self.width
+            place = np.unravel_index(int(np.prod(shape)) - from_end, shape)
             self._now_ns = None
             self._idle += self._under_way
             self._under_way.clear()
-            raise ValueError(event_input.invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
-        return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
-
-    def _limit_rows(self, scan: Scan) -> bool:
-        """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
-        stamps = scan.stamps_ns
-        total = np.cumsum(self._pixels.count_by_row(scan), axis=1, dtype=np.int64)
-        rows = (total <= self.config.event_count_max).sum(axis=1)
-        short = np.flatnonzero(rows < self.height)
-        for frame in short:
-            kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
-            self._lost.add(int(stamps[frame]), int(total[frame, -1]) - kept)
-        if len(short) == 0:
-            return False
-        wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
-        self._scan_again(scan)
-        return True
-
-    def _cut(self, ends: list[int]) -> list[Events]:
-        """Sort the keys, hand out those of the windows that end so, and carry the others over."""
-        self._begin_cut(ends)
-        return self._end_cut()
+            raise ValueError(event_input.invalid_message(invalid_count, f"{[int(index) for index in place]}"))
+        return counts
 
     def _begin_cut(self, ends: list[int]) -> None:
+        """Launch the sort of the keys for windows that end so."""
         if self._readout is not None:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
@@ -507,6 +466,7 @@ class EventCamera:
         self._begun = ends, self._keys.begin_cut(ends, end_bit)
 
     def _end_cut(self) -> list[Events]:
+        """Hand out the keys of the windows that were begun, and carry the others over."""
         assert self._begun is not None
         ends, end_cut = self._begun
         self._begun = None
