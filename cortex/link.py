@@ -7,6 +7,7 @@ import logging
 import re
 import secrets
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -45,6 +46,8 @@ BLOCK_MS = 20
 """Longest time that `receive(0)` waits."""
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
+_warned_of: deque[str] = deque(maxlen=256)
+"""Addresses of nodes that cannot share memory with us."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
@@ -307,7 +310,9 @@ class Link:
                 self._use_ring()
             except OSError as error:
                 reason = f"it is of another version of cortex, or has too many readers ({error})"
-                self._do_without_shared_memory(reason, logging.WARNING)
+                known = self.address in _warned_of  # a node has it once for all its publishers
+                self._do_without_shared_memory(reason, logging.INFO if known else logging.WARNING)
+                _warned_of.append(self.address)
                 self.attached = False
                 return []  # it is asked again
         if not known:

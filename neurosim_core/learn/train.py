@@ -424,6 +424,7 @@ def train(
         raise ImportError("--wandb needs the package wandb: pip install wandb")
     if ranks.rank() > 0:
         say = _say_nothing
+    say("set-up: scenes and kernels")
     training = Training(folder, config, say=say)
     if resume:
         training.resume()

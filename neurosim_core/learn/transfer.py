@@ -38,6 +38,11 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "three tenths of the actions lost": {"late": 0.3},
     "a tenth of the event packets lost": {"lost": 0.1},
     "three tenths of the event packets lost": {"lost": 0.3},
+    "camera turned by up to 0.05 rad about each axis": {"drawn": {"mount_rad": 0.05}},
+    "light 0.01 to 0.1 times": {"drawn": {"light_factor": (0.01, 0.1)}},
+    "lenses 0.9 to 1.1 times as long, k1 up to 0.05": {
+        "drawn": {"focal_factor": (0.9, 1.1), "distortion": (-0.05, 0.05)}
+    },
 }
 """What differs from the tests of a task, by name; periods of 50 Hz stay whole nanoseconds."""
 

@@ -105,3 +105,12 @@ def test_without_an_address_the_cluster_is_that_of_this_machine(tmp_path, monkey
     monkeypatch.setattr(population, "train_population", lambda folder, configs, **given: asked.update(given))
     assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray", "--workers", "2"]) == 0
     assert asked == {"address": "auto", "workers": 2}
+
+
+def test_where_no_cluster_runs_that_is_said(tmp_path, monkeypatch, capsys):
+    def init(address, **_):
+        raise ConnectionError("Could not find any running Ray instance")
+
+    monkeypatch.setattr("ray.init", init)
+    assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray"]) == 1
+    assert "no Ray cluster on this machine (`ray start --head` begins one)" in capsys.readouterr().err

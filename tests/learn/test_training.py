@@ -62,6 +62,7 @@ CONDITIONS = (
     "actions one step later",
     "three tenths of the actions lost",
     "three tenths of the event packets lost",
+    "lenses 0.9 to 1.1 times as long, k1 up to 0.05",
 )
 
 

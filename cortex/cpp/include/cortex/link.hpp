@@ -85,6 +85,9 @@ class Link {
     if (!attached_ && end_ != nullptr && end_->welcomed() > 0) enter_ring();
   }
 
+  // Whether the publisher has said that nothing follows what has come.
+  bool has_ended() const noexcept { return marks_end_ && known_ && expected_ + 1 == ended_; }
+
   // The publisher has left, and all that came of it has been read: what it has published besides is lost.
   void end() {
     try {
