@@ -145,9 +145,13 @@ class Fanout:
 
     def resume(self, pub_socket: PubSocket, reader: int, sequence: int) -> None:
         """A reader has accounted for all below a sequence."""
+        is_new = False
         for each in self.readers.values():
             if each.request.reader == reader:
+                is_new = not each.has_answer
                 each.confirmed, each.has_answer = max(each.confirmed, sequence), True
+        if is_new:
+            return  # it was not the one that was late
         if sequence >= self.late.get(pub_socket, 0):  # else it was too late once more since
             self.late.pop(pub_socket, None)
             self.route()

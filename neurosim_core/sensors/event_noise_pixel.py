@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var"
+# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var,no-untyped-def"
 """One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
@@ -204,3 +204,34 @@ def begin_pixel(
             if model.thresholds.shape[0] > 0:
                 voltage *= model.thresholds[pixel][0] / model.threshold_on
         memory_out.voltage[pixel] = voltage
+
+
+@functools.cache
+def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
+    """Return the kernel that begins what pixels with some `signal_terms` remember."""
+    see = make_see(signals)
+    module = wp.get_module(".".join((__name__, *(name for name, _ in signals))))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def begin(
+        # Model:
+        models: wp.array[PixelModel],
+        phase_stream: wp.uint32,
+        random_phase: wp.array[wp.bool],
+        # In:
+        mask: wp.array[wp.int32],
+        base: wp.array2d[wp.float32],
+        # Out:
+        memory_out: wp.array[Memory],
+    ):
+        """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
+        world, pixel = wp.tid()
+        if mask[world] != 0:
+            model = models[world]
+            seen = see(model, pixel, wp.int64(0), base[world, pixel])
+            begin_pixel(model, phase_stream, random_phase[world], seen, pixel, memory_out[world])
+
+    return begin
+
+
+make_begin(())  # before the module is loaded

@@ -24,7 +24,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_pixel import signal_terms
+from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.warp_start import refuse_forked_process
 
@@ -190,6 +190,8 @@ class Pixels:
                 terms=terms,
             )
             self._scan = event_worlds_scan.make_noisy_scan(frozenset(terms))
+            self._begin_noise = make_begin(signal_terms(terms))
+            wp.load_module(self._begin_noise.module, device=device)
             self._models: Any = wp.array([self.noise.model], dtype=PixelModel, device=device)
             self._memories: list[Any] = [
                 wp.array([self.noise.memory(slot)], dtype=Memory, device=device) for slot in range(ring_size)
@@ -216,7 +218,7 @@ class Pixels:
             wp.copy(self._models, wp.array([self.noise.model], dtype=PixelModel, device=self._device))
             phase_stream, random_phase = self.noise.phase()
             wp.launch(
-                event_worlds_scan.make_begin(signal_terms(self.noise.terms)),
+                self._begin_noise,
                 dim=(1, self.base.shape[0]),
                 inputs=[
                     self._models,

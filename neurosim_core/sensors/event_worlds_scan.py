@@ -19,7 +19,6 @@ import warp as wp
 from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_cut import take_apart
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_pixel import begin_pixel, make_see
 from neurosim_core.sensors.event_noise_scan import make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
@@ -242,10 +241,6 @@ def scan(
     )
 
 
-def _module(*parts: str) -> wp.Module:
-    return wp.get_module(f"{__name__}.{'_'.join(parts)}")
-
-
 @functools.cache
 def make_noisy_scan(terms: frozenset[str]) -> Any:
     """Return the kernel that does the same for pixels with the given terms (`event_noise_model.terms_of`).
@@ -255,7 +250,7 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
     scan_noisy = make_pixel_scan(terms)
 
     @wp.kernel(
-        module=_module(*(sorted(terms) or ["ideal"])),
+        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"),
         enable_backward=False,
     )
     def scan(
@@ -345,37 +340,6 @@ def begin_pixels(
         base_out[world, pixel] = value
         last_out[world, pixel] = value
         crossed_out[world, pixel] = wp.vec2i(0, 0)
-
-
-@functools.cache
-def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
-    """Return the kernel that begins what pixels with some `event_noise_pixel.signal_terms` remember."""
-    see = make_see(signals)
-    module = _module("begin", *(name for name, _ in signals)) if signals else wp.get_module(__name__)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def begin(
-        # Model:
-        models: wp.array[PixelModel],
-        phase_stream: wp.uint32,
-        random_phase: wp.array[wp.bool],
-        # In:
-        mask: wp.array[wp.int32],
-        base: wp.array2d[wp.float32],
-        # Out:
-        memory_out: wp.array[Memory],
-    ):
-        """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
-        world, pixel = wp.tid()
-        if mask[world] != 0:
-            model = models[world]
-            seen = see(model, pixel, wp.int64(0), base[world, pixel])
-            begin_pixel(model, phase_stream, random_phase[world], seen, pixel, memory_out[world])
-
-    return begin
-
-
-make_begin(())  # before the module is loaded
 
 
 @wp.kernel

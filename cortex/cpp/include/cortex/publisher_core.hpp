@@ -174,12 +174,13 @@ class PublisherCore {
 
   // A reliable reader has accounted for all below a sequence; called under the lock.
   void resume(std::uint64_t number, std::uint64_t sequence) noexcept {
+    bool is_new = false;
     for (const auto& reader : readers_.all()) {
       if (reader->request.reader != number) continue;
       reader->confirmed = std::max(reader->confirmed, sequence);
-      reader->has_answer = true;
+      is_new = !std::exchange(reader->has_answer, true);
     }
-    if (sequence >= late_until_) is_late_ = false;  // else it was too late once more since
+    if (!is_new && sequence >= late_until_) is_late_ = false;  // else it was too late once more since, or another was
     if (closed_) settle();
   }
 
