@@ -314,13 +314,3 @@ def test_a_reader_that_cannot_map_the_ring(make_node, start_child, monkeypatch, 
     assert [subscriber.recv(SOON_S).number for _ in range(2)] == [8, 9]
     assert subscriber.counters.lost == subscriber.counters.rejected == 0
     child.finish()
-
-
-def test_a_reader_in_the_same_process_has_the_ring_as_others(make_node):
-    node = make_node()
-    publisher = node.publisher("/blocks", Block)
-    subscriber = node.subscriber("/blocks", Block, policy=reliable())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    publisher.publish(make_block(1, 100))
-    assert subscriber.recv(SOON_S).number == 1
-    assert subscriber.carriers == ["ipc, shared memory"]

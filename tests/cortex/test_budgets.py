@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from peer import connect
 
 from cortex import Array, MalformedMessage, Node, message, reliable
 from cortex.body import Body
@@ -124,9 +125,7 @@ def test_back_pressure_ends_when_the_publisher_says(runtime):
 def test_a_command_holds_up_its_publisher_for_a_moment_only(runtime, type_, longest_s):
     """By default; whatever a reader asks for."""
     with Node("one", registry="off") as node:
-        publisher = node.publisher("/topic", type_)
-        subscriber = node.subscriber("/topic", type_, policy=reliable(timeout_s=3_000_000.0))
-        assert publisher.wait_for_subscribers()
+        publisher, subscriber = connect(node, "/topic", type_, reliable(timeout_s=3_000_000.0))
         assert [reader.timeout_s for reader in publisher._fanout.readers.values()] == [longest_s]
         subscriber.close()
 

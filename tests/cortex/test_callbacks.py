@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from peer import Number, Scan
+from peer import Number, Scan, connect
 from processes import SOON_S, wait_for
 
 from cortex import reliable
@@ -22,9 +22,7 @@ def scan(number, size=LARGE):
 
 def test_callbacks_are_called_in_order(node):
     received = []
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, reliable(64, 60.0), received.append)
     for value in range(3000):
         assert publisher.publish(Number(value, value))
     wait_for(lambda: len(received) == 3000)
@@ -47,9 +45,7 @@ def test_no_callback_after_close(node):
             time.sleep(1e-3)
         state["running"] = False
 
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, slow)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, callback=slow)
     for value in range(30):
         publisher.publish(Number(value, value))
     assert started.wait(SOON_S)
@@ -97,9 +93,7 @@ def test_a_callback_closes_its_node(make_node):
         node.close()
         closed.set()
 
-    publisher = node.publisher("/numbers", Number)
-    node.subscriber("/numbers", Number, close)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, _ = connect(node, "/numbers", Number, callback=close)
     publisher.publish(Number(0, 0))
     assert closed.wait(SOON_S)
     with pytest.raises(Closed):
@@ -117,9 +111,7 @@ def test_a_callback_publishes_and_subscribes(node):
             extra.append(node.subscriber("/second", Number, received.append, policy=reliable()))
         second.publish(Number(message.stamp_ns, message.value + 1))
 
-    first = node.publisher("/first", Number)
-    node.subscriber("/first", Number, forward, policy=reliable())
-    assert first.wait_for_subscribers(timeout_s=SOON_S)
+    first, _ = connect(node, "/first", Number, reliable(), forward)
     first.publish(Number(0, 0))
     assert second.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(1, 100):

@@ -9,7 +9,7 @@ import threading
 import time
 
 import pytest
-from peer import Block, Number, make_block
+from peer import Block, Number, connect, make_block
 from processes import SOON_S, wait_for
 
 import cortex.link
@@ -147,9 +147,7 @@ def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
 def test_a_forked_child_leaves_a_publisher_alone(make_node, use):
     """Also where a large message is written at the moment of the fork."""
     node = make_node(registry="off")
-    publisher = node.publisher("/blocks", Block)
-    subscriber = node.subscriber("/blocks", Block)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/blocks", Block)
     with publisher._large_lock, publisher._lock:
         child = os.fork()
         if child == 0:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import select
 import shutil
 import signal
@@ -168,21 +167,21 @@ def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
     assert time.monotonic() - begin < 20.0
 
 
-@pytest.mark.parametrize("others", [0, 2])
+@pytest.mark.parametrize(("others", "size", "held"), [(0, 10, 500), (2, 10, 500), (0, 20_000, 45)])
 def test_killed_cpp_reader_that_holds_up_its_publisher(
-    start: Callable[..., Peer], make_node: Callable[..., Node], others: int
+    start: Callable[..., Peer], make_node: Callable[..., Node], others: int, size: int, held: int
 ) -> None:
-    """The publisher waits for a reliable reader; when that dies it goes on, and no signal kills it."""
+    """The publisher waits for a reliable reader, with all slots of its share; when that dies it goes on."""
     node = make_node()
     slow = start("count", "/scan", "reliable", 50_000, 3)
     for _ in range(others):
         start("count", "/scan", "64", 0, 0)
-    writer = start("publish", "/scan", -1, "10", "", 1 + others)
+    writer = start("publish", "/scan", -1, size, "", 1 + others)
 
     def published() -> int:
         return max((found.published for found in publishers_in_cpp(node)), default=0)
 
-    wait_for(lambda: published() > 500)  # more than one message each 50 ms
+    wait_for(lambda: published() > held)  # more than one message each 50 ms
     before = [0, published()]
     while before[-1] > before[-2]:
         time.sleep(0.02)
@@ -190,25 +189,10 @@ def test_killed_cpp_reader_that_holds_up_its_publisher(
     slow.process.kill()
     scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     first = scans.recv(SOON_S).stamp_ns
-    for number in range(first + 1, first + 5000):
+    for number in range(first + 1, first + 10 * held):
         assert scans.recv(SOON_S).stamp_ns == number
-    assert writer.process.poll() is None
-
-
-def test_killed_cpp_publisher_is_followed_by_another(start: Callable[..., Peer]) -> None:
-    """What a dead publisher wrote does no harm, and the next one is another source."""
-    reader = start("count", "/scan", "reliable", 200, 3, 100_000_000)
-    first = start("publish", "/scan", -1, SIZES)
-    wait_for(lambda: share_a_ring(reader, first.process.pid))
-    time.sleep(random.random() * 0.2)  # it dies at any moment
-    first.process.kill()
-    reader.process.kill()
-
-    reader = start("count", "/scan", "reliable", 0, 3, 500)
-    second = start("publish", "/scan", -1, "10")
-    wait_for(lambda: share_a_ring(reader, second.process.pid) or reader.has_line())  # or it was quick
-    result = result_of(reader)
-    assert (result["wrong"], result["lost"], result["rejected"]) == (0, 0, 0)
+    assert scans.counters.lost == 0
+    assert writer.process.poll() is None  # no signal has killed it
 
 
 def nothing(flags: int) -> bytes:
@@ -516,19 +500,3 @@ def test_ring_of_a_publisher_that_is_gone_before_its_answer_came(
     result = result_of(peer)
     assert (result["received"], result["lost"], result["rejected"], result["cut_off"]) == (3, 0, 0, 1)
     peer.end()
-
-
-def test_random_bytes_in_a_ring_do_no_harm(programs: Path, impostor: RingImpostor) -> None:
-    """Damaged frames, one reader each: it lives."""
-    rng = random.Random(11)
-    for _ in range(5):
-        peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
-        impostor.take_in(impostor.await_key())
-        frames = [make_frame(b"M", number, body_of(number)) for number in range(50)] + bad_frames()
-        rng.shuffle(frames)
-        for frame in frames:
-            damaged = bytearray(frame)
-            damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
-            assert impostor.ring.send(bytes(damaged))
-        assert peer.process.poll() is None
-        peer.end()  # exits with status 0

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import zmq
-from peer import Number, Scan, make
+from peer import Number, Scan, connect, make
 from processes import SOON_S
 
 from cortex.codec import codec_of, coder_of
@@ -170,9 +170,7 @@ def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
 @pytest.mark.parametrize("size", [3, 50_000], ids=["small", "in a slot"])
 def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, monkeypatch, size):
     """It gets the lock before it gets the GIL, while another thread finds a frame that takes more care."""
-    publisher = node.publisher("/gap", Scan)
-    subscriber = node.subscriber("/gap", Scan, policy=reliable(64))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/gap", Scan, reliable(64))
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
     interval, got = sys.getswitchinterval(), []
     for number in range(3):

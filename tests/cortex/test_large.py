@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peer import Block, Scan, is_whole, make_block
+from peer import Block, Scan, connect, is_whole, make_block
 from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.back_pressure
@@ -29,10 +29,7 @@ def scan(number, size=LARGE):
 
 
 def connected(node, kind, policy, **options):
-    publisher = node.publisher("/large", kind, **options)
-    subscriber = node.subscriber("/large", kind, policy=policy)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    return publisher, subscriber
+    return connect(node, "/large", kind, policy, **options)
 
 
 def slots_held(publisher):
@@ -304,23 +301,6 @@ def _try(subscriber):
         return None
 
 
-@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
-def test_a_publisher_without_shared_memory(node, monkeypatch, policy):
-    """It goes through the ring as it is, without a slot."""
-    monkeypatch.setattr(cortex.broadcast.Broadcast, "_provide", lambda *_, **__: False)
-    publisher, subscriber = connected(node, Scan, policy)
-    for number in range(20):
-        assert publisher.publish(scan(number))
-        message = subscriber.recv(SOON_S)
-        assert message == scan(number)
-        assert not is_shared(message)
-    with publisher.loan(n=LARGE) as draft:
-        draft.stamp_ns = 77
-        draft.ranges[:] = 1.0
-    assert subscriber.recv(SOON_S).stamp_ns == 77
-    assert subscriber.counters.lost == 0
-
-
 def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
     """No second copy of it is made, and nothing is allocated for it once one has been sent."""
     monkeypatch.setattr(cortex.link, "native", None)
@@ -446,9 +426,7 @@ def recorded_waits_s(monkeypatch):
 
 def test_a_large_message_has_all_its_time_after_one_that_was_held_up(node, monkeypatch):
     """Of another thread, whose turn came between this one's check and its own turn."""
-    publisher = node.publisher("/scans", Scan, max_wait_s=0.5)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(1, SOON_S))
-    assert publisher.wait_for_subscribers(1, SOON_S)
+    publisher, subscriber = connect(node, "/scans", Scan, reliable(1, SOON_S), max_wait_s=0.5)
     assert subscriber.wait_for_publisher(SOON_S)
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
     fill_slots(publisher)

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from peer import Number, Scan, memory
+from peer import Number, Scan, connect, memory
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
@@ -20,9 +20,7 @@ MANY = int(os.environ.get("CORTEX_MESSAGES", "100000"))
 
 def connected(node, policy, **options):
     """A publisher and a subscriber of one node."""
-    publisher = node.publisher("/numbers", Number, **options)
-    subscriber = node.subscriber("/numbers", Number, policy=policy)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, policy, **options)
     assert subscriber.wait_for_publisher(SOON_S)
     return publisher, subscriber
 
@@ -85,20 +83,6 @@ def test_latest_gives_the_newest_at_once(node):
             value += 1
         assert subscriber.recv(SOON_S).value == value - 1
     assert take_all(subscriber) == []
-
-
-@pytest.mark.parametrize("policy", [latest(), keep_last(10)], ids=str)
-def test_the_newest_after_a_long_absence(make_node, start_child, policy):
-    """A reader that was away for 20 000 messages, more than the sockets hold, finds the last ones."""
-    child = start_child("peer")
-    child.ask(do="publisher", topic="/numbers", type="Number")
-    subscriber = make_node().subscriber("/numbers", Number, policy=policy)
-    assert subscriber.wait_for_publisher(SOON_S)
-    child.ask(do="publish", topic="/numbers", count=20_000, rate_hz=20_000)
-    depth, counters = policy.depth, subscriber.counters
-    wait_for(lambda: counters.overtaken + counters.lost == 20_000 - depth)
-    assert [subscriber.recv(SOON_S).value for _ in range(depth)] == list(range(20_000 - depth, 20_000))
-    assert counters.received == depth
 
 
 @pytest.mark.alone
@@ -195,9 +179,7 @@ def test_back_pressure_has_an_end(node):
 
 def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=4, timeout_s=1.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/scans", Scan, reliable(depth=4, timeout_s=1.0))
     ranges = np.zeros(50_000, np.float32)
     delivered = []
     while all(delivered):

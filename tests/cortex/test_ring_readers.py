@@ -11,7 +11,7 @@ import struct
 
 import pytest
 import zmq
-from peer import Number
+from peer import Number, connect
 from processes import SOON_S, wait_for
 from rings import RING_BYTES, SOURCE, fill, frame, nothing, ring, takes
 
@@ -102,9 +102,7 @@ def test_a_publisher_of_another_version_is_heard_and_it_is_said(make_node, monke
 
     monkeypatch.setattr(Listener, "take", close)
     node = make_node()
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, reliable())
     publisher.publish(Number(1, 2))
     assert subscriber.recv(SOON_S) == Number(1, 2)
     assert subscriber.wait_for_publisher(SOON_S)

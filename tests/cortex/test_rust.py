@@ -19,7 +19,7 @@ from peer import Block, Number, Scan, is_whole, make_block
 from processes import ROOT, SOON_S
 from wire_vectors import message_to_plain
 
-from cortex import Node, keep_last, reliable
+from cortex import keep_last, reliable
 from cortex.registry import ensure_registry
 from cortex.schema import schema_of
 
@@ -155,35 +155,26 @@ def test_vectors():
     assert {"test bodies ... ok", "test frames ... ok", "test types ... ok"} <= set(output.splitlines())
 
 
+def blocks_of(count: int) -> list[Block]:
+    """Small messages, and every hundredth a large one."""
+    return [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(count)]
+
+
 @pytest.mark.parametrize("over", ["ipc", "tcp"])
 def test_reliable_from_python(start, make_node, over):
-    """Far more than all queues hold: the subscriber gets each message, and the publisher's end."""
-    publisher = make_node(listen="127.0.0.1").publisher("/numbers", Number, max_wait_s=SOON_S)
-    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once", *transport(over)))
-    assert publisher.wait_for_subscribers(1, SOON_S)
-    count = 10_000
-    delivered = sum(publisher.publish(Number(number, -number)) for number in range(count))
-    publisher.close()
-    messages, counted = reading.finish()
-    assert len(messages) == counted["received"]
-    assert counted["received"] + counted["lost"] == count
-    assert (counted["rejected"], counted["cut_off"]) == (0, 0)
-    assert counted["received"] >= delivered
-    if delivered == count:  # nobody had to wait for longer than the reader asks for
-        assert messages == [{"stamp_ns": number, "value": -number} for number in range(count)]
-
-
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_small_and_large_messages_from_python(start, make_node, over):
+    """More than all queues hold: the subscriber gets each message, and the publisher's end."""
     publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, max_wait_s=SOON_S)
     reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
     assert publisher.wait_for_subscribers(1, SOON_S)
-    blocks = [make_block(number, 20_000 if number % 10 == 9 else number) for number in range(100)]
-    assert all(publisher.publish(block) for block in blocks)
+    blocks = blocks_of(6_000)
+    delivered = sum(map(publisher.publish, blocks))
     publisher.close()
     messages, counted = reading.finish()
-    assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
-    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
+    assert len(messages) == counted["received"] >= delivered
+    assert counted["received"] + counted["lost"] == len(blocks)
+    assert (counted["rejected"], counted["cut_off"]) == (0, 0)
+    if delivered == len(blocks):  # nobody had to wait for longer than the reader asks for
+        assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
 
 
 @pytest.mark.parametrize("over", ["ipc", "tcp"])
@@ -193,10 +184,7 @@ def test_reliable_from_rust(start, make_node, over):
     publishing = Publishing(start("cortex-pub", "/blocks", *transport(over)), Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
     publishing.await_subscribers(1)
-    count, blocks = (
-        3_000,
-        [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(3_000)],
-    )
+    count, blocks = 3_000, blocks_of(3_000)
     closing: list[dict[str, int]] = []
 
     def feed() -> None:
@@ -260,18 +248,6 @@ def test_several_subscribers_of_rust(start, make_node):
     assert publishing.close() == {"published": 1, "timeouts": 0}
 
 
-def test_rust_to_rust(start):
-    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once"))
-    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
-    publishing.await_subscribers(1)
-    for number in range(100):
-        publishing.publish(Number(number, number * number))
-    assert publishing.close() == {"published": 100, "timeouts": 0}
-    messages, counted = reading.finish()
-    assert messages == [{"stamp_ns": number, "value": number * number} for number in range(100)]
-    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
-
-
 def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     """Connected peers go on; who comes later is found through the registry that takes over."""
     publishing = Publishing(start("cortex-pub", "/numbers"), Number)
@@ -284,17 +260,3 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     publishing.publish(Number(1, 2))
     assert first.recv(SOON_S) == second.recv(SOON_S) == Number(1, 2)
     assert publishing.close() == {"published": 1, "timeouts": 0}
-
-
-def test_a_killed_rust_publisher_is_gone(start, make_node):
-    process = start("cortex-pub", "/numbers")
-    publishing = Publishing(process, Number)
-    node: Node = make_node()
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(8))
-    publishing.await_subscribers(1)
-    publishing.publish(Number(1, 2))
-    assert subscriber.recv(SOON_S) == Number(1, 2)
-    process.kill()
-    while any(record.publishers for record in node.nodes()):
-        with pytest.raises(TimeoutError):
-            subscriber.recv(0.01)

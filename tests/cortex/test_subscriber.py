@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 import zmq
-from peer import Number, OtherNumber, Scan
+from peer import Number, OtherNumber, Scan, connect
 from processes import SOON_S, in_time, wait_for
 
 from cortex import keep_last, receive_lock, reliable
@@ -130,9 +130,7 @@ def test_what_is_known_of_a_message(node, numbers):
 
 
 def test_arrays_cannot_be_written(node):
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/scans", Scan)
     for size in (10, LARGE):
         publisher.publish(scan(1, size))
         ranges = subscriber.recv(SOON_S).ranges

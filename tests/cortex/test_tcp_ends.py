@@ -158,7 +158,6 @@ def test_a_connection_fails_for_good_in_silence(make_node, start_child, before, 
     """Its reader has been told that nothing was missing so far: that is no end."""
     node = make_node("here", listen="127.0.0.1")
     child = start_child("peer", **ELSEWHERE)
-    child.hear()
     reading = Reading(node.subscriber("/blocks", Block, policy=reliable(timeout_s=SOON_S)), 0.0)
     child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import zmq
-from cable import ADDRESSES, two_hosts
 from peer import Block, Number, is_whole, make_block
-from processes import SOON_S, wait_for
+from processes import SOON_S
 
 import cortex.node
 from cortex import reliable
@@ -259,52 +252,3 @@ def test_frames_have_a_limit(runtime):
 
 
 # Two hosts
-
-
-@pytest.fixture
-def hosts(runtime):
-    """Two network namespaces with a cable between them; each has a runtime directory of its own."""
-    with two_hosts() as names:
-        yield [
-            (
-                {"prefix": ["ip", "netns", "exec", name], "env": {"CORTEX_RUNTIME_DIR": str(runtime / side)}},
-                address,
-            )
-            for name, side, address in zip(names, "xy", ADDRESSES, strict=True)
-        ]
-
-
-def test_two_hosts(hosts, start_child, tmp_path):
-    """Two kernels' worth of separation: a cable, encrypted, both ways, large and small."""
-    directories = keys_of(tmp_path, ("one", "two"))
-    (place, address), (other_place, other_address) = hosts
-    registry = f"tcp://{address}:7461"
-    (directories["two"] / AUTHORIZED_FILE).write_text(f"{load_keys(directories['one']).public} {address}\n")
-    serve = [sys.executable, "-m", "cortex.discovery", "--listen", registry, "--keys", directories["one"]]
-    serving = subprocess.Popen([*place["prefix"], *serve], env={**os.environ, **place["env"]})
-    wait_for(lambda: list(Path(place["env"]["CORTEX_RUNTIME_DIR"]).glob("*/registry")))
-    one = start_child("peer", name="one", listen=address, keys=str(directories["one"]), **place)
-    two = start_child(
-        "peer",
-        name="two",
-        listen=other_address,
-        registry=registry,
-        keys=str(directories["two"]),
-        **other_place,
-    )
-    for sender, receiver, topic in ((one, two, "/a"), (two, one, "/b")):
-        sender.ask(do="publisher", topic=topic, type="Block")
-        receiver.ask(do="subscriber", topic=topic, type="Block", policy=["reliable", {"timeout_s": 60.0}])
-        assert sender.ask(do="await_subscribers", topic=topic)["ok"]
-        for start, size in ((0, 100), (50, 300_000)):
-            receiver.say(do="receive", topic=topic, until=start + 49)
-            sent = sender.ask(do="publish", topic=topic, count=50, start=start, size=size)
-            assert sent["delivered"] == 50
-            expected = {"count": 50, "first": start, "last": start + 49, "ordered": True, "whole": True}
-            assert receiver.hear() == expected
-    one.finish()
-    two.finish()
-    serving.terminate()
-    serving.wait(SOON_S)
-    shutil.rmtree(place["env"]["CORTEX_RUNTIME_DIR"])
-    shutil.rmtree(other_place["env"]["CORTEX_RUNTIME_DIR"])
