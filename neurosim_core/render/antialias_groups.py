@@ -46,8 +46,6 @@ _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
 _COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
-_COVER_BLOCKS = 11
-"""Blocks of a multiprocessor that are launched: they run until all is done, and the flight needs room."""
 _RAY_THREADS = 5120
 """Threads of a multiprocessor: far more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
@@ -91,7 +89,10 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
 def thread_counts(lists: BlockLists, pixel_count: int, instant_count: int) -> tuple[int, int, int]:
     """Return the threads of the three kernels, for so many pixels of all instants of all worlds."""
     even = pixel_count // instant_count * -(-instant_count // _INSTANTS)
-    return even, lists.threads // _RAY_THREADS * _COVER_BLOCKS * _COVER_BOUNDS[0], lists.threads
+    processors = lists.threads // _RAY_THREADS
+    # they run until all is done: one in 16 multiprocessors has a block less, and there the flight finds room
+    cover = _COVER_BOUNDS[0] * (_COVER_BOUNDS[1] * processors - processors // 16)
+    return even, cover, lists.threads
 
 
 @wp.func_native(read_native(__file__, "classify_block"))

@@ -94,11 +94,6 @@ class Fence:
             self._behind = stream or self._device.stream
             self._behind.record_event(self._event)
 
-    @property
-    def passed(self) -> bool:
-        """Whether the device has come here."""
-        return self._event is None or bool(self._event.is_complete)
-
     def wait(self) -> None:
         """Let the host wait until the device has come here."""
         if self._event is not None:

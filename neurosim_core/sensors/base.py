@@ -352,9 +352,6 @@ class FrameSensor(Protocol):
     def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
         """Launch what it makes of the frames of a batch, device array, shape [>= K, H, W]."""
 
-    def begin_read(self, stamps_ns: Sequence[int]) -> None:
-        """Launch what `read` waits for of the oldest batch, all of whose stamps count, without waiting."""
-
     def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
         """Wait for the oldest batch, and return the packets that end in it, at most at a stamp."""
 

@@ -193,20 +193,11 @@ class EventChannel:
         if stamps_ns:
             self.camera.feed_device(frames[first:] if first else frames, stamps_ns)
 
-    def begin_read(self, stamps_ns: Sequence[int]) -> None:
-        """Launch what `read` waits for, of all stamps of the oldest batch, if its scan has ended."""
-        if self._labels is None:
-            self.camera.begin_windows(self._ends(stamps_ns, until_ns=stamps_ns[-1]))
-
-    def _ends(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[int]:
-        """Return the ends of the windows that end in a batch."""
-        begun_ns = self.camera.window_start_ns
-        ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
-        return [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
-
     def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
         """Wait for the oldest batch, and return the packets whose windows end in it, at most at a stamp."""
-        ends = self._ends(stamps_ns, until_ns=until_ns)
+        begun_ns = self.camera.window_start_ns
+        ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
+        ends = [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
         fed = stamps_ns[-1] > self.camera.stamp_ns
         self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
         packets: list[Events] = self.camera.collect_windows(ends, scan_count=int(fed))

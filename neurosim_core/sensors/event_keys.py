@@ -4,7 +4,7 @@
 Keys are as in `event_levels`. What no window has taken yet stays, and its time goes on from the last cut.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,8 +39,6 @@ _EVENTS_PER_SAMPLE = 1 / 8
 tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stands still."""
 _PINNED_BLOCKS = 3
 """What a reader holds, what it reads next, and what is copied to."""
-_REPLAYED_COUNT_MAX = 1 << 16
-"""So many keys or less are cut by a graph, which sorts up to half as many more: launches take longer."""
 _ROOM_MIN = 1024
 _BLOCK_COUNT_MAX = 1 << 26
 """Most events in one block of memory: Warp counts its bytes in 31 bits."""
@@ -190,20 +188,16 @@ class EventKeys:
         )
         self.count = first + read
 
-    def begin_cut(self, ends_ns: Sequence[int], end_bit: int) -> Callable[[], tuple[list[Any], list[int]]]:
-        """Launch the sort of the keys.
+    def cut(self, ends_ns: Sequence[int], end_bit: int) -> tuple[list[Any], list[int]]:
+        """Sort the keys and return them as columns, and the index of the first event after each window.
 
         Args:
             ends_ns: Ends of the windows [ns], at least one.
             end_bit: Beyond the highest bit that a key may have.
-
-        Returns:
-            What waits for it, and returns the keys as columns, and the index of the first event after each
-            window. No keys may come until then.
         """
         count = self.count
         if count == 0:
-            return lambda: ([], [0] * len(ends_ns))
+            return [], [0] * len(ends_ns)
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
         copied = count + count % 2  # columns in a block begin where they may
@@ -211,7 +205,7 @@ class EventKeys:
         told[:_TOLD] = count, copied, self.origin_us
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
-            return self._begin_cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
+            return self._cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
         self._told.upload()
         prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
         self._launch(event_cut.prepare, count, prepared, [self.keys])
@@ -229,22 +223,18 @@ class EventKeys:
         if self._labels is not None:
             self._labels.launch(count, *columns[:3])
         self._read.set()
+        self._read.wait()
+        if self._on_host:
+            columns = [column.numpy() for column in columns]
+        return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
-        def end_cut() -> tuple[list[Any], list[int]]:
-            self._read.wait()
-            found = [column.numpy() for column in columns] if self._on_host else columns
-            return found, self._found_on_host.rows(0, len(ends_ns)).tolist()
-
-        return end_cut
-
-    def _begin_cut_to_host(
+    def _cut_to_host(
         self, blocks: BufferPool, copied: int, window_count: int, end_bit: int
-    ) -> Callable[[], tuple[list[Any], list[int]]]:
+    ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
-        count, shifts = self.count, [self._row_shift, self._time_shift]
-        room = count
-        if count <= _REPLAYED_COUNT_MAX:
-            room = min(max(_ROOM_MIN, size_class(count)), self._order.shape[0] // 2)
+        # a graph sorts up to half as many more; launches, of which there are many, take the host far longer
+        room = min(max(_ROOM_MIN, size_class(self.count)), self._order.shape[0] // 2)
+        shifts = [self._row_shift, self._time_shift]
 
         def launch() -> None:
             self._told.upload()
@@ -255,27 +245,20 @@ class EventKeys:
             self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
             self._found_on_host.fetch(0, window_count)
 
-        if count <= _REPLAYED_COUNT_MAX:
-            self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
-        else:
-            launch()
+        self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         if self._labels is not None:
             t, both = self._columns[:2]
-            self._labels.launch(count, t, both, both, first_x=4 * copied, first_y=5 * copied)
+            self._labels.launch(self.count, t, both, both, first_x=4 * copied, first_y=5 * copied)
         block = blocks.acquire(_EVENT_BYTES * copied)
         wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()
-
-        def end_cut() -> tuple[list[Any], list[int]]:
-            self._read.wait()
-            rows = blocks.hand_out(block, _EVENT_BYTES * copied)
-            columns = []
-            for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
-                size = np.dtype(dtype).itemsize
-                columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
-            return columns, self._found_on_host.rows(0, window_count).tolist()
-
-        return end_cut
+        self._read.wait()
+        rows = blocks.hand_out(block, _EVENT_BYTES * copied)
+        columns = []
+        for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
+            size = np.dtype(dtype).itemsize
+            columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
+        return columns, self._found_on_host.rows(0, window_count).tolist()
 
     def no_events(self) -> list[Any]:
         """Return columns without an event."""

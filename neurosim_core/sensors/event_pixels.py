@@ -117,15 +117,6 @@ class Scan:
             start = number * _COUNTERS_ROOM
             self.inputs.rows[start : start + _COUNTERS] = chunk.first_key, 0, 0
 
-    def read(self) -> tuple[list[int], int, int]:
-        """Return what an ended scan has counted: events of each chunk; invalid samples; the first of these.
-
-        The latter is its flat index in the stack, counted from the end.
-        """
-        counters = [chunk.counters_on_host.view(0, _COUNTERS).tolist() for chunk in self.chunks]
-        counts = [end - chunk.first_key for (end, _, _), chunk in zip(counters, self.chunks, strict=True)]
-        return counts, sum(invalid for _, invalid, _ in counters), max(place for *_, place in counters)
-
     def has_room(self, counts: Sequence[int]) -> bool:
         """Return whether all events were written, of which each chunk has so many."""
         return all(chunk.has_room(count) for count, chunk in zip(counts, self.chunks, strict=True))
@@ -303,30 +294,6 @@ class Pixels:
         counts: NDArray[np.int32] = self._table.numpy()[0]
         self._table = self._empty((1, 1, self._height), wp.int32)
         return counts
-
-    def limit_rows(self, scan: Scan, event_count_max: int, lost: LostEvents) -> bool:
-        """Where a frame has too many events, keep the rows from the top that fit; return whether one has.
-
-        The stack is scanned again then, and what is lost is noted.
-        """
-        stamps = scan.stamps_ns
-        total = np.cumsum(self.count_by_row(scan), axis=1, dtype=np.int64)
-        rows = (total <= event_count_max).sum(axis=1)
-        short = np.flatnonzero(rows < self._height)
-        for frame in short:
-            kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
-            lost.add(int(stamps[frame]), int(total[frame, -1]) - kept)
-        if len(short) == 0:
-            return False
-        wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self._device), count=len(rows))
-        self.launch_again(scan)
-        return True
-
-    def launch_again(self, scan: Scan) -> None:
-        """Scan a stack again."""
-        scan.begin()
-        self.launch(scan)
-        scan.done.set()
 
     def launch(self, scan: Scan, *, tabulate: bool = False) -> None:
         """Scan a stack, after `scan.begin`, from the state before it; again, it gives the same one after it.

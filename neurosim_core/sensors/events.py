@@ -11,7 +11,7 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 
 import functools
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -165,8 +165,6 @@ class EventCamera:
         self._make_stepper = functools.cache(new_stepper)
         self._stepper: EventCameraBatch | None = None
         """Has the pixels since the reset, if they step."""
-        self._begun: tuple[list[int], Callable[[], tuple[list[Any], list[int]]]] | None = None
-        """Ends of windows that are cut, and what waits for that."""
         self._now_ns: int | None = None
         self._fed_ns = 0
         self._window_start_ns = 0
@@ -204,8 +202,6 @@ class EventCamera:
         event_input.check_reference(frame.numpy())
         for scan in (*self._idle, *self._under_way):
             scan.done.wait()  # it writes states, and reads what the host writes next
-        if self._begun is not None:
-            self._end_cut()
         self._pixels.reset(frame, int(stamp_ns))
         if self._readout is not None:
             self._readout.reset(int(stamp_ns))
@@ -317,7 +313,12 @@ class EventCamera:
         event_input.check_stack(
             log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns
         )
-        event_input.check_span(int(stamps[-1]), self._keys.origin_us, self.span_max_ns)
+        span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
+        if span_us * NS_PER_US >= self.span_max_ns:
+            limit_s = self.span_max_ns / 1e9
+            raise ValueError(
+                f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
+            )
 
     def collect(self) -> Events:
         """Return all events up to the last frame fed, and wait for them.
@@ -326,13 +327,10 @@ class EventCamera:
             RuntimeError: If the camera was not reset.
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
-        if self._begun is not None:
-            raise RuntimeError("collect_windows() must be called after begin_windows()")
         with use_stream(self._reader):
             while self._under_way:
                 self._take_over()
-            self._begin_cut([self._require_reset()])
-            packets = self._end_cut()
+            packets = self._cut([self._require_reset()])
             self._taken.set()
             return packets[0]
 
@@ -356,42 +354,30 @@ class EventCamera:
                 in which case the camera must be reset.
         """
         ends = [int(end) for end in ends_ns]
-        count = len(self._under_way)
-        if scan_count is not None and not (ends and self._scan_count_max == 1):
-            count = min(scan_count, count)  # else it writes where keys are cut
-        if self._begun is not None and ends != self._begun[0]:
-            raise RuntimeError(f"windows that end at {self._begun[0]} ns were begun, got {ends}")
+        under_way = len(self._under_way)
+        count = under_way if scan_count is None else min(scan_count, under_way)
+        if ends and self._scan_count_max == 1:
+            count = under_way  # in place it writes where keys are cut
         if self._in_place and not ends:  # nothing has to be launched
             for _ in range(count):
                 self._take_over()
             self._require_reset()
             return []
         with use_stream(self._reader):
-            if self._begun is None:
-                for _ in range(count):
-                    self._take_over()
-                self._taken.set()
-                now_ns = self._require_reset()
-                if not ends:
-                    return []
-                event_input.check_ends(ends, self._window_start_ns, now_ns)
-                self._begin_cut(ends)
-            packets = self._end_cut()
+            for _ in range(count):
+                self._take_over()
+            self._taken.set()
+            now_ns = self._require_reset()
+            if not ends:
+                return []
+            if not event_input.are_ends(ends, self._window_start_ns, now_ns):
+                raise ValueError(
+                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
+                    f" and not pass {now_ns}, got {ends}"
+                )
+            packets = self._cut(ends)
             self._taken.set()
             return packets
-
-    def begin_windows(self, ends_ns: Sequence[int]) -> None:
-        """Launch what the next `collect_windows`, of the same ends and at most one stack, waits for.
-
-        Nothing happens if this would have to wait itself, with a readout, or if an error is to be raised.
-        """
-        ready = bool(self._under_way) and self._under_way[0].done.passed and not self._under_way[0].read()[1]
-        if not ready or not ends_ns or self._begun is not None or self._in_place or self._readout is not None:
-            return
-        with use_stream(self._reader):
-            self._take_over()
-            self._begin_cut([int(end) for end in ends_ns])
-            self._taken.set()
 
     def _forget(self) -> None:
         scans = [*self._idle, *self._under_way]
@@ -407,6 +393,12 @@ class EventCamera:
         if self._now_ns is None:
             raise RuntimeError("reset() must be called before frames are fed")
         return self._now_ns
+
+    def _scan_again(self, scan: Scan) -> None:
+        """Scan a stack again."""
+        scan.begin()
+        self._pixels.launch(scan)
+        scan.done.set()
 
     def _take_over(self) -> None:
         """Wait for the oldest scan, redo it if there was too little room, and add its keys to the others."""
@@ -427,8 +419,7 @@ class EventCamera:
 
     def _redo(self, scan: Scan, counts: list[int]) -> list[int]:
         """Scan a stack again, within the limit and with room for all events; return how many there are."""
-        most = self.config.event_count_max
-        limited = sum(counts) > most and self._pixels.limit_rows(scan, most, self._lost)
+        limited = sum(counts) > self.config.event_count_max and self._limit_rows(scan)
         if limited:
             counts = self._read_counts(scan)
         if not scan.has_room(counts):
@@ -437,7 +428,7 @@ class EventCamera:
                 scan.chunks[0].keys = self._keys.room()
             else:
                 self._pixels.grow(scan, counts)
-            self._pixels.launch_again(scan)
+            self._scan_again(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
@@ -446,31 +437,40 @@ class EventCamera:
     def _read_counts(self, scan: Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
         scan.done.wait()
-        counts, invalid_count, from_end = scan.read()
-        if invalid_count:
-            shape = len(scan.stamps_ns), self.height, self.width
-            place = np.unravel_index(int(np.prod(shape)) - from_end, shape)
+        counters = [chunk.counters_on_host.view(0, 3).tolist() for chunk in scan.chunks]
+        if invalid_count := sum(invalid for _, invalid, _ in counters):
+            first = len(scan.stamps_ns) * self.width * self.height - max(place for *_, place in counters)
+            frame, pixel = divmod(first, self.width * self.height)
+            row, col = divmod(pixel, self.width)
             self._now_ns = None
             self._idle += self._under_way
             self._under_way.clear()
-            raise ValueError(event_input.invalid_message(invalid_count, f"{[int(index) for index in place]}"))
-        return counts
+            raise ValueError(event_input.invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
+        return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
 
-    def _begin_cut(self, ends: list[int]) -> None:
-        """Launch the sort of the keys for windows that end so."""
+    def _limit_rows(self, scan: Scan) -> bool:
+        """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
+        stamps = scan.stamps_ns
+        total = np.cumsum(self._pixels.count_by_row(scan), axis=1, dtype=np.int64)
+        rows = (total <= self.config.event_count_max).sum(axis=1)
+        short = np.flatnonzero(rows < self.height)
+        for frame in short:
+            kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
+            self._lost.add(int(stamps[frame]), int(total[frame, -1]) - kept)
+        if len(short) == 0:
+            return False
+        wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
+        self._scan_again(scan)
+        return True
+
+    def _cut(self, ends: list[int]) -> list[Events]:
+        """Sort the keys, hand out those of the windows that end so, and carry the others over."""
         if self._readout is not None:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
         # with a readout events may be read later than now
         end_bit = self._time_shift + (span_us + 1).bit_length() if self._readout is None else 63
-        self._begun = ends, self._keys.begin_cut(ends, end_bit)
-
-    def _end_cut(self) -> list[Events]:
-        """Hand out the keys of the windows that were begun, and carry the others over."""
-        assert self._begun is not None
-        ends, end_cut = self._begun
-        self._begun = None
-        columns, cuts = end_cut()
+        columns, cuts = self._keys.cut(ends, end_bit)
         packets = self._packets(ends, columns, cuts)
         self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
         return packets

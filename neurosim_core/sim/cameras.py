@@ -156,22 +156,6 @@ def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
     return packets
 
 
-def begin_next_read(state: State) -> None:
-    """Launch what reading the next batch in flight waits for, if it is known that all of it counts."""
-    if not state.in_flight or state.ended or state.failure is not None:
-        return
-    batch = state.in_flight[0]
-    if not batch.seen or not state.batch_done[batch.number % len(state.batch_done)].passed:
-        return
-    rows = state.trace.numpy(batch.slot, len(batch.boundaries))
-    if rows.status.any() or not (rows.clearance > 0.0).all():
-        return
-    with timed(state.wall_s, "events"):
-        for group, instants in batch.seen:
-            for name in instants.frames:
-                group.frames[name].begin_read(instants.stamps_ns)
-
-
 def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:
     """Let the frame sensors of many worlds see what was rendered; launches only.
 

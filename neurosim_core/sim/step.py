@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
-    begin_next_read,
     choose,
     find_in_worlds,
     launch_cameras,
@@ -97,6 +96,4 @@ def read(model: Model, state: State, *, last: bool = False) -> list[Packet]:
     packets = read_flight(model, state, batch)  # may end the run before the end of the batch
     packets += read_cameras(state, batch, borrow=last and state.borrow_pictures)
     state.rendered_count += 1
-    if state.overlaps:
-        begin_next_read(state)  # while the packets are used
     return in_order(model, packets, batch.until_ns)

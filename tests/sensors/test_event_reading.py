@@ -92,8 +92,6 @@ def fly(
         else:
             packets.extend(camera.collect_windows(ends_until(read_ns, end_ns), scan_count=1))
         read_ns = end_ns
-        if under_way and how[number + 1] == "begun":
-            camera.begin_windows(ends_until(read_ns, under_way[0]))
 
     waiting = deque(stacks)
     longest = max(len(stack) for stack in stacks)
@@ -205,7 +203,7 @@ def test_a_device_that_is_late_gives_the_same(monkeypatch, eagerness, lanes, con
     lengths = [4] * count
     # the same few sizes come again, so that most of it is replayed
     loudness = rng.choice([0.3, 0.3, 0.3, 1.0], size=count).tolist()
-    reads = rng.choice(["one"] * 6 + ["begun"] * 6 + ["all", "collect", "early"], size=count).tolist()
+    reads = rng.choice(["one"] * 12 + ["all", "collect", "early"], size=count).tolist()
     first, stacks = draw_stacks(rng, lengths, loudness)
     plain_camera = make_camera("cpu", lanes=lanes, **config)
     plain_camera.reset(first)
@@ -434,27 +432,3 @@ def test_more_events_than_a_power_of_two_fit_into_what_there_is(monkeypatch, dev
     assert 4096 < count < 4 * width * height
     assert [len(packet.t) for packet in found] == [1, 1] + [count] * 4
     assert [int(packet.polarity.sum()) for packet in found] == [1, 0] + [count, 0] * 2
-
-
-def test_windows_that_were_begun_are_the_next(device):
-    first, stacks = draw_stacks(np.random.default_rng(9), [3] * 3, [0.3] * 3)
-    camera = make_camera(device, lanes=2)
-    camera.reset(first)
-    ends = [FRAME_NS * 3 * turn for turn in range(1, 4)]
-    frames = [wp.array(stack, device=device) for stack in stacks]
-    for turn in range(2):
-        camera.feed_device(frames[turn], ends[turn] - FRAME_NS * np.arange(2, -1, -1))
-    camera.collect_windows(ends[:1], scan_count=1)
-    wp.synchronize()
-    camera.begin_windows(ends[1:2])
-    camera.feed_device(frames[2], ends[2] - FRAME_NS * np.arange(2, -1, -1))
-    with pytest.raises(RuntimeError, match="were begun"):
-        camera.collect_windows(ends[2:], scan_count=1)
-    with pytest.raises(RuntimeError, match="collect_windows"):
-        camera.collect()
-    (packet,) = camera.collect_windows(ends[1:2], scan_count=1)
-    assert len(packet.t) > 0
-    assert (packet.start_ns, packet.stamp_ns) == (ends[0], ends[1])
-    (packet,) = camera.collect_windows(ends[2:], scan_count=1)
-    assert len(packet.t) > 0
-    assert packet.start_ns == ends[1]

@@ -147,10 +147,6 @@ class _LateFence:
         self._behind = self._device.stream
         self._device.add(self._point.run)
 
-    @property
-    def passed(self) -> bool:
-        return self._point.passed
-
     def wait(self) -> None:
         point = self._point
         self._device.run_until(lambda: point.passed)
