@@ -29,6 +29,7 @@ from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement_kernels import rule_kernels
 from neurosim_core.sensors.event_noise_model import TERMS
+from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
 from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
@@ -108,6 +109,7 @@ def make_kernels() -> None:
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_noisy_scan(frozenset(pixel))
+    make_begin(signal_terms(TERMS))
     for errors in ((), IMU_TERMS):
         make_imu(frozenset(errors))
     make_flight(frozenset(VEHICLE_TERMS))

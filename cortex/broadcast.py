@@ -48,7 +48,9 @@ class Reader:
     member: int | None = None
     """Its number in the publisher's ring, through which its frames go; None: through the socket."""
     confirmed: int = 0
-    """It has accounted for all messages below this."""
+    """It has accounted for all messages below this; the end of the stream counts as one."""
+    has_answer: bool = False
+    """Whether it has said so, or need not."""
 
     @property
     def timeout_s(self) -> float:
@@ -82,6 +84,8 @@ class Listener:
         self._heard: dict[tuple[int, int], Hello] = {}
         self.heard_other_version = False
         """Whether a reader asked for a ring of another kind."""
+        self.has_complained = False
+        """Whether that was said; it is said once for all publishers."""
 
     def take(self, source: int, reader: int) -> Hello | None:
         """What a reader has handed over, if it has asked for the ring of a publisher; now the caller's."""
@@ -165,7 +169,6 @@ class Broadcast:
         self._expected_bytes = expected_bytes
         self._unavailable_until_s = 0.0
         self._is_dissolved = False
-        self._has_complained = False
         self._ring: Any = None
         self._readers: dict[int, Reader] = {}
         self._moving: set[Reader] = set()
@@ -177,8 +180,8 @@ class Broadcast:
         """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
         listener = reader.pub_socket.listener
         hello = None if listener is None else listener.take(self._source, reader.request.reader)
-        if listener is not None and listener.heard_other_version and not self._has_complained:
-            self._has_complained = True
+        if listener is not None and listener.heard_other_version and not listener.has_complained:
+            listener.has_complained = True
             self._note("a subscriber with another version of cortex cannot share memory, which is slower")
         if hello is None:
             return

@@ -15,6 +15,7 @@ from cortex.large import LargeSender
 from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket, PubSockets
 from cortex.wire import (
     LARGE,
+    LAST,
     MESSAGE,
     NEXT,
     REST,
@@ -123,6 +124,7 @@ class Fanout:
         reader = self.readers[key] = Reader(key, request, pub_socket)
         if request.shared_memory and pub_socket.local:
             self.ring.admit(reader, sequence)
+        reader.has_answer = reader.member is not None or not request.confirms_end
         self.route()
         answer = answer_frame(key, AttachAnswer(sequence, self.latched))
         if pub_socket.strict:
@@ -143,9 +145,13 @@ class Fanout:
 
     def resume(self, pub_socket: PubSocket, reader: int, sequence: int) -> None:
         """A reader has accounted for all below a sequence."""
+        is_new = False
         for each in self.readers.values():
             if each.request.reader == reader:
-                each.confirmed = max(each.confirmed, sequence)
+                is_new = not each.has_answer
+                each.confirmed, each.has_answer = max(each.confirmed, sequence), True
+        if is_new:
+            return  # it was not the one that was late
         if sequence >= self.late.get(pub_socket, 0):  # else it was too late once more since
             self.late.pop(pub_socket, None)
             self.route()
@@ -296,8 +302,8 @@ class Fanout:
     # Telling readers how many messages there have been
 
     def _news(self, sequence: int) -> bytes:
-        """A frame that says which sequence comes next."""
-        return self._next_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, 0)
+        """A frame that says which sequence comes next, or that none does."""
+        return self._next_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, LAST if self.closed else 0)
 
     def tell(self) -> None:
         """Tell all that have room which sequence comes next, so that they learn of a loss before it."""
@@ -308,14 +314,21 @@ class Fanout:
             pub_socket.try_send(frame)
         self.ring.offer(frame)
 
-    def stop(self) -> None:
-        """Take in no reader any more, and end the ring; `finish` follows."""
+    def stop(self, *, may_send: bool) -> None:
+        """Take in no reader any more, and end the ring; `finish` follows.
+
+        Args:
+            may_send: Whether no message is just being sent.
+        """
         self.closed = True
-        self.ring.end(self._news(self._fast_send.sequence))
         self._untold = list(self._strict_sockets)
+        last = self._news(self._fast_send.sequence)
+        self.ring.end(last)
+        for send in self._lossy_sends if may_send else ():
+            send(last, DONTWAIT)
 
     def finish(self, waited_s: float, linger_s: float) -> bool:
-        """Tell each reader of a socket which sequence would come next; called again and again.
+        """Tell each reader of a socket that the stream ends; called again and again.
 
         Args:
             waited_s: For how long this has gone on [s].
@@ -340,7 +353,7 @@ class Fanout:
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
         confirms = reader.request.confirms and reader.member is None
-        return confirms and reader.confirmed < self._fast_send.sequence
+        return confirms and reader.confirmed < self._fast_send.sequence + reader.request.confirms_end
 
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""

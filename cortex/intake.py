@@ -198,8 +198,8 @@ class Intake:
         return bool(found)
 
     def end_overdue(self, now_ns: int) -> bool:
-        """Close the links whose time is over, a reliable subscriber's once all is read; whether any was."""
-        overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns]
+        """Close links that have ended or had their time, once a reliable one has all; whether any was."""
+        overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns or link.has_ended]
         if overdue and self._policy.reliable:  # what is on its way stays there until there is room for it
             unread = self.drain()
             overdue = [link for link in overdue if link not in unread]

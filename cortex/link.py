@@ -7,6 +7,7 @@ import logging
 import re
 import secrets
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from cortex.wire import (
     BODY_LIMIT,
     HEADER_SIZE,
     LARGE,
+    LAST,
     MESSAGE,
     NEXT,
     SLOT,
@@ -44,6 +46,8 @@ BLOCK_MS = 20
 """Longest time that `receive(0)` waits."""
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
+_warned_of: deque[str] = deque(maxlen=256)
+"""Addresses of nodes that cannot share memory with us."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
@@ -125,8 +129,9 @@ class Link:
         """What comes through the socket while there is no ring."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
-        self._told = -1
-        """The sequence that the publisher last said would come next."""
+        self._marks_end = True
+        self._ended = -1
+        """The sequence at which the publisher said that the stream ends."""
         self._complained: set[str] = set()
         self.socket = new_socket(
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
@@ -180,6 +185,7 @@ class Link:
             min(policy.depth + 2, 255),
             min(int(policy.timeout_s * 1000.0), 2**32 - 1),
             confirms=True,
+            confirms_end=policy.reliable,
         )
         self._key = attach_key(key, stamped=self._stamped)
         self.socket.subscribe(self._key)
@@ -243,12 +249,13 @@ class Link:
         self.socket.subscribe(key)
         self.socket.unsubscribe(key)
 
-    def _count_to(self, sequence: int) -> None:
-        """The publisher says which sequence comes next."""
+    def _count_to(self, sequence: int, *, is_last: bool) -> None:
+        """The publisher says which sequence comes next, or that none does."""
         if self.advance(sequence, 0):
-            self._told = sequence
+            if is_last or not self._marks_end:
+                self._ended = sequence
             if self._ring is None:
-                self._confirm(sequence)
+                self._confirm(sequence + is_last)
 
     def _check(self, fingerprint: int, size: int) -> None:
         if fingerprint != self.codec.fingerprint:
@@ -282,11 +289,11 @@ class Link:
         return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns))]
 
     def _on_next(self, frame: bytes) -> list[Item]:
-        fingerprint, sequence, _, _, size, _ = TAIL.unpack_from(frame, 16)
+        fingerprint, sequence, _, _, size, options = TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
         if len(frame) != HEADER_SIZE or size:
             raise MalformedMessage(f"a frame of {len(frame)} bytes that should have no body")
-        self._count_to(sequence)
+        self._count_to(sequence, is_last=bool(options & LAST))
         return []
 
     def _on_answer(self, frame: bytes) -> list[Item]:
@@ -296,20 +303,23 @@ class Link:
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
+        self._marks_end = answer.marks_end
         known = self.expected >= 0
         if first:
             try:
                 self._use_ring()
             except OSError as error:
                 reason = f"it is of another version of cortex, or has too many readers ({error})"
-                self._do_without_shared_memory(reason, logging.WARNING)
+                known = self.address in _warned_of  # a node has it once for all its publishers
+                self._do_without_shared_memory(reason, logging.INFO if known else logging.WARNING)
+                _warned_of.append(self.address)
                 self.attached = False
                 return []  # it is asked again
-        if known:
-            return []
-        items = self._latched(answer.latched) if answer.latched else []
-        self.expected = answer.sequence
-        return items
+        if not known:
+            self.expected = answer.sequence
+        if self._policy.reliable and self._ring is None:
+            self._confirm(self.expected)
+        return self._latched(answer.latched) if answer.latched and not known else []
 
     def _use_ring(self) -> None:
         """If the publisher has taken us in, its ring has all that follows; OSError if we cannot read it."""
@@ -377,11 +387,16 @@ class Link:
             with contextlib.suppress(OSError):
                 self._use_ring()
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether the publisher has said that nothing follows what has come."""
+        return self._marks_end and 0 <= self.expected == self._ended
+
     def end(self) -> None:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""
         if 0 <= self.expected < self._reached:
             self.advance(self._reached, 0)
-        if self._policy.reliable and self.expected > self._told:
+        if self._policy.reliable and self.expected > self._ended:
             self.counters.cut_off += 1
             logger.warning("%s: a publisher ended without saying how much it had sent", self.record.topic)
 

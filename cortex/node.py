@@ -63,8 +63,8 @@ class Node:
         registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port"; None
             takes `CORTEX_REGISTRY`, else "auto".
         listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None takes
-            `CORTEX_LISTEN`, else this host only. Without `keys` also "127.0.0.1" lets every user of this
-            host read and call this node.
+            `CORTEX_LISTEN`, else this host only, as "" does. Without `keys` also "127.0.0.1" lets every user
+            of this host read and call this node.
         keys: CURVE keys for tcp, from `cortex.security.load_keys`; None takes those in `CORTEX_KEYS`, a
             directory, if that is set.
         insecure: Allow plain tcp beyond this host.

@@ -38,8 +38,8 @@ def network(registry: str | None, listen: str | None, keys: Keys | None) -> Netw
     directory = os.environ.get("CORTEX_KEYS")
     return Network(
         registry or os.environ.get("CORTEX_REGISTRY") or "auto",
-        listen or os.environ.get("CORTEX_LISTEN") or None,
-        load_keys(Path(directory)) if keys is None and directory else keys,
+        (os.environ.get("CORTEX_LISTEN") if listen is None else listen) or None,
+        load_keys(Path(directory).expanduser()) if keys is None and directory else keys,
     )
 
 

@@ -343,11 +343,11 @@ class Publisher(Generic[T]):
 
     @property
     def subscriber_count(self) -> int:
-        """Subscribers that are attached now."""
+        """Subscribers that are attached now: what follows reaches them, or they count it as lost."""
         with self._lock:
             if not (self._closed or self._pub_sockets.closed):
                 self._pub_sockets.refresh()
-            return len(self._fanout.readers)
+            return sum(reader.has_answer for reader in self._fanout.readers.values())
 
     def wait_for_subscribers(self, count: int = 1, timeout_s: float = 5.0) -> bool:
         """Wait until so many subscribers are attached; False if they are not in time."""
@@ -395,13 +395,9 @@ class Publisher(Generic[T]):
         """Publish no more; nobody is waited for after a time of the monotonic clock [s]."""
         with self._lock:
             self._back_pressure.until_s = min(self._back_pressure.until_s, by_s)
-            try:
-                if not self._pub_sockets.closed and not self._back_pressure.is_waiting:
-                    self._fanout.tell()
-            finally:
-                self._closed = True
-                self._fanout.stop()
-                self._fast_send.refresh_ns = 0  # so that `publish` looks
+            self._closed = True
+            self._fast_send.refresh_ns = 0  # so that `publish` looks
+            self._fanout.stop(may_send=not (self._pub_sockets.closed or self._back_pressure.is_waiting))
 
     def _is_finished(self, waited_s: float, linger_s: float) -> bool:
         """Whether nobody is worth waiting for any more; writes what there is room for."""

@@ -24,9 +24,9 @@ class SubscriberCounters:
     rejected: int = 0
     """Frames that were malformed or of another type."""
     cut_off: int = 0
-    """Publishers that ended without saying how many messages there were, as one that is killed does.
+    """Publishers whose end was not heard, as they were killed, or the connection to them failed for good.
 
-    How many were lost at the end is not known then. Counted by `reliable` subscribers."""
+    How many messages were lost at the end is not known then. Counted by `reliable` subscribers."""
     latency: list[int] = field(default_factory=lambda: [0] * BUCKETS)
     """Counts of the time from `publish` to arrival, in buckets of powers of two of a nanosecond."""
 

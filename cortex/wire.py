@@ -17,6 +17,8 @@ MESSAGE, LARGE, SLOT, NEXT, ATTACH, RESUME = b"M", b"L", b"S", b"N", b"A", b"R"
 CONTROL, REQUEST, REPLY, ERROR = b"C", b"Q", b"P", b"E"
 
 FLAG_STAMP = 1
+LAST = 1
+"""In `aux` of a frame of kind `N`: nothing follows, the stream ends here."""
 BODY_LIMIT = 1 << 30
 CONTROL_LIMIT = 16 << 20
 
@@ -150,6 +152,8 @@ class AttachKey(NamedTuple):
     timeout_ms: int
     confirms: bool = False
     """It says how far it has read, when it is told how many messages there have been."""
+    confirms_end: bool = False
+    """It says so of the answer, too, and of the end of the stream."""
 
 
 class AttachAnswer(NamedTuple):
@@ -157,6 +161,8 @@ class AttachAnswer(NamedTuple):
 
     sequence: int
     latched: bytes
+    marks_end: bool = True
+    """It will say when the stream ends; older versions did not."""
 
 
 KEY_SIZE = PREFIX_SIZE + _KEY.size
@@ -168,6 +174,7 @@ def attach_key(key: AttachKey, *, stamped: bool) -> bytes:
         int(key.shared_memory)
         | int(key.strict) << 1
         | int(key.confirms) << 2
+        | int(key.confirms_end) << 3
         | min(key.quota, 255) << 8
         | min(key.timeout_ms, 2**32 - 1) << 32
     )
@@ -188,6 +195,7 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
         (options >> 8) & 0xFF,
         options >> 32,
         bool(options & 4),
+        bool(options & 8),
     )
 
 
@@ -205,7 +213,7 @@ def parse_resume_key(data: bytes) -> tuple[int, int, int] | None:
 
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:
     """The frame that answers a reader; `key` is the 32 bytes that it subscribed to."""
-    return key + _ANSWER.pack(answer.sequence, 0, len(answer.latched), 0) + answer.latched
+    return key + _ANSWER.pack(answer.sequence, answer.marks_end, len(answer.latched), 0) + answer.latched
 
 
 def parse_answer(frame: bytes) -> AttachAnswer:
@@ -217,7 +225,7 @@ def parse_answer(frame: bytes) -> AttachAnswer:
     start = KEY_SIZE + _ANSWER.size
     if len(frame) < start:
         raise MalformedMessage(f"an attach answer of {len(frame)} bytes is too short")
-    sequence, _, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
+    sequence, options, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
     if latched > BODY_LIMIT or len(frame) != start + latched:
         raise MalformedMessage(f"an attach answer of {len(frame)} bytes cannot hold {latched} bytes")
-    return AttachAnswer(sequence, frame[start:])
+    return AttachAnswer(sequence, frame[start:], bool(options & 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -24,6 +25,8 @@ COMMAND_TOPICS = {
 def convert(source: Path, target: Path) -> tuple[Counter[str], list[str]]:
     """Convert a log of Cortex into a bag, or a bag into a log, whichever the source is.
 
+    What was made of it is removed if it fails or is interrupted.
+
     Returns:
         How many messages of each topic were written, by their names in Cortex, and the topics left out: those
         of types that have no counterpart.
@@ -35,7 +38,13 @@ def convert(source: Path, target: Path) -> tuple[Counter[str], list[str]]:
     """
     with open(source, "rb") if source.is_file() else contextlib.nullcontext() as file:
         is_log = file is not None and file.read(27)[21:] == b"cortex"
-    return log_to_bag(source, target) if is_log else bag_to_log(source, target)
+    made = [path for path in (target, target.with_name(f"{target.stem}.bag")) if not path.exists()]
+    try:
+        return log_to_bag(source, target) if is_log else bag_to_log(source, target)
+    except BaseException:
+        for path in made:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        raise
 
 
 def bag_to_log(source: Path, target: Path) -> tuple[Counter[str], list[str]]:

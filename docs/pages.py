@@ -167,6 +167,13 @@ def python_page() -> str:
     lines += names_of(ns.data)
     lines += ["", "## ns.sensors", "", "What [sensors of your own](../tutorials/own-sensor.md) are made of."]
     lines += names_of(ns.sensors)
+    lines += ["", "## ns.control and ns.sinks", ""]
+    lines += ["What [controllers and sinks of your own](../simulator.md) are made of."]
+    for package in (ns.control, ns.sinks):
+        home = package.__name__
+        for name, value in vars(package).items():
+            if isinstance(value, type) and value.__module__.startswith(home) and name[0] != "_":
+                lines += entry(f"{value.__module__}.{name}", f"{home.replace('neurosim_core', 'ns')}.{name}")
     return "\n".join(lines) + "\n"
 
 

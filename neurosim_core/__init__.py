@@ -11,13 +11,16 @@ from neurosim_core.lazy import lazy_names
 
 if TYPE_CHECKING:  # isort: off
     from neurosim_core import (
+        control as control,
         data as data,
         learn as learn,
         packets as packets,
+        random as random,
         registry as registry,
         scene as scene,
         sensors as sensors,
         sim as sim,
+        sinks as sinks,
         vehicle as vehicle,
     )
     from neurosim_core.config import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -20,9 +20,10 @@ from pydantic import (
 )
 
 from neurosim_core.config_errors import describe_errors, explain, suggestion
-from neurosim_core.control import Se3Config
+from neurosim_core.control import ControllerConfig, Se3ControllerConfig
 from neurosim_core.live.config import LinkConfig, LiveConfig
 from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
+from neurosim_core.live.sink import CortexSinkConfig  # noqa: F401  registers a kind
 from neurosim_core.registry import kinds, on_change
 from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
 from neurosim_core.scene.apartment import ApartmentConfig
@@ -38,6 +39,7 @@ from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
 from neurosim_core.settings import Settings, documentation
+from neurosim_core.sinks import SinkConfig, default_sinks
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
@@ -47,16 +49,8 @@ class ConfigError(ValueError):
     """A settings file or dict is wrong; the message names each key, its value and what is allowed."""
 
 
-class ControlConfig(Settings):
-    """The controller that flies the path."""
-
-    rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
-    """Commands a second [Hz]; each is held until the next."""
-    gains: Se3Config = Se3Config()
-    """Gains and limits of the geometric controller."""
-
-
-def _default_sensors() -> dict[str, SensorConfig]:
+def default_sensors() -> dict[str, SensorConfig]:
+    """Return the sensors of a vehicle whose settings do not say otherwise."""
     return {
         "events": EventSensorConfig(),
         "rgb": RgbSensorConfig(),
@@ -66,8 +60,11 @@ def _default_sensors() -> dict[str, SensorConfig]:
     }
 
 
-_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "renderer": "warp"}
+_DEFAULTS: dict[str, Callable[[], Mapping[str, Any]]] = {"sensors": default_sensors, "sinks": default_sinks}
+"""Groups of named settings that have a default set; KEY+ changes the set or adds to it."""
+_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "control": "se3", "renderer": "warp"}
 """Kinds of settings that do not say which they are."""
+_KEYS = {"controller": "control"}  # of the settings of a seam, where they are not its name
 
 
 def _any_kind(seam: str, *, default: str | None = None) -> Any:
@@ -97,11 +94,15 @@ if TYPE_CHECKING:
     AnySensor = SensorConfig
     AnyScene = SceneConfig
     AnyVehicle = VehicleConfig
+    AnyController = ControllerConfig
+    AnySink = SinkConfig
     AnyRenderer = RendererConfig
 else:
     AnySensor = _any_kind("sensor")
     AnyScene = _any_kind("scene", default=_DEFAULT_KINDS["scene"])
     AnyVehicle = _any_kind("vehicle", default=_DEFAULT_KINDS["vehicle"])
+    AnyController = _any_kind("controller", default=_DEFAULT_KINDS["control"])
+    AnySink = _any_kind("sink")
     AnyRenderer = _any_kind("renderer", default=_DEFAULT_KINDS["renderer"])
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
@@ -117,8 +118,6 @@ _RESERVED = {
     "path": "the planned path",
     "rotor_speeds": "the speeds of the rotors",
 }
-_ADDED = "sensors+"
-"""Key of a settings file for changes of the default set of sensors."""
 _SEED_STRIDE = 0x9E3779B97F4A7C15
 
 
@@ -129,7 +128,7 @@ class FleetMember(Settings):
     """The multirotor; null: the common one."""
     path: PathConfig | None = None
     """Where it flies; null: as the common one, a tour with a seed of its own."""
-    control: ControlConfig | None = None
+    control: AnyController | None = None
     """What flies it; null: as the common one."""
     sensors: Sensors | None = None
     """Its sensors; null: the common ones."""
@@ -166,9 +165,9 @@ class SimulationConfig(Settings):
     path: PathConfig = TourConfig()
     """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
     {kind: poses, file: poses.txt, format: tum} moves the sensors along poses, without a vehicle."""
-    control: ControlConfig = ControlConfig()
-    """What flies it."""
-    sensors: Sensors = Field(default_factory=_default_sensors)
+    control: AnyController = Se3ControllerConfig()
+    """What flies it: `se3`, the geometric controller, or a controller of a plug-in by its kind."""
+    sensors: Sensors = Field(default_factory=default_sensors)
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
     exist, nor does one that is null, as in --set sensors.depth=null. Under the key `sensors+` they change the
     default set or add to it."""
@@ -179,6 +178,9 @@ class SimulationConfig(Settings):
     one, with the settings above."""
     live: LiveConfig = LiveConfig()
     """How `neurosim serve` lets time pass."""
+    sinks: dict[Name, AnySink] = Field(default_factory=default_sinks)
+    """Where packets of `neurosim run` go, by name. Given here, they replace the default set; `sinks+` adds to
+    it: {sinks+: {raw: {kind: event_file, name: events.raw}}}."""
     links: Links = Field(default_factory=dict)
     """Simulated links of `neurosim serve` by what travels on them: the name of a sensor, odometry,
     rotor_speeds or command, such as {command: {latency_s: 0.008}}."""
@@ -257,16 +259,19 @@ class SimulationConfig(Settings):
 
 def _take_new_kinds(seam: str) -> None:
     """Let settings name kinds that were registered after this module was imported."""
-    if seam == "sensor":
+    if seam == "sink":
+        sinks: Any = dict[Name, _any_kind("sink")]  # type: ignore[misc]
+        SimulationConfig.model_fields["sinks"].annotation = sinks
+    elif seam == "sensor":
         sensors: Any = Annotated[dict[Name, _any_kind("sensor")], AfterValidator(expand_stereo)]  # type: ignore[misc]
         SimulationConfig.model_fields["sensors"].annotation = sensors
         FleetMember.model_fields["sensors"].annotation = sensors | None
-    elif seam in _DEFAULT_KINDS:
-        field = SimulationConfig.model_fields[seam]  # which keeps its validator
+    elif (key := _KEYS.get(seam, seam)) in _DEFAULT_KINDS:
+        field = SimulationConfig.model_fields[key]  # which keeps its validator
         field.annotation = functools.reduce(operator.or_, kinds(seam).values())
-        field.discriminator = "kind"
-        if seam in FleetMember.model_fields:
-            FleetMember.model_fields[seam].annotation = _any_kind(seam, default=_DEFAULT_KINDS[seam]) | None
+        field.discriminator = "kind" if len(kinds(seam)) > 1 else None
+        if key in FleetMember.model_fields:
+            FleetMember.model_fields[key].annotation = _any_kind(seam, default=_DEFAULT_KINDS[key]) | None
     else:
         return
     for settings in (FleetMember, SimulationConfig):
@@ -288,15 +293,15 @@ def load_config(
         source: A YAML file, a mapping with the same keys, or None for the defaults. Relative files of the
             scene, the path, bodies and lenses are looked up beside the YAML file.
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
-            another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
-            the default set are changed, and new ones added to it.
+            another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors` or
+            `sinks`, those of the default set are changed, and new ones added to it.
         options: What the user calls a key of `overrides`, such as {"duration_s": "--duration"}: an error
             there is said of it, and so is what lacks or is unknown in a group that only it has made.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the only kind that has
     its keys, else of the default kind.
-    A sensor or body that is null is left out: {"sensors.depth": None}. Sensors under the key `sensors+`
-    change the default set, as overrides do.
+    A sensor, sink or body that is null is left out: {"sensors.depth": None}. What is under the keys
+    `sensors+` and `sinks+` changes the default set, as overrides do.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
@@ -305,20 +310,22 @@ def load_config(
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
     patches = [_nest(key, value) for key, value in (overrides or {}).items()]
-    if _ADDED in raw:
-        if "sensors" in raw:
-            reason = f"give `sensors`, which replace the default set, or `{_ADDED}`, not both"
-            raise ConfigError(f"{origin}: {reason}")
-        patches.insert(0, {"sensors": raw[_ADDED]})
-        raw = {key: value for key, value in raw.items() if key != _ADDED}
-    if "sensors" not in raw and any("sensors" in patch for patch in patches):
-        # of what a preset may say, nothing is said: errors and pixels are ideal anyway
-        raw["sensors"] = {
-            name: {"kind": sensor.kind}
-            if "preset" in type(sensor).model_fields
-            else sensor.model_dump(exclude={"pixel"})
-            for name, sensor in _default_sensors().items()
-        }
+    for group, defaults in _DEFAULTS.items():
+        added = f"{group}+"
+        if added in raw:
+            if group in raw:
+                reason = f"give `{group}`, which replace the default set, or `{added}`, not both"
+                raise ConfigError(f"{origin}: {reason}")
+            patches.insert(0, {group: raw[added]})
+            raw = {key: value for key, value in raw.items() if key != added}
+        if group not in raw and any(group in patch for patch in patches):
+            # of what a preset may say, nothing is said: errors and pixels are ideal anyway
+            raw[group] = {
+                name: {"kind": each.kind}
+                if "preset" in type(each).model_fields
+                else each.model_dump(exclude={"pixel"})
+                for name, each in defaults().items()
+            }
     given = raw
     for patch in patches:
         raw = _merge(raw, patch)
@@ -329,17 +336,6 @@ def load_config(
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
         raise ConfigError(describe_errors(origin, list(_explain(error, raw)), options or {}, given)) from None
-
-
-def absent_sensors(config: SimulationConfig) -> str:
-    """Return one sentence on the sensors of the default set that a configuration leaves out; "" if none."""
-    absent = [name for name in _default_sensors() if name not in config.sensors]
-    if not absent:
-        return ""
-    return (
-        f"Absent of the default sensors: {', '.join(absent)}. `sensors` replaces the default set, "
-        f"`{_ADDED}` adds to it."
-    )
 
 
 def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
@@ -446,8 +442,8 @@ def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _without_nulls(raw: dict[str, Any]) -> dict[str, Any]:
-    """Leave out sensors and bodies that are null."""
-    for key in ("sensors", "bodies"):
+    """Leave out sensors, sinks and bodies that are null."""
+    for key in ("sensors", "sinks", "bodies"):
         if isinstance(raw.get(key), Mapping):
             raw = {**raw, key: {name: item for name, item in raw[key].items() if item is not None}}
     return raw

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from neurosim_core.clock import NS_PER_S
-from neurosim_core.config import absent_sensors
-from neurosim_core.packets import Collision, Odometry, Packet
+from neurosim_core.config import SimulationConfig, default_sensors
+from neurosim_core.packets import Collision, Events, Odometry, Packet
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.render_plan import RenderGroup
@@ -36,8 +36,8 @@ class FlightReport:
     """What of `State.wall_s` had passed by then."""
     flight_s: float = 0.0
     """Wall-clock time of the flight, recording included [s]."""
-    overview_s: float = 0.0
-    """Wall-clock time to draw the overview [s]."""
+    closing_s: float = 0.0
+    """Wall-clock time to complete its files, and to draw the overview [s]."""
     simulated_ns: int = 0
     event_count: int = 0
     packet_counts: dict[str, int] = field(default_factory=dict)
@@ -61,7 +61,9 @@ class FlightReport:
         count = self.packet_counts.get(packet.sensor, 0) + 1
         self.packet_counts[packet.sensor] = count
         self.lost_counts[packet.sensor] = packet.sequence + 1 - count
-        if isinstance(packet, Collision):
+        if isinstance(packet, Events):
+            self.event_count += len(packet)
+        elif isinstance(packet, Collision):
             self.collisions.append(packet)
         elif isinstance(packet, Odometry):
             self.positions.append((packet.stamp_ns, packet.position.copy()))
@@ -145,7 +147,7 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     setup["set-up: kernels, first packet"] = max(0.0, report.setup_s - sum(setup.values()))
     inside = {phase: seconds - report.setup_wall_s.get(phase, 0.0) for phase, seconds in state.wall_s.items()}
     inside["recording and drawing"] = max(0.0, report.flight_s - sum(inside.values()))
-    inside["overview"] = report.overview_s
+    inside["files completed"] = report.closing_s
     rows = [*setup.items(), *inside.items()]
     total = sum(seconds for _, seconds in rows)
     for name, seconds in rows:
@@ -160,6 +162,17 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
         console.print(f"[yellow]interrupted at {simulated_s:.3f} s; what was flown is kept[/]")
     left = ", ".join(sorted(path.name for path in folder.iterdir() if path.is_file()))
     console.print(f"{folder}/: {left}", highlight=False, soft_wrap=True)
+
+
+def absent_sensors(config: SimulationConfig) -> str:
+    """Return one sentence on the sensors of the default set that a configuration leaves out; "" if none."""
+    absent = [name for name in default_sensors() if name not in config.sensors]
+    if not absent:
+        return ""
+    return (
+        f"Absent of the default sensors: {', '.join(absent)}. `sensors` replaces the default set, "
+        "`sensors+` adds to it."
+    )
 
 
 def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:

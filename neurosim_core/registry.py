@@ -23,7 +23,7 @@ from typing import TypeVar
 ENTRY_POINT_GROUP = "neurosim.plugins"
 """Entry points whose modules register what they bring."""
 
-SEAMS = ("sensor", "vehicle", "renderer", "scene", "task")
+SEAMS = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise", "task")
 """What can be registered."""
 
 Registered = TypeVar("Registered", bound=type)

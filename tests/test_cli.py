@@ -93,7 +93,7 @@ def test_the_report_says_what_was_flown(flown):
         row[1]: float(row[2])
         for row in re.finditer(r"(?m)^(\S.*?) +(\d+\.\d\d) +\d+ %", said.split("time went to")[1])
     }
-    assert {"set-up: libraries, settings", "recording and drawing", "overview"} <= spent.keys()
+    assert {"set-up: libraries, settings", "recording and drawing", "files completed"} <= spent.keys()
     assert spent.pop("all") == pytest.approx(
         sum(spent.values()), abs=0.005 * (len(spent) + 5)
     )  # rounded rows

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from neurosim_core.config import ConfigError, SimulationConfig, absent_sensors, load_config, to_yaml
+from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
+from neurosim_core.flight_report import absent_sensors
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.settings import Settings, documentation
 

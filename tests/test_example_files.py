@@ -40,11 +40,22 @@ def test_a_sensor_of_an_outside_package_is_flown_recorded_and_shown(tmp_path):
     assert (tmp_path / "flight.rrd").stat().st_size > 10_000
 
 
+def test_a_sink_of_an_outside_package_writes_poses_beside_the_recording(tmp_path):
+    assert load("own_sink").main(tmp_path) == 101
+    poses = np.loadtxt(tmp_path / "poses.txt")
+    with ns.Recording(tmp_path / "flight.h5") as flight:
+        positions = flight.column("odometry", "position")
+    assert np.abs(poses[:, 1:4] - positions).max() < 1e-9
+    assert (tmp_path / "overview.png").exists()
+
+
 NUMBERS = {
     "first_events": lambda events: events > 10_000,
     "anemometer": lambda wind_m_s: 4.0 < wind_m_s < 5.5,  # the vehicle gives way; white noise of 0.05
     "own_scene": lambda distance_m: distance_m == pytest.approx(3.9, abs=1e-4),  # 4 m less the mount of 0.1 m
     "own_controller": lambda error_m: error_m < 0.01,
+    "noise_term": lambda counts: counts == sorted(counts, reverse=True) and counts[0] > 10 * counts[-1] > 0,
+    "pursuit_controller": lambda errors_m: errors_m[1] < 0.02 < errors_m[0] < 0.2,
     "many_worlds": lambda counts: counts == sorted(counts, reverse=True) and counts[-1] > 1000,
     "training_windows": lambda windows: windows[0] == 10 and windows[1] > 10_000,
     "frames_to_events": lambda events: events == 32 * 48 * 6,

@@ -65,22 +65,23 @@ def test_ci_runs_the_test_command():
 
 
 def test_the_run_command(tmp_path):
-    """The last part of the command, for 1.2 s; what is before it has installed this environment."""
+    """The last part of the command, for 0.3 s; what is before it has installed this environment."""
     command = named("command", "bash")["run"].rsplit("&&", 1)[-1].strip()
     assert command == ".venv/bin/neurosim run"
-    done = shell("neurosim run --duration 1.2", tmp_path)
+    done = shell("neurosim run --duration 0.3", tmp_path)
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "flight").iterdir()} == {
         "config.yaml", "flight.h5", "flight.rrd", "overview.png"
     }  # fmt: skip
-    reading = named("reading", "python")["flight"] + "print(len(events.t), len(rates), len(packets))"
+    reading = named("reading", "python")["flight"].replace("1.0, 1.1", "0.1, 0.2")
+    reading += "print(len(events.t), len(rates), len(packets))"
     read = subprocess.run(
         [sys.executable, "-W", "error", "-c", reading], cwd=tmp_path, capture_output=True, text=True
     )
     assert read.returncode == 0, read.stderr
     events, rates, packets = map(int, read.stdout.split())
     assert events > 1000
-    assert (rates, packets) == (481, 25 + 241)
+    assert (rates, packets) == (121, 7 + 61)
 
 
 EXAMPLES = named("example", "python")
@@ -93,9 +94,15 @@ SETTINGS = named("settings", "yaml", (ROOT / "docs" / "sensors.md").read_text(en
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples(name, tmp_path, monkeypatch, capsys):
-    """Each as a program of its own would run, in this process: it finds nothing of the others."""
+    """Each as a program of its own would run, in this process: it finds nothing of the others.
+
+    Flights of a second end after a fifth of it.
+    """
     monkeypatch.chdir(tmp_path)
-    exec(compile(EXAMPLES[name], name, "exec"), {"__name__": "__main__"})
+    exec(
+        compile(EXAMPLES[name].replace('"duration_s": 1.0', '"duration_s": 0.2'), name, "exec"),
+        {"__name__": "__main__"},
+    )
     count = int(capsys.readouterr().out.splitlines()[-1].split()[0])
     assert count == 5 * 64 * 48 if name == "parts" else count > 1000
 

@@ -54,6 +54,7 @@ class Policy {
     thrust_span_ = numbers(card, "thrust_span").at(0);
     rate_max_rad_s_ = numbers(card, "rate_max_rad_s");
     surfaces_.resize(2 * tau_s_.size() * height_ * width_);
+    added_.resize(surfaces_.size());
     memory_.resize(static_cast<std::size_t>(
         session_.GetInputTypeInfo(2).GetTensorTypeAndShapeInfo().GetElementCount()));
   }
@@ -65,24 +66,29 @@ class Policy {
     action_.fill(0.0f);
   }
 
-  // Lets the surfaces fade for a step: each is a sum of exp(-(now - t) / tau), off and on for each tau.
-  void fade() {
-    const std::size_t plane = height_ * width_;
-    for (std::size_t channel = 0; channel < 2 * tau_s_.size(); ++channel) {
-      const auto share = static_cast<float>(std::exp(-1.0 / (rate_hz_ * tau_s_[channel / 2])));
-      for (std::size_t pixel = 0; pixel < plane; ++pixel) surfaces_[channel * plane + pixel] *= share;
-    }
-  }
-
+  // Surfaces are sums of exp(-(now - t) / tau), off and on for each tau. Those of the events of a step are added in
+  // fixed point and float, as by `neurosim_core/learn/surfaces.py`, so that policies see the same numbers.
   void add(const Events& events, std::int64_t now_ns) {
     if (events.width != width_ || events.height != height_) throw std::runtime_error("events of another camera");
     for (std::size_t event = 0; event < events.t.size(); ++event) {
-      const double age_s = 1e-6 * static_cast<double>(now_ns / 1000 - events.t[event]);
+      const auto age_us = static_cast<float>(now_ns / 1000 - events.t[event]);
       for (std::size_t scale = 0; scale < tau_s_.size(); ++scale) {
         const std::size_t row = (2 * scale + events.polarity[event]) * height_ + events.y[event];
-        surfaces_[row * width_ + events.x[event]] += static_cast<float>(std::exp(-age_s / tau_s_[scale]));
+        const float weight = std::exp(-age_us / static_cast<float>(1e6 * tau_s_[scale]));
+        added_[row * width_ + events.x[event]] += static_cast<std::int32_t>(std::round(weight * one_));
       }
     }
+  }
+
+  // Ends a step: what was seen before fades, and its events are shown.
+  void show() {
+    const std::size_t plane = height_ * width_;
+    for (std::size_t channel = 0; channel < 2 * tau_s_.size(); ++channel) {
+      const auto share = static_cast<float>(std::exp(-1.0 / (rate_hz_ * tau_s_[channel / 2])));
+      for (std::size_t pixel = channel * plane; pixel < (channel + 1) * plane; ++pixel)
+        surfaces_[pixel] = surfaces_[pixel] * share + static_cast<float>(added_[pixel]) / one_;
+    }
+    std::fill(added_.begin(), added_.end(), 0);
   }
 
   RateThrustCommand act(const Odometry& state) {
@@ -127,7 +133,9 @@ class Policy {
   double rate_hz_ = 0.0, hover_thrust_n_ = 0.0, thrust_span_ = 0.0;
   std::vector<double> tau_s_, rate_max_rad_s_;
   std::size_t width_ = 0, height_ = 0;
+  static constexpr float one_ = 65536.0f;
   std::vector<float> surfaces_, memory_;
+  std::vector<std::int32_t> added_;
   std::array<float, 4> action_{};
 };
 
@@ -157,13 +165,13 @@ int main(int argc, char** argv) {
       seen_ns = 0;  // events come with each step but the first
     }
     if (now_ns != last_ns) {  // else it is sent again
-      if (now_ns > 0) policy.fade();
       while (seen_ns < now_ns) {
         const auto events = packets.receive(30s);
         if (!events) throw std::runtime_error("the events of a step have not come");
         seen_ns = (*events)->stamp_ns;
         policy.add(**events, now_ns);
       }
+      policy.show();
       command = policy.act(**state);
       last_ns = now_ns;
     }

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import shutil
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurosim_core.bench.options import Options, Progress, add_option
@@ -117,7 +119,7 @@ def _add(parser: argparse.ArgumentParser, questions: list[Question], folder: str
     folder = folder or questions[0].name
     parser.add_argument("--out", default=folder, metavar="DIR", help=f"where to leave files (./{folder})")
     parser.add_argument("--json", action="store_true", help="print the chapters as JSON, and nothing else")
-    parser.add_argument("--resume", action="store_true", help="keep chapters that are already in --out")
+    parser.add_argument("--resume", action="store_true", help="keep what is already in --out")
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if a claim is missed")
     for option in dict.fromkeys(option for question in questions for option in ("quick", *question.options)):
         if option == "settings":
@@ -149,6 +151,7 @@ def _bench(questions: Sequence[Question], arguments: argparse.Namespace) -> int:
                     chapter, status = _failed(question, error, console), 1
                 chapters.append(chapter)
                 write_report(chapters, arguments.out, console)
+                shutil.rmtree(_stages(question, arguments), ignore_errors=True)
         except KeyboardInterrupt:
             status = 130
     if arguments.json:
@@ -158,6 +161,10 @@ def _bench(questions: Sequence[Question], arguments: argparse.Namespace) -> int:
     said = f"claims: {missed} missed, {met} met, {unknown} not measured here"
     console.print(said, style="bold red" if missed else None)
     return status or int(arguments.strict and missed > 0)
+
+
+def _stages(question: Question, arguments: argparse.Namespace) -> Path:
+    return Path(arguments.out) / f"{question.name}-stages"
 
 
 def _answer(question: Question, arguments: argparse.Namespace, console: Console, prefix: str) -> Chapter:
@@ -172,13 +179,16 @@ def _answer(question: Question, arguments: argparse.Namespace, console: Console,
     given = {name: getattr(arguments, name) for name in ("quick", *question.options)}
     if "settings" in given:
         given["settings"] = read_settings(given["settings"])
+    stages = _stages(question, arguments)
+    if not arguments.resume:
+        shutil.rmtree(stages, ignore_errors=True)
     facts, begin_s = describe_machine(), time.monotonic()
     with console.status(f"{prefix}{question.name}") as line:
 
         def tell(what: str) -> None:
             line.update(f"{prefix}{question.name}, {time.monotonic() - begin_s:.0f} s: {what}")
 
-        chapter = question.measure(Options(**given), tell)
+        chapter = question.measure(Options(**given, stages=stages), tell)
     facts["took"] = f"{time.monotonic() - begin_s:.0f} s"
     chapter = replace(chapter, facts=facts)
     if not arguments.json:

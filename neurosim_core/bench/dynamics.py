@@ -48,16 +48,14 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     quick = options.quick
     samples: list[Row] = []
     peers: list[Row] = []
-    for name, make in FLIGHTS.items():
+    for name in FLIGHTS:
         progress(name)
-        flight = make()
-        known = make_reference(flight, cross_check=name in ("rotor step", "flip") and not quick)
-        samples += _sweep(flight, known, quick)
-        if not quick or name in ("rotor step", "figure eight"):
-            peers += _peers(flight, known)
+        of_flight, of_peers = options.stage(name, partial(_precise, name, quick))
+        samples += of_flight
+        peers += of_peers
     lagging = {tau_s: partial(short_flight, "hummingbird", motor_time_constant_s=tau_s) for tau_s in MOTORS_S}
-    motors = _hard({f"{tau_s:g} s": (make, False) for tau_s, make in lagging.items()}, quick, progress)
-    extremes = _hard(EXTREMES, quick, progress)
+    motors = _hard({f"{tau_s:g} s": (make, False) for tau_s, make in lagging.items()}, options, progress)
+    extremes = _hard(EXTREMES, options, progress)
     claims = [
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
         _hard_claim("any motor time constant", motors, 1e-8),
@@ -149,6 +147,14 @@ def _ours(flight: Flight, name: str, method: str, setting: float, known: Referen
     return _row(name, method, setting, states, known, **measured)
 
 
+def _precise(name: str, quick: bool) -> tuple[list[Row], list[Row]]:
+    """Fly one of `FLIGHTS` with every method and setting, and as RotorPy is called from Python."""
+    flight = FLIGHTS[name]()
+    known = make_reference(flight, cross_check=name in ("rotor step", "flip") and not quick)
+    peers = not quick or name in ("rotor step", "figure eight")
+    return _sweep(flight, known, quick), _peers(flight, known) if peers else []
+
+
 def _sweep(flight: Flight, known: Reference, quick: bool) -> list[Row]:
     """Fly a flight with every method and setting."""
     settings = [(RKMK4, step_s) for step_s in (STEPS_S[:5] if quick else STEPS_S)]
@@ -172,25 +178,29 @@ def _peers(flight: Flight, known: Reference) -> list[Row]:
 
 
 def _hard(
-    cases: Mapping[str, tuple[Callable[[], Flight], bool]], quick: bool, progress: Progress
+    cases: Mapping[str, tuple[Callable[[], Flight], bool]], options: Options, progress: Progress
 ) -> list[Row]:
     """Fly stiff and extreme flights by all methods, at 1 ms or rtol 1e-6; what is refused says why."""
     rows: list[Row] = []
     for name, (make, stiff) in cases.items():
         progress(name)
-        try:
-            flight = make()
-        except ValueError as error:
-            why = next(line for line in str(error).splitlines() if "Value error" in line)
-            rows.append({"flight": name, "method": RKMK4, "outcome": f"refused: {why.strip()}"})
-            continue
-        known = make_reference(flight, stiff=stiff)
-        for method, setting in ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6)):
-            rows.append(_ours(flight, name, method, setting, known, 1))
-        if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
-            states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
-            outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"
-            rows.append(_row(name, ROTORPY, 1e-3, states, known, outcome=outcome))
+        rows += options.stage(name, partial(_hard_case, name, make, stiff, options.quick))
+    return rows
+
+
+def _hard_case(name: str, make: Callable[[], Flight], stiff: bool, quick: bool) -> list[Row]:
+    try:
+        flight = make()
+    except ValueError as error:
+        why = next(line for line in str(error).splitlines() if "Value error" in line)
+        return [{"flight": name, "method": RKMK4, "outcome": f"refused: {why.strip()}"}]
+    known = make_reference(flight, stiff=stiff)
+    methods = ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6))
+    rows = [_ours(flight, name, method, setting, known, 1) for method, setting in methods]
+    if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
+        states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
+        outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"
+        rows.append(_row(name, ROTORPY, 1e-3, states, known, outcome=outcome))
     return rows
 
 

@@ -108,7 +108,8 @@ def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
                 return np.asarray(held + (first - held) * np.nan_to_num(np.exp(-t * decay_rate)))
 
         def rate(t: float, y: Array, rotor_speed: Any = rotor_speed) -> Array:
-            return equations.rate(y, rotor_speed(t))
+            with np.errstate(over="ignore", invalid="ignore"):  # of steps that the solver tries and refuses
+                return equations.rate(y, rotor_speed(t))
 
         solution = solve_ivp(
             rate, (0.0, _HOLD_S), y, method=solver, t_eval=[_HOLD_S], rtol=rtol, atol=0.1 * rtol,

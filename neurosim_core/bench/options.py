@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 Progress: TypeAlias = Callable[[str], None]
 """Is told what is measured next."""
@@ -91,6 +93,32 @@ class Options:
     )
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Further settings by dotted key."""
+    stages: Path | None = None
+    """Folder of what has been measured before the chapter is complete; None: it is not kept."""
+
+    def stage(self, name: str, measure: Callable[[], Any]) -> Any:
+        """Return what a stage of a question finds, or what an interrupted run with these options left of it.
+
+        Args:
+            name: Differs from those of the question's other stages.
+            measure: Returns something that JSON has, or numbers of NumPy.
+        """
+        if self.stages is None:
+            return measure()
+        file, asked = (
+            self.stages / f"{quote(name, safe=' ')}.json",
+            repr(dataclasses.replace(self, stages=None)),
+        )
+        if file.exists():
+            options, found = json.loads(file.read_text(encoding="utf-8"))
+            if options == asked:
+                return found
+        found = measure()
+        self.stages.mkdir(parents=True, exist_ok=True)
+        written = file.with_suffix(".tmp")
+        written.write_text(json.dumps([asked, found], default=lambda number: number.item()), encoding="utf-8")
+        written.replace(file)
+        return found
 
 
 def add_option(parser: argparse.ArgumentParser, name: str) -> None:

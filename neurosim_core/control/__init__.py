@@ -1,6 +1,13 @@
 """Control: geometric tracking on SE(3) in six command modes, for one vehicle or thousands."""
 
+from neurosim_core.control.config import (
+    ControllerConfig,
+    ControllerContext,
+    PathController,
+    Se3ControllerConfig,
+)
 from neurosim_core.control.follow import FollowMode, PathFollower
+from neurosim_core.control.host_controller import HostController
 from neurosim_core.control.modes import MODES, CommandMode, Controller, Mode, make_controller, mode_kernel
 from neurosim_core.control.se3 import Se3Config
 
@@ -8,10 +15,15 @@ __all__ = [
     "MODES",
     "CommandMode",
     "Controller",
+    "ControllerConfig",
+    "ControllerContext",
     "FollowMode",
+    "HostController",
     "Mode",
+    "PathController",
     "PathFollower",
     "Se3Config",
+    "Se3ControllerConfig",
     "make_controller",
     "mode_kernel",
 ]

@@ -11,7 +11,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.control.modes import Controller, make_controller
+from neurosim_core.control.config import (
+    ControllerConfig,
+    ControllerContext,
+    PathController,
+    Se3ControllerConfig,
+)
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
@@ -24,13 +29,12 @@ FollowMode = Literal["motor_speeds", "velocity", "position"]
 class PathFollower:
     """Keeps one vehicle on its path: a command for each state, in microseconds.
 
-    motor_speeds: the geometric controller with all derivatives of the path; the bits are those of
-    `make_controller("path", ..., device="cpu")`.
+    motor_speeds: what the controller of the settings commands; the bits are those of a flight in one process.
     velocity: velocity and yaw rate of the path, and what brings the vehicle back to it, limited by
     `correction_speed_max_m_s`.
     position: position and yaw of the path. The vehicle lags behind a moving setpoint.
 
-    It has no memory, so a reset is nothing special. Not for several threads at once.
+    A state before the last one begins a new episode. Not for several threads at once.
 
     Attributes:
         path: What is followed.
@@ -44,7 +48,20 @@ class PathFollower:
         gains: Se3Config | None = None,
         *,
         mode: FollowMode = "motor_speeds",
+        controller: ControllerConfig | None = None,
     ) -> None:
+        """Make the controller.
+
+        Args:
+            path: What is followed.
+            airframe: What the vehicle is taken for.
+            gains: Of the geometric controller, and for corrections in mode velocity.
+            mode: What is commanded.
+            controller: What flies in mode motor_speeds; None: the geometric controller.
+
+        Raises:
+            ValueError: There is no such mode.
+        """
         if mode not in get_args(FollowMode):
             raise ValueError(f"unknown mode {mode!r}, known: {', '.join(get_args(FollowMode))}")
         self.path = path
@@ -52,13 +69,15 @@ class PathFollower:
         self._gains = gains or Se3Config()
         self._cursor = PathCursor(path)
         self._feedback = _Feedback(airframe.rotor_count)
-        self._controller = (
-            make_controller("path", airframe, self._gains, device="cpu", paths=path)
-            if mode == "motor_speeds"
-            else None
-        )
-        if self._controller is not None:
+        self._controller: PathController | None = None
+        self._all = wp.ones(1, dtype=wp.int32, device="cpu")
+        if mode == "motor_speeds":
+            settings = controller or Se3ControllerConfig(gains=self._gains)
+            context = ControllerContext(airframe=airframe, paths=[path], device="cpu")
+            self._controller = settings.make(context)
+            self._feedback.host_orientation[0, 3] = 1.0
             self._controller.update(self._feedback)  # compiled here rather than at the first command
+            self._controller.begin(self._all)
 
     def command(
         self,
@@ -98,7 +117,7 @@ class PathFollower:
 
     def _motor_speeds(
         self,
-        controller: Controller,
+        controller: PathController,
         stamp_ns: int,
         position: ArrayLike,
         velocity: ArrayLike,
@@ -112,7 +131,10 @@ class PathFollower:
         state.host_orientation[0] = orientation
         state.host_body_rate[0] = body_rate
         state.host_rotor_speed[0] = rotor_speed
-        state.host_stamp_ns[0] = operator.index(stamp_ns)
+        stamp_ns = operator.index(stamp_ns)
+        if stamp_ns < state.host_stamp_ns[0]:
+            controller.begin(self._all)
+        state.host_stamp_ns[0] = stamp_ns
         controller.update(state)
         return np.array(state.host_rotor_speed_command[0])
 

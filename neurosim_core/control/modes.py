@@ -304,6 +304,9 @@ class Controller:
             self._bound = (arrays, self._record(arrays))
         self._bound[1].launch()
 
+    def begin(self, mask: Any) -> None:
+        """Nothing is remembered."""
+
     def set(self, setpoint: ArrayLike) -> None:
         """Write all setpoints from the host.
 

@@ -31,8 +31,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this one")
     parser.add_argument(
         "--ray",
+        nargs="?",
+        const="auto",
         metavar="ADDRESS",
-        help="fly on a Ray cluster: local, auto, or host:port; --workers at a time",
+        help="fly on a Ray cluster: local, host:port, or auto (the default); --workers at a time",
     )
     parser.add_argument(
         "--flights-per-scene", type=int, default=10, metavar="N", help="flights in one generated scene"

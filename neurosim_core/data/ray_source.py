@@ -51,7 +51,13 @@ def cluster(address: str) -> Iterator[Any]:
         yield ray
         return
     options = {"include_dashboard": False} if address == "local" else {}
-    ray.init(address=address, log_to_driver=False, **options)
+    try:
+        ray.init(address=address, log_to_driver=False, **options)
+    except ConnectionError as error:
+        where = "on this machine (`ray start --head` begins one)" if address == "auto" else f"at {address}"
+        raise ConnectionError(
+            f"there is no Ray cluster {where}; `local` is one for this time only"
+        ) from error
     try:
         yield ray
     finally:

@@ -44,6 +44,11 @@ def add_parsers(commands: _Commands) -> None:
     learn.add_argument(
         "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
+    learn.add_argument(
+        "--surface",
+        choices=("leaky", "time", "counts", "voxels"),
+        help="how the student sees events (default: as the task says)",
+    )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="train with N seeds from --seed on; with --ray"
@@ -53,16 +58,19 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument(
         "--ray",
+        nargs="?",
+        const="auto",
         metavar="ADDRESS",
-        help="a Ray cluster (local, auto, host:port): one training for each of --seeds; depth, flow: the "
-        "flights of --live",
+        help="a Ray cluster (local, host:port; auto, the default: one that runs here): one training for each "
+        "of --seeds; depth, flow: the flights of --live",
     )
     learn.add_argument("--wandb", action="store_true", help="send what TensorBoard gets to Weights & Biases")
     learn.add_argument(
         "--algorithm",
         choices=("dagger", "ppo"),
         default="dagger",
-        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher",
+        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher "
+        "(rate: how fast that is, too)",
     )
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
     learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
@@ -167,12 +175,13 @@ def _learn(arguments: argparse.Namespace) -> int:
     config = _changed(
         config,
         pixels=arguments.pixels,
+        surface=arguments.surface,
         randomise=arguments.randomise,
         wandb=arguments.wandb,
         student=_changed(config.student, worlds=arguments.worlds, iterations=arguments.student_iterations),
         teacher=_changed(config.teacher, iterations=arguments.teacher_iterations),
     )
-    changes = ("worlds", "pixels", "teacher_iterations", "student_iterations", "randomise")
+    changes = ("worlds", "pixels", "surface", "teacher_iterations", "student_iterations", "randomise")
     changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
     if arguments.resume and changed:
         raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
@@ -209,10 +218,12 @@ def _changed(settings: Any, **given: Any) -> Any:
 
 
 def _measure_rate(arguments: argparse.Namespace) -> int:
-    """Print steps a second of a task, with one and two renders in each, and what endings cost."""
+    """Print steps a second of a task, with one and two renders in each, and what endings (and PPO) cost."""
     from neurosim_core.learn.env import find_task, make_env
-    from neurosim_core.learn.rate import measure_steps
+    from neurosim_core.learn.rate import measure_steps, measure_updates
+    from neurosim_core.learn.train import prepare_torch
 
+    prepare_torch()
     where: dict[str, Any] = {}
     for renders in (1, 2):
         task = find_task(str(arguments.run or "hover"))
@@ -232,6 +243,9 @@ def _measure_rate(arguments: argparse.Namespace) -> int:
             f"steps_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f}; {renders} renders a step, {env.device})"
         )
         print(f"step_with_endings {rate / ended:.3f} (1 % of the worlds, or one, in each step)", flush=True)
+        if arguments.algorithm == "ppo":
+            rate, least, most = measure_updates(env)
+            print(f"steps_with_updates_per_s {rate:.0f} 1/s ({least:.0f} to {most:.0f})", flush=True)
     return 0
 
 
@@ -283,7 +297,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.train import evaluate_run
 
-    film = arguments.run / f"{Path(arguments.scenes).stem}.webp"
+    speed = "" if arguments.speed is None else f"-{arguments.speed:g}m_s"
+    film = arguments.run / f"{Path(arguments.scenes).stem}{speed}.webp"
     for name, evaluation in evaluate_run(
         arguments.run,
         scenes=arguments.scenes,

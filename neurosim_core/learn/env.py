@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import torch
 import warp as wp
 
 from neurosim_core.learn.actions import COMMANDS, hover_command
+from neurosim_core.learn.cameras import CameraDraws, draw_lenses
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
@@ -22,7 +23,7 @@ from neurosim_core.learn.episodes import (
     make_routes,
     probe,
 )
-from neurosim_core.learn.snapshot import Place, find_state
+from neurosim_core.learn.snapshot import put_state, state_of
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import Observations, Task, View
 from neurosim_core.registry import find
@@ -88,7 +89,8 @@ class Env:
         sim: The simulator.
         view: What the task sees.
         observation: What all sensors yielded last. Events are there until episodes begin anew, which on CUDA
-            is asked for in each step: read them in `Task.advance`.
+            is asked for in each step: read them in `Task.advance` or `watch`.
+        watch: Called in each step before episodes begin anew, and before the task sees it; None: nobody.
         episode_steps: Steps after which an episode is truncated.
         action_count: Numbers in an action, each in [-1, 1].
         episode_length: Steps since each episode began, int32, shape [N].
@@ -119,12 +121,15 @@ class Env:
         self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
         if randomise is False:
             self.randomisation = NO_RANDOMISATION
+        lenses, lens_table = draw_lenses(task.camera, self.randomisation)
         self.sim = Simulation(
             _settings(task, device, sees, sensors or {}, wind=self.randomisation.wind_m_s > 0.0),
             worlds=worlds,
             seeds=seed,
             event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
             sorted=False,
+            lenses={CAMERA: lenses} if sees and lenses else None,
+            own_light=sees and self.randomisation.light_factor != (1.0, 1.0),
             **({"scenes": scenes} if models is None else {"models": models}),
         )
         self.num_envs, self.action_count = worlds, 4
@@ -148,6 +153,9 @@ class Env:
         self._thresholds: torch.Tensor | None = None
         if sees and self.randomisation.threshold_factor != (1.0, 1.0):
             self._thresholds = wp.to_torch(self.sim.thresholds(CAMERA))
+        self._cameras: CameraDraws | None = None
+        if sees and self.randomisation.cameras_differ:
+            self._cameras = CameraDraws(self.sim, CAMERA, self.randomisation, lens_table)
         if sees:
             self._surface = EventSurface(
                 task.surface if surface is None else surface,
@@ -176,6 +184,7 @@ class Env:
         self._thrown = torch.zeros((worlds, len(task.bodies), 6), dtype=torch.float64, device=self.device)
         self._status: torch.Tensor | None = None
         self._started = False
+        self.watch: Callable[[], None] | None = None
 
     @property
     def obs_groups(self) -> Mapping[str, Sequence[str]]:
@@ -197,6 +206,8 @@ class Env:
         if self._surface is not None:
             thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
             found["threshold_factor"] = thresholds / self.task.threshold
+        if self._cameras is not None:
+            found |= self._cameras.parameters()
         return found
 
     @property
@@ -225,19 +236,24 @@ class Env:
         """
         return _named(observations, self.task.hint, "observation")
 
-    def reset(self, *, seed: int | None = None, spread: bool = False) -> tuple[Observations, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, spread: bool = False, episodes: torch.Tensor | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode in all worlds.
 
         Args:
             seed: New seed of world 0 (of world i: seed + i), from which all episodes follow; None: go on.
             spread: Let these first episodes be cut at different times, so that worlds do not end together.
+            episodes: Play these again, what `step` returned as `seed`, int64, [N]; others follow from them.
         """
         if seed is not None or not self._started:
             self._episodes.seed(self._seed if seed is None else seed)
+        if episodes is not None:
+            self._seeds.copy_(episodes)
         self._started = True
         self._mask.fill_(True)
         self._queue_place = 0
-        self._begin(everywhere=True)
+        self._begin(everywhere=True, again=episodes is not None)
         if spread:
             self.episode_length.copy_(self.view.draws[:, 0] * self.episode_steps)
         return self._observations(), {}
@@ -264,6 +280,8 @@ class Env:
         self.episode_length += 1
         torch.mul(self.episode_length, view.step_s, out=view.elapsed_s)
         task = self.task
+        if self.watch is not None:
+            self.watch()
         task.advance(view)
         reward = task.reward(view)
         terminated = task.terminated(view) | view.crashed
@@ -289,7 +307,7 @@ class Env:
         Raises:
             ValueError: A sensor remembers what is not in it: noise of event cameras, automatic exposure.
         """
-        found = self._find_state()
+        found = state_of(self)
         return {path: v.clone() if isinstance(v, torch.Tensor) else v for path, _, _, v in found}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Observations:
@@ -303,39 +321,17 @@ class Env:
         """
         self.reset()
         self.step(torch.zeros_like(self.view.action))  # some arrays are made only when they are needed
-        found = self._find_state()
-        here, there = (
-            {path: getattr(value, "shape", None) for path, value in rows}
-            for rows in ([(path, value) for path, _, _, value in found], state.items())
-        )
-        if here != there:
-            path = min(path for path, _ in here.items() ^ there.items())
-            raise ValueError(f"the state is of another kind of environment: they differ in {path}")
-        for path, owner, name, value in found:
-            if isinstance(value, torch.Tensor):
-                value.copy_(state[path])
-            else:
-                setattr(owner, name, state[path])
+        put_state(state_of(self), state)
         wp.synchronize_device(self.sim.device)
         return self._observations()
-
-    def _find_state(self) -> list[Place]:
-        cameras = [pair for group in self.sim._state.groups for pair in group.world_frames.items()]
-        sensors = self.sim.model.config.sensors
-        forgetful = [name for name, sensor in sensors.items() if getattr(sensor, "remembers", False)]
-        forgetful += [name for name, camera in cameras if camera.terms]
-        if forgetful:
-            raise ValueError(f"{', '.join(forgetful)}: noise and automatic exposure cannot be saved")
-        wp.synchronize_device(self.sim.device)
-        return list(find_state(self))
 
     def close(self) -> None:
         """Nothing to close: memory is freed with the object."""
 
-    def _begin(self, *, everywhere: bool) -> None:
+    def _begin(self, *, everywhere: bool, again: bool = False) -> None:
         """Begin episodes in the worlds of the mask."""
         episodes, view = self._episodes, self.view
-        episodes.begin(self._mask_array)
+        episodes.begin(self._mask_array, again=again)
         if self.task.bodies:
             self._throw()
         drawn, mask = self.randomisation, self._mask[:, None]
@@ -345,6 +341,8 @@ class Env:
             self._thresholds.copy_(torch.where(mask, chosen, self._thresholds))
         if drawn.airframes_differ:
             episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
+        if self._cameras is not None:
+            self._cameras.vary(self._mask_array, episodes.seeds)
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )

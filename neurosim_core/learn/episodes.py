@@ -43,7 +43,8 @@ PARAMETERS = {"mass_factor": 0, "inertia_factor": 1, "drag_factor": 2, "wind_m_s
 """Columns of what differs between the airframes of worlds; of the wind x and y in W."""
 
 _POINT_COUNT = 4096
-_EPISODE = wp.constant(wp.uint32(stream_id("learn/episode")))
+EPISODE = wp.constant(wp.uint32(stream_id("learn/episode")))
+"""Stream of random numbers of what episodes draw."""
 _NOISE = wp.constant(wp.uint32(stream_id("learn/noise")))
 
 
@@ -82,6 +83,19 @@ class Randomisation:
     """Range of the inertia besides."""
     drag_factor: tuple[float, float] = (1.0, 1.0)
     """Range of rotor drag and parasitic drag."""
+    mount_m: float = 0.0
+    """Largest displacement of the event camera along each axis of B [m]."""
+    mount_rad: float = 0.0
+    """Largest part of its turn on the body about each axis of B, a rotation vector [rad]."""
+    focal_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of its focal length against that of its lens. Episodes share `cameras.LENS_COUNT` lenses."""
+    axis_shift: float = 0.0
+    """Largest shift of its optical axis along rows and along columns, as a share of the width."""
+    distortion: tuple[float, float] = (0.0, 0.0)
+    """Range of what is added to k1 of its lens: barrels are below 0."""
+    light_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of all light, even in its logarithm: event cameras see it against `render.dark_floor`. The noise
+    of their pixels does not follow it."""
     wind_m_s: float = 0.0
     """Strongest wind, level and constant in an episode [m/s]; if > 0, in place of the vehicle's."""
     gyro_bias_rad_s: float = 0.0
@@ -96,6 +110,13 @@ class Randomisation:
         """Mass, inertia, drag or wind are drawn."""
         factors = self.mass_factor, self.inertia_factor, self.drag_factor
         return self.wind_m_s > 0.0 or any(factor != (1.0, 1.0) for factor in factors)
+
+    @property
+    def cameras_differ(self) -> bool:
+        """Mount or lens of the event camera or the light are drawn."""
+        factors = self.focal_factor, self.light_factor
+        ranges = self.mount_m, self.mount_rad, self.axis_shift, *self.distortion
+        return any(ranges) or any(factor != (1.0, 1.0) for factor in factors)
 
 
 NO_RANDOMISATION = Randomisation(
@@ -117,7 +138,8 @@ class _Start:
 
 
 @wp.func
-def _signed(u: wp.vec4) -> wp.vec4:
+def signed(u: wp.vec4) -> wp.vec4:
+    """Return numbers of [0, 1) in [-1, 1)."""
     return u * 2.0 - wp.vec4(1.0, 1.0, 1.0, 1.0)
 
 
@@ -130,6 +152,7 @@ def _begin(
     start: _Start,
     # In:
     mask: wp.array[wp.bool],
+    again: wp.bool,
     # In/out:
     seeds: wp.array[wp.uint64],
     # Out:
@@ -143,13 +166,15 @@ def _begin(
     world = wp.tid()
     if not mask[world]:
         return
-    mixed = random_bits(seeds[world], _EPISODE, wp.int64(0), 0)
-    seed = (wp.uint64(mixed[0]) << wp.uint64(32)) | wp.uint64(mixed[1])
+    seed = seeds[world]
+    if not again:
+        mixed = random_bits(seed, EPISODE, wp.int64(0), 0)
+        seed = (wp.uint64(mixed[0]) << wp.uint64(32)) | wp.uint64(mixed[1])
     seeds[world] = seed
     scene = scene_of_world[world]
-    a = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 0))
-    b = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 1))
-    c = _signed(uniform4(random_bits(seed, _EPISODE, wp.int64(1), 2)))
+    a = uniform4(random_bits(seed, EPISODE, wp.int64(1), 0))
+    b = uniform4(random_bits(seed, EPISODE, wp.int64(1), 1))
+    c = signed(uniform4(random_bits(seed, EPISODE, wp.int64(1), 2)))
     index = wp.min(int(a[0] * float(points.shape[1])), points.shape[1] - 1)
     point = points[scene, index]
     goal = goals[scene, index]
@@ -175,7 +200,7 @@ def _begin(
         orientation_out[world, part] = wp.float64(q[part])
     goal_out[world] = goal
     for block in range(DRAW_COUNT // 4):
-        u = uniform4(random_bits(seed, _EPISODE, wp.int64(3), block))
+        u = uniform4(random_bits(seed, EPISODE, wp.int64(3), block))
         for part in range(4):
             draws_out[world, 4 * block + part] = u[part]
 
@@ -214,7 +239,7 @@ def _look(
     stamp = clock_ns[world]
     n = normal4(random_bits(seeds[world], _NOISE, stamp, 0))
     m = normal4(random_bits(seeds[world], _NOISE, stamp, 1))
-    b = gyro_bias * _signed(uniform4(random_bits(seeds[world], _EPISODE, wp.int64(6), 0)))
+    b = gyro_bias * signed(uniform4(random_bits(seeds[world], EPISODE, wp.int64(6), 0)))
     _write(rows_out, world, 0, p)
     _write(rows_out, world, 3, v)
     for part in range(4):
@@ -237,7 +262,8 @@ class _Ranges:
 
 
 @wp.func
-def _within(bounds: wp.vec2, u: wp.float32) -> wp.float32:
+def within(bounds: wp.vec2, u: wp.float32) -> wp.float32:
+    """Return a number of [0, 1) within bounds."""
     return bounds[0] + (bounds[1] - bounds[0]) * u
 
 
@@ -256,11 +282,11 @@ def _vary_airframes(
     world = wp.tid()
     if not mask[world]:
         return
-    u = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(5), 0))
-    mass = _within(ranges.mass, u[0])
-    inertia = _within(ranges.inertia, u[1])
-    drag = _within(ranges.drag, u[2])
-    around = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(5), 1))
+    u = uniform4(random_bits(seeds[world], EPISODE, wp.int64(5), 0))
+    mass = within(ranges.mass, u[0])
+    inertia = within(ranges.inertia, u[1])
+    drag = within(ranges.drag, u[2])
+    around = uniform4(random_bits(seeds[world], EPISODE, wp.int64(5), 1))
     speed = ranges.wind_max * u[3]
     wind = speed * wp.vec2(wp.cos(2.0 * wp.PI * around[0]), wp.sin(2.0 * wp.PI * around[0]))
     airframe = nominal[0]
@@ -377,12 +403,12 @@ class Episodes:
         """Let world i go on from seed + i."""
         self.seeds.assign(np.arange(len(self.seeds), dtype=np.uint64) + np.uint64(seed))
 
-    def begin(self, mask: Any) -> None:
-        """Draw the next episode of the worlds of a mask, device array of bool, shape [N]."""
+    def begin(self, mask: Any, *, again: bool = False) -> None:
+        """Draw the next episode of the worlds of a mask, device array of bool, [N]; or the same again."""
         wp.launch(
             _begin,
             dim=len(self.seeds),
-            inputs=[*self._routes, self._scene_of_world, self._start, mask, self.seeds],
+            inputs=[*self._routes, self._scene_of_world, self._start, mask, again, self.seeds],
             outputs=[*self.start.values(), self.goal, self.draws],
             device=self._device,
         )

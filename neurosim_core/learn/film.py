@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 from neurosim_core.flight import saved_flight
 from neurosim_core.learn.env import CAMERA, Env
 from neurosim_core.learn.evaluate import EPISODE_SEED, Actor
-from neurosim_core.learn.task import Task, View
+from neurosim_core.learn.task import Task
 from neurosim_core.packets import Events, Image, Odometry, Packet
 
 _HEIGHT_PX = 220
@@ -43,16 +44,10 @@ def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED
         ValueError: The file is neither.
         OSError: It cannot be written.
     """
-    advance = env.task.advance
     with saved_flight(file, env.sim.model) as write:
-
-        def film(view: View) -> None:
-            _write(env, write)  # before episodes begin anew, which leaves no events
-            advance(view)
-
         observations, _ = env.reset(seed=seed)
         _write(env, write)
-        env.task.advance = film  # type: ignore[method-assign]
+        env.watch = partial(_write, env, write)
         begun = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         try:
             for _ in range(env.episode_steps):
@@ -61,7 +56,7 @@ def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED
                 if begun[0]:
                     break
         finally:
-            env.task.advance = advance  # type: ignore[method-assign]
+            env.watch = None
 
 
 def _write(env: Env, write: Callable[[Packet], None]) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -11,18 +11,53 @@ import warp as wp
 
 from neurosim_core.learn.task import Task
 
-_COUNTERS = {"_now_ns", "_stamp_ns", "launched_ns", "launched_count", "parity", "_queue_place", "_started"}
 _LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
     "_scenes", "_model", "_routes", "_timetable", "_observations", "observation", "_status", "buffers",
     "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_pose_launches", "_hosts",
 }  # fmt: skip
 
 Place = tuple[str, Any, str, Any]
-"""A path, who is there, its attribute, and what that is: memory as a tensor, or a number."""
+"""A path, who is there, its attribute, and what that is: memory as a tensor, or a whole number."""
+
+
+def state_of(env: Any) -> list[Place]:
+    """Return all that a step of an environment may change, as it is now.
+
+    Raises:
+        ValueError: A sensor remembers what cannot be saved.
+    """
+    cameras = [pair for group in env.sim._state.groups for pair in group.world_frames.items()]
+    sensors = env.sim.model.config.sensors
+    forgetful = [name for name, sensor in sensors.items() if getattr(sensor, "remembers", False)]
+    forgetful += [name for name, camera in cameras if camera.terms]
+    if forgetful:
+        raise ValueError(f"{', '.join(forgetful)}: noise and automatic exposure cannot be saved")
+    wp.synchronize_device(env.sim.device)
+    return list(find_state(env))
+
+
+def put_state(places: list[Place], state: Mapping[str, Any]) -> None:
+    """Put a state in the place of what there is.
+
+    Raises:
+        ValueError: It is of an environment that was made otherwise.
+    """
+    here, there = (
+        {path: getattr(value, "shape", None) for path, value in rows}
+        for rows in ([(path, value) for path, _, _, value in places], state.items())
+    )
+    if here != there:
+        path = min(path for path, _ in here.items() ^ there.items())
+        raise ValueError(f"the state is of another kind of environment: they differ in {path}")
+    for path, owner, name, value in places:
+        if isinstance(value, torch.Tensor):
+            value.copy_(state[path])
+        elif value != state[path]:
+            setattr(owner, name, state[path])
 
 
 def find_state(owner: Any, path: str = "", seen: set[Any] | None = None) -> Iterator[Place]:
-    """Yield all that a step changes of an object and of what it holds, memory once."""
+    """Yield all that a step may change of an object and of what it holds: numbers, and memory once."""
     seen = set() if seen is None else seen
     if id(owner) in seen:
         return
@@ -38,7 +73,7 @@ def find_state(owner: Any, path: str = "", seen: set[Any] | None = None) -> Iter
             if memory.numel() and key not in seen:
                 seen.add(key)
                 yield place, owner, name, memory
-        elif name in _COUNTERS:
+        elif isinstance(value, int) and hasattr(owner, "__dict__") and not hasattr(owner, "_ctype"):
             yield place, owner, name, value
         elif isinstance(value, dict | list | tuple | Task) or _is_own(value):
             yield from find_state(value, place, seen)

@@ -9,7 +9,7 @@ numbers, so that the order in which threads add does not change a bit.
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import warp as wp
@@ -121,6 +121,22 @@ class VoxelGrid(_Shown):
 
 SurfaceConfig = TimeSurface | LeakySurface | Counts | VoxelGrid
 """What a surface shows."""
+
+SURFACES: dict[str, type[SurfaceConfig]] = {
+    "leaky": LeakySurface,
+    "time": TimeSurface,
+    "counts": Counts,
+    "voxels": VoxelGrid,
+}
+"""Kinds of surfaces by their name on the command line."""
+
+
+def surface_like(kind: str, surface: SurfaceConfig) -> SurfaceConfig:
+    """Return a surface of a kind of `SURFACES`, with the time constants of another one if both have some."""
+    made = SURFACES[kind]()
+    if isinstance(made, TimeSurface | LeakySurface) and isinstance(surface, TimeSurface | LeakySurface):
+        return replace(made, tau_s=surface.tau_s)
+    return made
 
 
 def _check_tau(tau_s: tuple[float, ...]) -> None:

@@ -30,7 +30,7 @@ from neurosim_core.learn.film import film_episode, film_sensors
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
-from neurosim_core.learn.surfaces import LeakySurface, TimeSurface
+from neurosim_core.learn.surfaces import SURFACES, LeakySurface, TimeSurface, surface_like
 from neurosim_core.learn.task import Task
 from neurosim_core.sim.model import Model, find_device
 
@@ -38,6 +38,8 @@ Say = Callable[[str], None]
 Trainer = Ppo | Dagger | RecurrentPpo
 
 _BLOCK = 60
+_TELL_S = 15.0
+"""So often is said how far a block has come."""
 _RANDOMISE = ("training", "tests", "none")
 _SEEDS_APART = 1 << 20
 
@@ -56,6 +58,8 @@ class TrainConfig:
     """Width and height of the event camera [px]; None: as the task says."""
     rate_hz: float | None = None
     """Steps a second; time constants of surfaces are stretched with the step. None: as the task says."""
+    surface: str | None = None
+    """Kind of the event surfaces (`surfaces.SURFACES`); None: as the task says."""
     randomise: str = "training"
     """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
     learn, or nothing (`none`)."""
@@ -68,10 +72,14 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
             raise ValueError(f"unknown randomise {self.randomise!r}, known: {', '.join(_RANDOMISE)}")
+        if self.surface not in (None, *SURFACES):
+            raise ValueError(f"unknown surface {self.surface!r}, known: {', '.join(SURFACES)}")
 
     def make_task(self) -> Task:
         """Return the task, with the steps of this training."""
         task = find_task(self.task)
+        if self.surface is not None:
+            task.surface = surface_like(self.surface, task.surface)
         if self.rate_hz is not None:
             stretch, task.rate_hz = task.rate_hz / self.rate_hz, self.rate_hz
             if isinstance(task.surface, LeakySurface | TimeSurface):
@@ -208,20 +216,23 @@ class Training:
         trainer.begin(seed)
         end = min(done + self.config.block, whole)
         sums: dict[str, list[float]] = {}
+        told_s = begin_s
         for iteration in range(done, end):
             log = trainer.iterate(iteration / whole)
             for name, value in log.items():
                 if writer is not None:
                     writer.add_scalar(f"{stage}/{name}", value, iteration)
                 sums.setdefault(name, []).append(value)
+            if time.monotonic() - told_s > _TELL_S and iteration + 1 < end:
+                told_s = time.monotonic()
+                self._say(f"{stage} {iteration + 1}/{whole}: {_means(sums)}")
         self._done[stage] = end
         if ranks.rank() == 0:
             self._save()
         self.trained_s[stage] = self.trained_s.get(stage, 0.0) + time.monotonic() - begin_s
         self.processor_s += _processor_s() - processor_s
-        means = ", ".join(f"{name} {sum(v) / len(v):.3g}" for name, v in sums.items())
         times = f"{self.trained_s[stage]:.0f} s, {self.processor_s:.0f} s of processor time in all"
-        self._say(f"{stage} {end}/{whole} ({times}): {means}")
+        self._say(f"{stage} {end}/{whole} ({times}): {_means(sums)}")
 
     def _save(self) -> None:
         file = self.folder / "checkpoint.pt"
@@ -413,6 +424,7 @@ def train(
         raise ImportError("--wandb needs the package wandb: pip install wandb")
     if ranks.rank() > 0:
         say = _say_nothing
+    say("set-up: scenes and kernels")
     training = Training(folder, config, say=say)
     if resume:
         training.resume()
@@ -455,6 +467,10 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
 
 def _say_nothing(line: str) -> None:
     """Leave it to the first process."""
+
+
+def _means(sums: Mapping[str, Sequence[float]]) -> str:
+    return ", ".join(f"{name} {sum(values) / len(values):.3g}" for name, values in sums.items())
 
 
 def _processor_s() -> float:

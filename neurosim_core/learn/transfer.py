@@ -12,7 +12,7 @@ import torch
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.evaluate import Actor, Evaluation, evaluate_policy, student_actor
 from neurosim_core.learn.surfaces import LeakySurface
-from neurosim_core.learn.task import Observations, Task, View
+from neurosim_core.learn.task import Observations, Task
 from neurosim_core.learn.train import load_student, read_config
 
 _NOISY_WORLDS = 128
@@ -38,6 +38,11 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "three tenths of the actions lost": {"late": 0.3},
     "a tenth of the event packets lost": {"lost": 0.1},
     "three tenths of the event packets lost": {"lost": 0.3},
+    "camera turned by up to 0.05 rad about each axis": {"drawn": {"mount_rad": 0.05}},
+    "light 0.01 to 0.1 times": {"drawn": {"light_factor": (0.01, 0.1)}},
+    "lenses 0.9 to 1.1 times as long, k1 up to 0.05": {
+        "drawn": {"focal_factor": (0.9, 1.1), "distortion": (-0.05, 0.05)}
+    },
 }
 """What differs from the tests of a task, by name; periods of 50 Hz stay whole nanoseconds."""
 
@@ -97,18 +102,17 @@ def _lose_events(env: Env, share: float) -> None:
     decay = torch.exp(-1.0 / (task.rate_hz * tau_s))[:, None, None]
     generator = torch.Generator(device=env.device).manual_seed(0)
     before: list[torch.Tensor] = []
-    advance = task.advance
+    view = env.view
 
-    def lose(view: View) -> None:
+    def lose() -> None:
         assert view.surface is not None
         if before:
             lost = torch.rand((env.num_envs, 1, 1, 1), generator=generator, device=env.device) < share
             lost &= (env.episode_length > 1)[:, None, None, None]
             view.surface.copy_(torch.where(lost, before.pop() * decay, view.surface))
         before[:] = [view.surface.clone()]
-        advance(view)
 
-    task.advance = lose  # type: ignore[method-assign]
+    env.watch = lose
 
 
 def _changed(task: Task, changes: Mapping[str, Any]) -> Task:

@@ -242,7 +242,9 @@ class _Fleet:
             controller = PathController(
                 self._node,
                 name,
-                PathFollower(path, airframe, vehicle.control.gains, mode=self.mode),
+                PathFollower(
+                    path, airframe, vehicle.control.gains, mode=self.mode, controller=vehicle.control
+                ),
                 lockstep=lockstep,
                 rotor_speed=np.full(airframe.rotor_count, airframe.hover_rotor_speed_rad_s),
                 delay_s=self._delay_s,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import logging
 import threading
 import time
 from collections import deque
@@ -17,8 +18,10 @@ from neurosim_core.flight import header_of, new_folder
 from neurosim_core.install import install_hint
 from neurosim_core.live.links import payload_bytes
 from neurosim_core.packets import Packet
-from neurosim_core.record import RecordingWriter
 from neurosim_core.sim import Model
+from neurosim_core.sinks import SinkConfig, Sinks
+
+_logger = logging.getLogger(__name__)
 
 QUEUE_BYTES = 16_000_000
 """Most that waits to be written [bytes]: gzip writes it in 0.2 s."""
@@ -49,7 +52,7 @@ class _Entry(NamedTuple):
     """A packet that waits to be written."""
 
     run: int
-    file: str
+    stem: str
     config: SimulationConfig
     """The settings that held when the file began."""
     vehicle: str
@@ -59,8 +62,8 @@ class _Entry(NamedTuple):
 class Recorder:
     """Writes what the vehicles measure to flight.h5, and after a reset to flight-2.h5, ...
 
-    `write` waits for a slow disk, so that nothing is lost. When the run is stopped, packets that are not
-    written by a deadline are counted.
+    Further sinks of the settings get the same packets. `write` waits for a slow disk, so that nothing is
+    lost. When the run is stopped, packets that are not written by a deadline are counted.
 
     Attributes:
         stop: Set when the run is to end soon.
@@ -75,10 +78,11 @@ class Recorder:
 
         Raises:
             OSError: A folder cannot be written to.
-            ImportError: h5py is not installed.
+            ImportError: h5py, or what another sink needs, is not installed.
         """
-        if importlib.util.find_spec("h5py") is None:
-            raise ImportError(f"h5py is not installed: {install_hint('record')}")
+        for sink in (sink for model in models.values() for sink in _live_sinks(model).values()):
+            if sink.library is not None and importlib.util.find_spec(sink.library[0]) is None:
+                raise ImportError(f"{sink.library[0]} is not installed: {install_hint(sink.library[1])}")
         for name, folder in folders.items():
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "config.yaml").write_text(to_yaml(models[name].config, comments=True), "utf-8")
@@ -101,8 +105,12 @@ class Recorder:
         self._thread.start()
 
     @property
+    def _stem(self) -> str:
+        return "flight" if self._file_count <= 1 else f"flight-{self._file_count}"
+
+    @property
     def _file(self) -> str:
-        return "flight.h5" if self._file_count <= 1 else f"flight-{self._file_count}.h5"
+        return f"{self._stem}.h5"
 
     def begin(self, seeds: Mapping[str, int], *, replace: bool) -> None:
         """Begin a new file for each vehicle with its next packet.
@@ -154,7 +162,7 @@ class Recorder:
                 self._changed.wait(0.05)
             self._check()
             first = self._first_configs[vehicle]
-            self._queue.append(_Entry(self._run_count, self._file, first, vehicle, packet))
+            self._queue.append(_Entry(self._run_count, self._stem, first, vehicle, packet))
             self._queue_bytes += payload_bytes(packet)
             self._changed.notify_all()
 
@@ -189,7 +197,7 @@ class Recorder:
     def _run(self) -> None:
         try:
             with contextlib.ExitStack() as files:
-                writers: dict[str, tuple[int, RecordingWriter]] = {}
+                writers: dict[str, tuple[int, Sinks]] = {}
                 while (entry := self._next()) is not None:
                     run, writer = writers.get(entry.vehicle, (0, None))
                     if writer is None or run != entry.run:
@@ -217,13 +225,24 @@ class Recorder:
             self._changed.notify_all()
             return entry
 
-    def _open(self, entry: _Entry) -> RecordingWriter:
-        header = header_of(self._models[entry.vehicle], entry.config)
-        return RecordingWriter(self._folders[entry.vehicle] / entry.file, header)
+    def _open(self, entry: _Entry) -> Sinks:
+        model = self._models[entry.vehicle]
+        return Sinks(
+            _live_sinks(model),
+            say=_logger.warning,
+            folder=self._folders[entry.vehicle],
+            stem=entry.stem,
+            model=model,
+            header=header_of(model, entry.config),
+        )
 
     def _write_changes(self, vehicle: str) -> None:
         text = "".join(json.dumps(change) + "\n" for change in self._changes[vehicle])
         (self._folders[vehicle] / SETTINGS).write_text(text, "utf-8")
+
+
+def _live_sinks(model: Model) -> dict[str, SinkConfig]:
+    return {name: sink for name, sink in model.config.sinks.items() if sink.is_live}
 
 
 def _items(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

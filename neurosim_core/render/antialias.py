@@ -284,6 +284,21 @@ def _pixel_caster(terms: RenderTerms) -> Any:
     return wp.func_native(code)(cast_pixels)
 
 
+@wp.func_native(read_native(__file__, "write_log"))
+def _write_log(
+    scene: SceneData,
+    radiance: wp.array[wp.vec3],
+    instant: int,
+    top: int,
+    left: int,
+    rows: int,
+    columns: int,
+    log_radiance_out: wp.array3d[float],
+):
+    """Write the log radiance of 4 x 4 pixels; on a CPU only."""
+    ...
+
+
 def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
@@ -349,6 +364,9 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
                 unresolved,
                 radiance,
             )
+        if place.slot < 0:
+            _write_log(scene, radiance, instant, top, left, rows, columns, out.log_radiance)
+            return
         for y in range(rows):
             for x in range(columns):
                 write_radiance(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)

@@ -66,20 +66,18 @@ class BlindPixels:
     def __init__(
         self,
         lenses: Sequence[Lens],
-        lens_of_world: Sequence[int],
+        lens_of_world: Any,
         *,
         stride: int,
         dark_floor: float,
-        device: str,
     ) -> None:
         """Bring them to the device.
 
         Args:
             lenses: All of one size.
-            lens_of_world: Index of the lens of each world, shape [N].
+            lens_of_world: Index of the lens of each world, device array of int32, shape [N].
             stride: K, the most instants of a world per launch.
             dark_floor: Radiance before the logarithm where there is no light.
-            device: Where pictures are.
         """
         masks = [lens.blind_pixels() for lens in lenses]
         found = [np.zeros((0, 2), int) if mask is None else np.argwhere(mask) for mask in masks]
@@ -88,10 +86,9 @@ class BlindPixels:
         rows = np.full((len(found), self.count, 2), -1, dtype=np.int32)
         for row, pixels in zip(rows, found, strict=True):
             row[: len(pixels)] = pixels
-        self._device = device
-        self._lens_of_world: Any = wp.array(list(lens_of_world), dtype=int, device=device)
-        places: Any = wp.array(rows, dtype=wp.vec2i, device=device)
-        self._model = [places, self._lens_of_world, stride, float(np.log(dark_floor))]
+        self._lens_of_world = lens_of_world
+        places: Any = wp.array(rows, dtype=wp.vec2i, device=lens_of_world.device)
+        self._model = [places, lens_of_world, stride, float(np.log(dark_floor))]
 
     def darken(self, image_slot: Any, out: RenderOutputs, *, instant_count: int) -> None:
         """Write what a pixel is that sees nothing: black, infinitely far, no surface.
@@ -104,4 +101,5 @@ class BlindPixels:
         if self.count:
             dim = self._lens_of_world.shape[0] * instant_count * self.count
             inputs = [*self._model, instant_count, image_slot]
-            launch_split(_darken_pixels, dim=dim, inputs=inputs, outputs=[out], device=self._device)
+            device = self._lens_of_world.device
+            launch_split(_darken_pixels, dim=dim, inputs=inputs, outputs=[out], device=device)

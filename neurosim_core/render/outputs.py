@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,assignment,return-value"
+# mypy: disable-error-code="index,attr-defined,assignment,return-value,empty-body"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """Render outputs: their arrays, and the functions that write a pixel of them."""
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from neurosim_core.native_code import read_native
 from neurosim_core.render.ray_intersection import Hit
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
@@ -148,6 +149,10 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
     return write_geometry
 
 
+@wp.func_native(read_native(__file__, "log_of", BINARY=False))
+def _natural_log(x: float) -> float: ...
+
+
 @cache
 def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Function:
     """Return the function that writes the light of a pixel, that of it which is in `outputs`.
@@ -171,7 +176,7 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
             radiance = (1.0 / float(layer_count - 1)) * radiance
         if wp.static("log_radiance" in outputs):
             luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
-            out.log_radiance[instant, row, col] = wp.log(luma + scene.dark_floor)
+            out.log_radiance[instant, row, col] = _natural_log(luma + scene.dark_floor)
         if wp.static("radiance" in outputs):
             if slot >= 0:
                 out.radiance[slot, row, col] = scene.exposure * radiance

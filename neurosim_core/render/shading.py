@@ -22,6 +22,10 @@ _COSINE_MIN = wp.constant(0.05)
 _OFFSET_M = wp.constant(1.0e-3)
 
 
+@wp.func_native(read_native(__file__, "log_of", BINARY=True))
+def _binary_log(x: float) -> float: ...
+
+
 @cache
 def pixel_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that says what light a pixel receives along a ray.
@@ -226,7 +230,7 @@ def albedo_reader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
                     albedo = wp.cw_mul(albedo, sample_finest(scene.texels, scene.levels, texture, uv))
                 else:
                     footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
-                    lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
+                    lod = _binary_log(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
                     if wp.static(beyond):
                         apart = APART * spread_rad * wp.clamp(lod + 1.0, 0.0, 1.0)
                         away = apart * slope[0] * (scene.corner_uv[corner] - scene.corner_uv[corner + 2])

@@ -46,14 +46,12 @@ class RenderWorlds:
     """Number of worlds N."""
     lenses: Sequence[Lens] = ()
     """The lenses there are, all of one size; empty: every world has the lens of the renderer."""
-    lens_of_world: Sequence[int] = ()
-    """Index into `lenses` of each world, shape [N]."""
+    lens_of_world: Any = None
+    """Index into `lenses` of each world, device array of int32, shape [N]; may change between renders."""
     scenes: Any = None
     """All scenes, device array of `SceneData`; None: every world is in the scene of the renderer."""
     scene_of_world: Any = None
     """Index into `scenes` of each world, device array of int32, shape [N]."""
-    arrays: Sequence[SceneArrays] = ()
-    """The scenes that `scene_of_world` counts; empty: that of the renderer."""
     terms: RenderTerms | None = None
     """What some scene needs in the kernel; None: as the scene of the renderer says."""
 
@@ -191,10 +189,9 @@ class WarpRenderer:
         self._render_outputs = make_render_outputs(**arrays_of, face=allocate(FACE, instants, int))
         self._blind = BlindPixels(
             lenses,
-            worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
+            worlds.lens_of_world if worlds.lenses else wp.zeros(worlds.count, dtype=int, device=device),
             stride=instant_count,
             dark_floor=arrays.config.dark_floor,
-            device=str(device),
         )
 
     def render(
@@ -311,7 +308,7 @@ class WarpRenderer:
         if worlds.scenes is not None:
             data.scenes, data.scene = worlds.scenes, worlds.scene_of_world
         if len(worlds.lenses) > 1:
-            data.lens = wp.array(list(worlds.lens_of_world), dtype=int, device=self._arrays.device)
+            data.lens = worlds.lens_of_world
         return data
 
     def _make_candidates(

@@ -223,8 +223,8 @@ class PictureContext:
     """The same for all outputs that the sensor asks for, by name."""
     lenses: Sequence[Lens]
     """The lenses there are, all of one size."""
-    lens_of_world: Sequence[int]
-    """Index into them of each world, shape [N]."""
+    lens_of_world: Any
+    """Index into them of each world, device array of int32, shape [N]."""
     scenes: Sequence[Any]
     """The scenes as the renderer has them."""
     scene_of_world: Any

@@ -10,9 +10,11 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
+from neurosim_core.registry import register
 from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.sensors.event_terms import NoiseTermConfig, parse_terms
 from neurosim_core.settings import Settings, fill_from_preset
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -20,9 +22,12 @@ Rate = Annotated[float, Field(ge=0.0, le=1e6)]
 Decades = Annotated[float, Field(ge=0.0, le=2.0)]
 
 
-class ThresholdSpreadConfig(Settings):
+@register("noise", "threshold_spread")
+class ThresholdSpreadConfig(NoiseTermConfig):
     """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
 
+    compiled = ("spread",)
+
     sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     """Standard deviation of the threshold upwards, in log radiance."""
     sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
@@ -31,9 +36,12 @@ class ThresholdSpreadConfig(Settings):
     """Smaller thresholds are raised to this one."""
 
 
-class ThresholdJitterConfig(Settings):
+@register("noise", "threshold_jitter")
+class ThresholdJitterConfig(NoiseTermConfig):
     """Thresholds that are drawn anew after each event, around those of the pixel, as in ESIM."""
 
+    compiled = ("jitter",)
+
     sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     """Standard deviation of the threshold upwards, in log radiance."""
     sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
@@ -42,23 +50,34 @@ class ThresholdJitterConfig(Settings):
     """Smaller thresholds are raised to this one."""
 
 
-class LinLogConfig(Settings):
+@register("noise", "lin_log")
+class LinLogConfig(NoiseTermConfig):
     """A logarithm that becomes a line in the dark, as in v2e, where 8-bit pictures have no more steps.
 
     With DN the radiance in units of white_radiance / 255, the pixel sees ln(DN) above `linear_below`, here D,
     and DN ln(D) / D below.
     """
 
+    compiled = ("lin_log",)
+
     linear_below: Annotated[float, Field(gt=1.0, le=255.0)] = 20.0
     """Light at which the logarithm begins [white / 255]."""
 
+    def numbers(self, white_radiance: float) -> tuple[float, ...]:
+        """Return radiance where the logarithm begins, its logarithm, and log radiance over that light."""
+        begin = white_radiance * self.linear_below / 255.0
+        return begin, math.log(begin), math.log(self.linear_below)
 
-class LowPassConfig(Settings):
+
+@register("noise", "low_pass")
+class LowPassConfig(NoiseTermConfig):
     """The photoreceptor: first order, the slower the darker.
 
     With I the radiance at the pixel, I_w that of white and I_d what the dark current stands for, the 3 dB
     frequency is cutoff_hz min((I + I_d) / (I_w + I_d), 1).
     """
+
+    compiled = ("low_pass",)
 
     cutoff_hz: Annotated[float, Field(gt=0.0, le=1e12)] = 3000.0
     """3 dB frequency at `white_radiance` [Hz]; above it the bias limits it, and it grows no more."""
@@ -66,8 +85,11 @@ class LowPassConfig(Settings):
     """Radiance that the dark current is worth: it keeps the time constant of a black pixel finite."""
 
 
-class LeakConfig(Settings):
+@register("noise", "leak")
+class LeakConfig(NoiseTermConfig):
     """Leak of the reset switch: the reference falls, so that a still pixel fires ON events steadily."""
+
+    compiled = ("leak",)
 
     rate_hz: Annotated[float, Field(ge=0.0, le=1e4)] = 0.1
     """Events a second and pixel in a still scene, in the dark [Hz]."""
@@ -76,9 +98,16 @@ class LeakConfig(Settings):
     bright_factor: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
     """Factor on the rate at `white_radiance`; light leaks through the switch, so that it grows linearly."""
 
+    def terms(self) -> tuple[str, ...]:
+        """Return the names of what is compiled in."""
+        return self.compiled if self.bright_factor == 1.0 else (*self.compiled, "light_leak")
 
-class ShotNoiseConfig(Settings):
+
+@register("noise", "shot_noise")
+class ShotNoiseConfig(NoiseTermConfig):
     """Events without cause, a Poisson process in each pixel; fewer where it is bright."""
+
+    compiled = ("spontaneous",)
 
     rate_hz: Rate = 1.0
     """Events a second and pixel in the dark, of both polarities together [Hz]."""
@@ -105,12 +134,15 @@ class NoiseLevelConfig(Settings):
     """Standard deviation of the common logarithm of the rates; a pixel has one rank in all lights."""
 
 
-class MeasuredNoiseConfig(Settings):
+@register("noise", "measured_noise")
+class MeasuredNoiseConfig(NoiseTermConfig):
     """Events without cause at rates that were measured in several lights, for each polarity.
 
     Each pixel is a Poisson process. Between two lights rates are linear in the logarithm of light, beyond
     them they stay. They come from `levels`, or each pixel takes those of a random pixel in `file`.
     """
+
+    compiled = ("spontaneous", "measured")
 
     white_lux: Annotated[float, Field(ge=1e-3, le=1e7)] = 1000.0
     """Illuminance that `white_radiance` stands for [lux]."""
@@ -130,8 +162,11 @@ class MeasuredNoiseConfig(Settings):
         return self
 
 
-class HotPixelConfig(Settings):
+@register("noise", "hot_pixels")
+class HotPixelConfig(NoiseTermConfig):
     """A few pixels that fire all the time, at random."""
+
+    compiled = ("spontaneous",)
 
     fraction: Share = 1e-4
     """Share of hot pixels; which ones is drawn once."""
@@ -141,7 +176,8 @@ class HotPixelConfig(Settings):
     """Share of ON events."""
 
 
-class StochasticConfig(Settings):
+@register("noise", "stochastic")
+class StochasticConfig(NoiseTermConfig):
     """DVS-Voltmeter: the voltage of a pixel is a Brownian motion with drift, events are first passages.
 
     With L the radiance in units of white_radiance / 255, at most 1000 times white, the voltage moves with
@@ -155,6 +191,8 @@ class StochasticConfig(Settings):
     vision sensors, ECCV, eq. (10) and (11), where d/dt ln(L + k2) is taken between frames; its published code
     has the parameters.
     """
+
+    compiled = ("stochastic",)
 
     k1: Annotated[float, Field(ge=0.0, le=1e4)]
     """Events per e-fold of light; its inverse is the threshold."""
@@ -223,16 +261,9 @@ def describe_pixel(pixel: EventCameraConfig) -> str:
         parts.append(f"steps of about {1.0 / pixel.stochastic.k1:.3g}" if pixel.stochastic.k1 else "no steps")
     else:
         parts.append(f"thresholds {pixel.threshold_on:g} on, {pixel.threshold_off:g} off")
-    groups = (
-        "threshold_spread",
-        "low_pass",
-        "leak",
-        "shot_noise",
-        "measured_noise",
-        "hot_pixels",
-        "stochastic",
-    )
-    present = [name for name in (*groups, "readout") if getattr(pixel, name) is not None]
+    groups = {name: getattr(pixel, name) for name in type(pixel).model_fields}
+    present = [name for name, group in groups.items() if isinstance(group, NoiseTermConfig | ReadoutConfig)]
+    present += [term for each in pixel.noise for term in each.terms()]
     if pixel.refractory_s > 0.0:
         present.append("refractory_s")
     return ", ".join([*parts, *(present or ["ideal"])])
@@ -281,6 +312,8 @@ class EventCameraConfig(Settings):
     stochastic: StochasticConfig | None = None
     """Brownian motion in place of thresholds, DVS-Voltmeter: {k1: .., .. k6: .., random_phase: true}; instead
     of low_pass, leak and noise. null: thresholds."""
+    noise: Annotated[tuple[SerializeAsAny[NoiseTermConfig], ...], BeforeValidator(parse_terms)] = ()
+    """Terms of other packages, by kind: [{kind: flicker, depth: 0.1}]; each kind once."""
     readout: ReadoutConfig | None = None
     """Arbiter with limited bandwidth: {kind: event or row, bandwidth_hz: 12e6, row_s: 0, queue_length:
     65536}; null: all events at once."""
@@ -303,6 +336,9 @@ class EventCameraConfig(Settings):
             for name in ("threshold_jitter", "lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} must be null where stochastic is given, which has its own")
+        kinds = [term for each in self.noise for term in each.terms()]
+        if len(set(kinds)) < len(kinds):
+            raise ValueError(f"noise must have each kind once, got {', '.join(kinds)}")
         if self.shot_noise is not None and self.measured_noise is not None:
             raise ValueError("give shot_noise or measured_noise, not both")
         return self

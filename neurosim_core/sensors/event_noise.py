@@ -19,7 +19,8 @@ import warp as wp
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.sensors.event_config import EventCameraConfig, MeasuredNoiseConfig
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
-from neurosim_core.sensors.event_noise_pixel import begin_pixel
+from neurosim_core.sensors.event_noise_pixel import signal_terms
+from neurosim_core.sensors.event_terms import SignalTerm
 
 wp.set_module_options({"enable_backward": False})
 
@@ -118,21 +119,6 @@ def _draw_measured(
     rate_out[pixel] = wp.vec2d(most, rate_out[pixel][1])
 
 
-@wp.kernel
-def _begin(
-    # Model:
-    model: PixelModel,
-    phase_stream: wp.uint32,
-    random_phase: wp.bool,
-    # In:
-    base: wp.array[wp.float32],
-    # Out:
-    memory_out: Memory,
-) -> None:
-    pixel = wp.tid()
-    begin_pixel(model, phase_stream, random_phase, base, pixel, memory_out)
-
-
 def mix_seed(seed: int, stamp_ns: int) -> int:
     """Return a seed of 64 bits that differs for each stamp (finaliser of SplitMix64, Steele et al. 2014)."""
     mixed = (seed + 0x9E3779B97F4A7C15 * (stamp_ns + 1)) % 2**64
@@ -209,17 +195,6 @@ class PixelNoise:
         self.thresholds = self._model.thresholds
         self._reset_ns = 0
 
-    def reset(self, base: wp.array[wp.float32], stamp_ns: int) -> None:
-        """Begin anew in slot 0 of the ring, at what the pixels see at a stamp, shape [pixel]."""
-        self.set_reset(stamp_ns)
-        wp.launch(
-            _begin,
-            dim=self._pixel_count,
-            inputs=[self._model, *self.phase(), base],
-            outputs=[self._ring[0]],
-            device=self._device,
-        )
-
     def set_reset(self, stamp_ns: int) -> None:
         """Let the noise that follows be that after a reset at a stamp."""
         self._reset_ns = stamp_ns
@@ -274,10 +249,7 @@ class PixelNoise:
         model.refractory_ns = 1e9 * config.refractory_s
         if (jitter := config.threshold_jitter) is not None:
             model.jitter, model.jitter_least = wp.vec2d(jitter.sigma_on, jitter.sigma_off), jitter.minimum
-        if config.lin_log is not None and self._has("lin_log"):
-            model.linear_below = config.white_radiance * config.lin_log.linear_below / 255.0
-            model.linear_level = math.log(model.linear_below)
-            model.linear_slope = math.log(config.lin_log.linear_below)
+        model.signals = self._make_signals()
         if config.low_pass is not None:
             model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
             model.dark_radiance = config.low_pass.dark_radiance
@@ -320,6 +292,20 @@ class PixelNoise:
                 device=self._device,
             )
         return model
+
+    def _make_signals(self) -> Any:
+        """Return what changes what pixels see; terms without settings have numbers 0."""
+        config = self._config
+        given = {term: each for each in config.noise for term in each.terms()} | {"lin_log": config.lin_log}
+        terms = []
+        for name, _ in signal_terms(self.terms):
+            term = SignalTerm()
+            settings = given.get(name)
+            numbers = () if settings is None else settings.numbers(config.white_radiance)
+            term.numbers = wp.vec4d(*numbers, *[0.0] * (4 - len(numbers)))
+            term.seed, term.stream = self._seed, self._stream(name)
+            terms.append(term)
+        return wp.array(terms, dtype=SignalTerm, device=self._device)
 
     def _draw(self, kernel: Any, out: Any, *parameters: Any) -> Any:
         if out.shape[0] > 0:

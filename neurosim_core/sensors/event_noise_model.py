@@ -39,6 +39,7 @@ Schucany, Haas (1976), Generating random variates using transformations with mul
 import warp as wp
 
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_terms import NoiseTermConfig, SignalTerm
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +47,7 @@ TERMS = (
     "spread", "jitter", "lin_log", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured",
     "stochastic",
 )  # fmt: skip
-"""All terms that may be compiled in."""
+"""All terms of our own that may be compiled in; those of other packages have the names of their kinds."""
 CAUSE = "cause"
 """A further term: the column of an event is eight times the column plus its cause."""
 CAUSES = ("signal", "leak", "shot noise", "hot pixel", "threshold noise")
@@ -65,9 +66,7 @@ class PixelModel:
     jitter: wp.vec2d  # standard deviations ON, OFF
     jitter_least: wp.float64
     refractory_ns: wp.float64
-    linear_below: wp.float64  # radiance; 0: logarithmic everywhere
-    linear_level: wp.float64  # its logarithm
-    linear_slope: wp.float64  # log radiance seen over that light
+    signals: wp.array[SignalTerm]  # what changes what pixels see, in the order of `signals_of`
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64
     bright_factor: wp.float64
@@ -117,18 +116,9 @@ class Memory:
 
 def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
     """Return the terms that a configuration asks for; none: the pixels are ideal."""
-    present = {
-        "spread": config.threshold_spread is not None,
-        "jitter": config.threshold_jitter is not None,
-        "lin_log": config.lin_log is not None,
-        "low_pass": config.low_pass is not None,
-        "refractory": config.refractory_s > 0.0,
-        "leak": config.leak is not None,
-        "light_leak": config.leak is not None and config.leak.bright_factor != 1.0,
-        "spontaneous": any(
-            noise is not None for noise in (config.shot_noise, config.measured_noise, config.hot_pixels)
-        ),
-        "measured": config.measured_noise is not None,
-        "stochastic": config.stochastic is not None,
-    }
-    return tuple(term for term, asked in present.items() if asked)
+    groups = [getattr(config, name) for name in type(config).model_fields]
+    terms = [each for each in (*groups, *config.noise) if isinstance(each, NoiseTermConfig)]
+    present = {name for term in terms for name in term.terms()}
+    if config.refractory_s > 0.0:
+        present.add("refractory")
+    return (*(term for term in TERMS if term in present), *sorted(present - set(TERMS)))

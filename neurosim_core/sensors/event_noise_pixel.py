@@ -1,14 +1,20 @@
 # mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var"
+# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var,no-untyped-def"
 """One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
 """
 
+import functools
+from collections.abc import Iterable
+from typing import Any
+
 import warp as wp
 
 from neurosim_core.random import normal2, random_bits, uniform2
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+from neurosim_core.registry import find
+from neurosim_core.sensors.event_noise_model import CAUSE, TERMS, Memory, PixelModel
+from neurosim_core.sensors.event_terms import SignalTerm
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,14 +55,40 @@ def jittered(model: PixelModel, index: wp.int32, state: NoisyPixel) -> NoisyPixe
 
 
 @wp.func
-def see(model: PixelModel, log_radiance: wp.float32) -> wp.float32:
+def _linear_in_the_dark(
+    term: SignalTerm, seed: wp.uint64, pixel: wp.int32, since_reset_ns: wp.int64, log_radiance: wp.float64
+) -> wp.float64:
     """Return what a pixel sees of log radiance: a line below some light, with the same value there."""
-    if model.linear_below > _ZERO:
-        radiance = wp.exp(wp.float64(log_radiance))
-        if radiance < model.linear_below:
-            rise = model.linear_slope * (radiance / model.linear_below - _ONE)
-            return wp.float32(model.linear_level + rise)
+    if term.numbers[0] > _ZERO:
+        radiance = wp.exp(log_radiance)
+        if radiance < term.numbers[0]:
+            rise = term.numbers[2] * (radiance / term.numbers[0] - _ONE)
+            return wp.float64(wp.float32(term.numbers[1] + rise))
     return log_radiance
+
+
+def signal_terms(terms: Iterable[str]) -> tuple[tuple[str, Any], ...]:
+    """Return the name and the device function of each term that changes what pixels see, in their order."""
+    others = sorted(set(terms) - {*TERMS, CAUSE})
+    first = [("lin_log", _linear_in_the_dark)] if "lin_log" in terms else []
+    return (*first, *((name, find("noise", name).signal) for name in others))
+
+
+@functools.cache
+def make_see(signals: tuple[tuple[str, Any], ...]) -> Any:
+    """Return the function from log radiance to what pixels with some `signal_terms` see."""
+    functions = tuple(function for _, function in signals)
+
+    @wp.func
+    def see(
+        model: PixelModel, pixel: wp.int32, since_reset_ns: wp.int64, log_radiance: wp.float32
+    ) -> wp.float64:
+        seen = wp.float64(log_radiance)
+        for index in range(wp.static(len(functions))):
+            seen = wp.static(functions[index])(model.signals[index], model.seed, pixel, since_reset_ns, seen)
+        return seen
+
+    return see
 
 
 @wp.func
@@ -145,12 +177,11 @@ def begin_pixel(
     model: PixelModel,
     phase_stream: wp.uint32,
     random_phase: wp.bool,
-    base: wp.array[wp.float32],
+    value: wp.float64,
     pixel: wp.int32,
     memory_out: Memory,
 ) -> None:
     """Let a pixel begin anew at what it sees now."""
-    value = wp.float64(see(model, base[pixel]))
     if memory_out.reference.shape[0] > 0:
         memory_out.reference[pixel] = value
     if memory_out.event_count.shape[0] > 0:
@@ -173,3 +204,34 @@ def begin_pixel(
             if model.thresholds.shape[0] > 0:
                 voltage *= model.thresholds[pixel][0] / model.threshold_on
         memory_out.voltage[pixel] = voltage
+
+
+@functools.cache
+def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
+    """Return the kernel that begins what pixels with some `signal_terms` remember."""
+    see = make_see(signals)
+    module = wp.get_module(".".join((__name__, *(name for name, _ in signals))))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def begin(
+        # Model:
+        models: wp.array[PixelModel],
+        phase_stream: wp.uint32,
+        random_phase: wp.array[wp.bool],
+        # In:
+        mask: wp.array[wp.int32],
+        base: wp.array2d[wp.float32],
+        # Out:
+        memory_out: wp.array[Memory],
+    ):
+        """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
+        world, pixel = wp.tid()
+        if mask[world] != 0:
+            model = models[world]
+            seen = see(model, pixel, wp.int64(0), base[world, pixel])
+            begin_pixel(model, phase_stream, random_phase[world], seen, pixel, memory_out[world])
+
+    return begin
+
+
+make_begin(())  # before the module is loaded

@@ -15,17 +15,18 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
-from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, CAUSES, TERMS, Memory, PixelModel
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, CAUSES, Memory, PixelModel
 from neurosim_core.sensors.event_noise_pixel import (
     NEVER,
     NoisyPixel,
     draw_noise,
     jittered,
     light_of,
+    make_see,
     mean_light,
     measured_polarity,
     noise_polarity,
-    see,
+    signal_terms,
     wait_ns,
 )
 from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
@@ -67,15 +68,14 @@ def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
 
 @functools.cache
 def make_pixel_scan(terms: frozenset[str]) -> Any:
-    """Return the function that takes a pixel with only the given `TERMS` over a stack of frames.
+    """Return the function that takes a pixel with only the given terms over a stack of frames.
 
     Its parameters are those of the kernel of `make_scan`, with the pixel in place of the range of pixels.
     """
-    if unknown := terms - {*TERMS, CAUSE}:
-        raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
+    signals = signal_terms(terms)
+    see, changed = make_see(signals), len(signals) > 0
     spread = "spread" in terms
     jitter = "jitter" in terms
-    lin_log = "lin_log" in terms
     low_pass = "low_pass" in terms
     refractory = "refractory" in terms
     leak = "leak" in terms
@@ -286,8 +286,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             state.off = state.off / model.threshold_off
             state.voltage = before.voltage[pixel]
         state.reference = wp.float64(base[pixel])
-        if wp.static(lin_log):
-            state.reference = wp.float64(see(model, base[pixel]))
+        if wp.static(changed):
+            state.reference = see(model, pixel, wp.int64(0), base[pixel])
         if wp.static(resets):
             state.reference = before.reference[pixel]
         state.up = crossed[pixel][0]
@@ -312,8 +312,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             exposure_ns = before.exposure_ns[pixel]
         sample_before = last[pixel]
         seen_last = wp.float64(sample_before)
-        if wp.static(lin_log):
-            seen_last = wp.float64(see(model, sample_before))
+        if wp.static(changed):
+            seen_last = see(model, pixel, stamps[0] + since_reset_ns, sample_before)
         end_light = _ZERO
         if wp.static(light_leak):
             end_light = light_of(model, sample_before)
@@ -334,8 +334,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 light_slope = (wp.float64(sample) - light) / span_ns
                 seen = seen_last  # as light, where the pixel sees its logarithm
                 seen_last = wp.float64(sample)
-                if wp.static(lin_log):
-                    seen_last = wp.float64(see(model, sample))
+                if wp.static(changed):
+                    seen_last = see(model, pixel, stamps[frame + 1] + since_reset_ns, sample)
                 seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO

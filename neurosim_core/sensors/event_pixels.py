@@ -24,6 +24,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.warp_start import refuse_forked_process
 
@@ -180,6 +181,8 @@ class Pixels:
                 terms=terms,
             )
             self._scan = event_worlds_scan.make_noisy_scan(frozenset(terms))
+            self._begin_noise = make_begin(signal_terms(terms))
+            wp.load_module(self._begin_noise.module, device=device)
             self._models: Any = wp.array([self.noise.model], dtype=PixelModel, device=device)
             self._memories: list[Any] = [
                 wp.array([self.noise.memory(slot)], dtype=Memory, device=device) for slot in range(ring_size)
@@ -202,8 +205,22 @@ class Pixels:
         wp.copy(self._last[0].flatten(), self.base)
         self._crossed[0].zero_()
         if self.noise is not None:
-            self.noise.reset(self.base, stamp_ns)
+            self.noise.set_reset(stamp_ns)
             wp.copy(self._models, wp.array([self.noise.model], dtype=PixelModel, device=self._device))
+            phase_stream, random_phase = self.noise.phase()
+            wp.launch(
+                self._begin_noise,
+                dim=(1, self.base.shape[0]),
+                inputs=[
+                    self._models,
+                    phase_stream,
+                    wp.array([random_phase], dtype=wp.bool, device=self._device),
+                    self._overflow,
+                    self.base.reshape((1, -1)),
+                ],
+                outputs=[self._memories[0]],
+                device=self._device,
+            )
 
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""

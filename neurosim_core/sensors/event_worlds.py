@@ -19,6 +19,7 @@ from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
+from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 
 _SORT_BLOCK_SIZE = 1024
@@ -151,7 +152,8 @@ class WorldEventCamera:
             self.seed(seeds)
         self._pool: ThreadPoolExecutor | None = None
         self._scan = scan.make_noisy_scan(frozenset(self.terms)) if self.terms else scan.scan
-        for module in (scan, self._scan.module):
+        self._begin_noise = make_begin(signal_terms(self.terms))
+        for module in (scan, self._scan.module, *([self._begin_noise.module] if self.terms else [])):
             wp.load_module(module, device=self.device)
 
     @property
@@ -223,7 +225,7 @@ class WorldEventCamera:
         )
         if self.terms:
             wp.launch(
-                scan.begin_noise,
+                self._begin_noise,
                 dim=shape,
                 inputs=[self._models, self._phase_stream, self._random_phase, mask, self._base],
                 outputs=[self._memories[parity]],

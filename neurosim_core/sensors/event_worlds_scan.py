@@ -19,7 +19,6 @@ import warp as wp
 from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_cut import take_apart
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_pixel import begin_pixel
 from neurosim_core.sensors.event_noise_scan import make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
@@ -244,16 +243,14 @@ def scan(
 
 @functools.cache
 def make_noisy_scan(terms: frozenset[str]) -> Any:
-    """Return the kernel that does the same for pixels with the given `event_noise_model.TERMS`.
+    """Return the kernel that does the same for pixels with the given terms (`event_noise_model.terms_of`).
 
     In place of thresholds it takes a `PixelModel` of each world, and a `Memory` of each before and after.
     """
     scan_noisy = make_pixel_scan(terms)
 
     @wp.kernel(
-        module=wp.get_module(
-            "neurosim_core.sensors.event_worlds_scan." + ("_".join(sorted(terms)) or "ideal")
-        ),
+        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"),
         enable_backward=False,
     )
     def scan(
@@ -343,24 +340,6 @@ def begin_pixels(
         base_out[world, pixel] = value
         last_out[world, pixel] = value
         crossed_out[world, pixel] = wp.vec2i(0, 0)
-
-
-@wp.kernel
-def begin_noise(
-    # Model:
-    models: wp.array[PixelModel],
-    phase_stream: wp.uint32,
-    random_phase: wp.array[wp.bool],
-    # In:
-    mask: wp.array[wp.int32],
-    base: wp.array2d[wp.float32],
-    # Out:
-    memory_out: wp.array[Memory],
-) -> None:
-    """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
-    world, pixel = wp.tid()
-    if mask[world] != 0:
-        begin_pixel(models[world], phase_stream, random_phase[world], base[world], pixel, memory_out[world])
 
 
 @wp.kernel

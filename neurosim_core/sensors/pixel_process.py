@@ -107,8 +107,7 @@ class PixelProcess:
         batch.width, batch.stride, batch.seeds = source.shape[2], context.stride, context.seeds
         batch.element_count = source.shape[1] * source.shape[2] if element_count is None else element_count
         batch.part_count = 1 if context.times is None else len(context.times.offsets_ns)
-        batch.lens_of_world = wp.array(list(context.lens_of_world), dtype=int, device=device)
-        batch.scene_of_world = context.scene_of_world
+        batch.lens_of_world, batch.scene_of_world = context.lens_of_world, context.scene_of_world
 
     def launch(self, views: PictureViews) -> None:
         """Process the pictures of a batch; launches only."""

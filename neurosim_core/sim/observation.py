@@ -1,3 +1,4 @@
+# mypy: disable-error-code="attr-defined,union-attr"
 """What many worlds yield in a step: arrays on the device."""
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from typing import Any
 
 import warp as wp
 
+from neurosim_core.sim.schedule import Period
+from neurosim_core.sim.state import State
 from neurosim_core.vehicle.arrays import MultirotorArrays
 
 
@@ -46,3 +49,32 @@ class Observation:
     def events(self) -> Mapping[str, Any]:
         """The events of each event camera."""
         return self.frames
+
+
+def make_observation(state: State, period: Period) -> Observation:
+    """Return the views of what a period of many worlds yields."""
+    arrays = state.vehicle.arrays
+    samples = {}
+    for index, (name, sampler) in enumerate(state.samplers.items()):
+        offsets_ns = period.sample_offsets_ns(index)
+        samples[name] = Samples(
+            arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
+            offsets_ns=offsets_ns,
+        )
+    return Observation(
+        state=arrays,
+        clock_ns=state.fleet.clock_ns,
+        frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
+        images={name: picture for group in state.groups for name, picture in group.pictures.items()},
+        fresh=frozenset(name for names in period.pictures for name in names),
+        samples=samples,
+        collided=state.fleet.collided,
+        status=arrays.status,
+    )
+
+
+def _first(rows: Any, count: int) -> Any:
+    """Return the first rows; Warp refuses an empty slice."""
+    if count == 0:
+        return wp.empty((0, *rows.shape[1:]), dtype=rows.dtype, device=rows.device)
+    return rows[:count]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
 from neurosim_core.config_errors import explain
+from neurosim_core.render.camera import Lens
 from neurosim_core.sensors.base import CameraConfig, SensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.scene_table import SceneTable
@@ -32,6 +33,8 @@ class WorldSettings:
     """The most instants of a group in one step."""
     slot_count: int
     """The most boundaries of one step."""
+    lenses: Mapping[str, Sequence[Lens]] = field(default_factory=dict)
+    """Lenses of cameras that worlds change at resets, in place of those of `rigs`."""
     event_capacity: int | None = None
     """Room for the events of one world and camera in one step."""
     ordered: bool = True
@@ -85,15 +88,33 @@ def lenses_differ(rigs: Sequence[Rig]) -> bool:
     return any(other != lenses[0] for other in lenses[1:])
 
 
-def lens_tables(group: RenderGroup, rigs: Sequence[Rig]) -> tuple[list[Any], list[int]]:
+def check_lenses(sensors: Rig, lenses: Mapping[str, Sequence[Lens]]) -> None:
+    """Refuse lenses of what is no camera, or of another size than its pictures.
+
+    Raises:
+        ValueError: There are some.
+    """
+    for name, table in lenses.items():
+        camera = sensors.get(name)
+        if not isinstance(camera, CameraConfig):
+            raise ValueError(f"lenses: {name!r} is no camera, known: {', '.join(sensors)}")
+        size = camera.optics.width, camera.optics.height
+        if not table or any((lens.width, lens.height) != size for lens in table):
+            raise ValueError(f"lenses of {name!r}: give one at least, all of {size[0]} x {size[1]} px")
+
+
+def lens_tables(group: RenderGroup, worlds: WorldSettings) -> tuple[list[Any], list[int]]:
     """Return the lenses that a render group has in some world, and which of them it has in each.
 
     Raises:
         ValueError: Cameras of the group, which share their rays, differ in some world.
     """
+    for name in group.names:
+        if name in worlds.lenses:
+            return list(worlds.lenses[name]), [0] * len(worlds.rigs)
     lenses: dict[Any, int] = {}
     chosen = []
-    for world, rig in enumerate(rigs):
+    for world, rig in enumerate(worlds.rigs):
         found = {name: rig[name].optics for name in group.names}  # type: ignore[attr-defined]
         lens = found[group.names[0]]
         for name, other in found.items():

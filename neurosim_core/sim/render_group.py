@@ -49,6 +49,7 @@ from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings, lens_tables
+from neurosim_core.sim.scene_table import SceneTable
 
 MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
@@ -117,8 +118,12 @@ class RenderGroupState:
     """What the renderer wrote, for image sensors whose last picture another one of the group replaces."""
     parity: int = 0
     """Which of the two states of `world_frames` is the present one."""
-    p_BC: wp.vec3d
-    q_BC: wp.quatd
+    p_BC: Any
+    """Position of the camera on the body in each world [m], vec3d, shape [N]."""
+    q_BC: Any
+    """Its orientation there, xyzw, quatd, shape [N]."""
+    lens_of_world: Any
+    """Which of its lenses a world has, int32, shape [N]."""
     offsets_ns: Any
     """From an instant to its J rays [ns], device array; None: all are cast at the instant."""
     instants: Any
@@ -147,6 +152,7 @@ class _Plan(NamedTuple):
     times: RayTimes | None
     motions: Any
     seeds: Any
+    scenes: SceneTable
 
 
 def make_render_groups(
@@ -188,13 +194,14 @@ def make_render_groups(
         plan = _Plan(
             group=group,
             model=model,
-            worlds=_render_worlds(group, worlds),
+            worlds=_render_worlds(group, worlds, model.device),
             images=images,
             capacity=capacity,
             picture_count=_picture_count(group, images, capacity) if on_host else 1,
             times=_ray_times(group, model.scene_on_device),
             motions=upload_motions(bodies, model.device, world_count=len(worlds.seeds)) if bodies else None,
             seeds=seeds,
+            scenes=worlds.scenes,
         )
         groups.append(_make_group(plan, worlds, history, in_flight, make_room, on_host=on_host))
     return groups
@@ -266,8 +273,9 @@ def _make_group(
         world_frames=world_frames,
         pictures=pictures,
         shared_pictures=shared,
-        p_BC=p_BC,
-        q_BC=q_BC,
+        p_BC=wp.full(count, p_BC, dtype=wp.vec3d, device=device),
+        q_BC=wp.full(count, q_BC, dtype=wp.quatd, device=device),
+        lens_of_world=plan.worlds.lens_of_world,
         offsets_ns=None if offsets_ns is None else wp.array(offsets_ns, dtype=wp.int64, device=device),
         instants=wp.array(np.arange(first.stamps.shape[0], dtype=np.int32), dtype=int, device=device),
         motions=plan.motions,
@@ -288,19 +296,16 @@ def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
         worlds=plan.worlds,
         times=plan.times,
     )
-    worlds, scene = plan.worlds, plan.model.scene_on_device
-    one_scene = not worlds.arrays or worlds.scene_of_world is None
-    first_scene = wp.zeros(worlds.count, dtype=int, device=device)
     processes: dict[str, PictureProcess] = {}
     for name, image in plan.images.items():
         context = PictureContext(
             name=name,
             source=getattr(renderer, image.output),
             sources={output: getattr(renderer, output) for output in image.config.outputs},
-            lenses=worlds.lenses or (plan.group.lens,),
-            lens_of_world=worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
-            scenes=(scene,) if one_scene else worlds.arrays,
-            scene_of_world=first_scene if one_scene else worlds.scene_of_world,
+            lenses=plan.worlds.lenses,
+            lens_of_world=plan.worlds.lens_of_world,
+            scenes=[model.scene_on_device for model in plan.scenes.models],
+            scene_of_world=plan.scenes.scene,
             motions=plan.motions,
             times=plan.times,
             stride=plan.capacity,
@@ -330,16 +335,15 @@ def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
     )
 
 
-def _render_worlds(group: RenderGroup, worlds: WorldSettings) -> RenderWorlds:
+def _render_worlds(group: RenderGroup, worlds: WorldSettings, device: str) -> RenderWorlds:
     """Return who is rendered together."""
-    lenses, lens_of_world = lens_tables(group, worlds.rigs)
+    lenses, lens_of_world = lens_tables(group, worlds)
     return RenderWorlds(
         count=len(worlds.seeds),
         lenses=lenses,
-        lens_of_world=lens_of_world,
+        lens_of_world=wp.array(lens_of_world, dtype=int, device=device),
         scenes=worlds.scenes.data,
-        scene_of_world=worlds.scenes.scene,
-        arrays=[each.scene_on_device for each in worlds.scenes.models],
+        scene_of_world=worlds.scenes.row,
         terms=worlds.scenes.terms,
     )
 

@@ -40,9 +40,12 @@ class SceneTable:
     scene: wp.array[int]
     """`scene_of_world` on the device, shape [world]."""
     data: wp.array[Any] | None
-    """`completed` on the device, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
+    """`completed` on the device, array of `SceneData`; None: there is one row, or no camera."""
+    row: wp.array[int]
+    """Which row of `data` the renderer reads in each world, shape [world]."""
     completed: tuple[SceneData, ...]
-    """Arrays of each scene, with all that a kernel for all scenes reads; empty: `data` is None."""
+    """Arrays of each scene, or of each world, with all that a kernel for all scenes reads; empty: `data` is
+    None."""
     terms: RenderTerms | None
     """What some scene needs in the kernel of the renderer; None: there is no camera."""
 
@@ -51,11 +54,24 @@ class SceneTable:
         """The model of the first scene; what does not depend on the scene is the same in all."""
         return self.models[0]
 
-    @property
-    def first(self) -> SceneArrays | None:
-        """The first scene as the renderer has it; None: there is no camera."""
-        arrays = self.model.scene_on_device
-        return arrays if isinstance(arrays, SceneArrays) else None
+    def light(self, name: str) -> Any:
+        """Return `dark_floor` or `exposure` of `SceneData` in each world, device array of float32, [world].
+
+        Raises:
+            ValueError: Worlds share the light of their scene: they were not made with `own_light`.
+        """
+        if self.data is None or len(self.data) != len(self.scene_of_world):
+            raise ValueError("the light is that of the scene in all worlds: make them with own_light=True")
+        offset = getattr(SceneData.ctype, name).offset
+        size = wp.types.type_size_in_bytes(self.data.dtype)
+        floats: Any = wp.array(
+            ptr=self.data.ptr + offset,
+            dtype=float,
+            shape=len(self.data),
+            strides=(size,),
+            device=self.data.device,
+        )
+        return floats
 
 
 def make_scene_table(
@@ -66,6 +82,7 @@ def make_scene_table(
     models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
     lenses_differ: bool = False,
+    own_light: bool = False,
 ) -> SceneTable:
     """Load the scenes and bring them to the device.
 
@@ -76,6 +93,7 @@ def make_scene_table(
         models: Scenes that were loaded before, in place of `scenes`, each with its path and light.
         scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
         lenses_differ: Worlds look through different lenses.
+        own_light: Let the light of each world be changed (`SceneTable.light`).
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
@@ -96,8 +114,8 @@ def make_scene_table(
     if models is not None:
         _check_models(models, config)
     asked = isinstance(config.render.candidate_lists, CandidateListConfig)
-    if asked and (lenses_differ or len(scenes or models or ()) > 1):
-        _logger.info("render.candidate_lists is left out: worlds differ in their scenes or lenses")
+    if asked and (lenses_differ or own_light or len(scenes or models or ()) > 1):
+        _logger.info("render.candidate_lists is left out: worlds differ in scenes, lenses or light")
         alone = config.render.model_copy(update={"candidate_lists": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})
     if models is not None:
@@ -118,13 +136,21 @@ def make_scene_table(
     terms = None
     if arrays:
         terms = RenderTerms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
-        terms = terms._replace(world_scenes=len(arrays) > 1)
-    completed = tuple(_completed(a) for a in arrays) if len(arrays) > 1 else ()
+        terms = terms._replace(world_scenes=own_light or len(arrays) > 1)
+    completed: tuple[SceneData, ...] = ()
+    scene: Any = wp.array(chosen.astype(np.int32), dtype=int, device=device)
+    row = scene
+    if arrays and (own_light or len(arrays) > 1):
+        completed = tuple(_completed(a) for a in arrays)
+    if own_light:
+        completed = tuple(completed[index] for index in chosen)
+        row = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     return SceneTable(
         models=made,
         scene_of_world=tuple(int(scene) for scene in chosen),
         fields=wp.array([m.free_space.arrays for m in made], dtype=DistanceField, device=device),
-        scene=wp.array(chosen.astype(np.int32), dtype=int, device=device),
+        scene=scene,
+        row=row,
         data=wp.array(list(completed), dtype=SceneData, device=device) if completed else None,
         completed=completed,
         terms=terms,
@@ -134,11 +160,13 @@ def make_scene_table(
 def single_scene(model: Model) -> SceneTable:
     """Return the table of one world in the scene of a model."""
     arrays = model.scene_on_device
+    scene: Any = wp.zeros(1, dtype=int, device=model.device)
     return SceneTable(
         models=(model,),
         scene_of_world=(0,),
         fields=wp.array([model.free_space.arrays], dtype=DistanceField, device=model.device),
-        scene=wp.zeros(1, dtype=int, device=model.device),
+        scene=scene,
+        row=scene,
         data=None,
         completed=(),
         terms=arrays.terms if isinstance(arrays, SceneArrays) else None,

@@ -22,13 +22,14 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows, normalised
+from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, checked_mask, checked_seeds, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.observation import Observation, Samples
-from neurosim_core.sim.parameters import WorldSettings, lenses_differ, vary_sensors
+from neurosim_core.sim.observation import Observation, make_observation
+from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
 from neurosim_core.sim.reset import begin_of_paths, normalise, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
@@ -59,6 +60,8 @@ class Simulation:
         parameters: What differs from world to world, one number for each, shape [N]: thresholds, noise and
             dead time of event cameras ("front.threshold_on", "front.shot_noise.rate_hz") and lenses
             ("front.lens.horizontal_fov_rad").
+        lenses: Lenses of cameras, by name, that worlds change between (`optics`); all begin with the first.
+        own_light: Let the light of each world be changed (`light`).
         scenes: Scenes to be in: settings files, mesh files or settings; None: the configured one.
         models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice. They
             must be on the same device, and have the bodies and `render` of `config`.
@@ -85,6 +88,8 @@ class Simulation:
         device: str | None = None,
         seeds: int | ArrayLike | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
+        lenses: Mapping[str, Sequence[Lens]] | None = None,
+        own_light: bool = False,
         scenes: Sequence[SceneSource] | None = None,
         models: Sequence[Model] | None = None,
         scene_of_world: ArrayLike | None = None,
@@ -97,6 +102,7 @@ class Simulation:
             raise ValueError(f"event_capacity must be 1 at least, got {event_capacity}")
         chosen = _one_vehicle(config, device)
         rigs = vary_sensors(chosen.sensors, parameters or {}, worlds)
+        check_lenses(chosen.sensors, lenses or {})
         self.count = worlds
         first_seeds = make_seeds(chosen.seed if seeds is None else seeds, worlds)
         self._scenes = make_scene_table(
@@ -105,7 +111,8 @@ class Simulation:
             scenes=scenes,
             models=models,
             scene_of_world=scene_of_world,
-            lenses_differ=lenses_differ(rigs),
+            lenses_differ=lenses_differ(rigs) or bool(lenses),
+            own_light=own_light,
         )
         self._model = model = self._scenes.model
         self.device = wp.get_device(model.device)
@@ -118,6 +125,7 @@ class Simulation:
                 scenes=self._scenes,
                 seeds=first_seeds,
                 rigs=rigs,
+                lenses=lenses or {},
                 instant_count=self._timetable.instant_count_max(),
                 slot_count=self._timetable.boundary_count_max(),
                 event_capacity=event_capacity,
@@ -156,6 +164,31 @@ class Simulation:
                 if thresholds is not None:
                     return thresholds
         raise ValueError(f"{camera!r} is no event camera with ideal pixels: its thresholds stay as they are")
+
+    def optics(self, camera: str) -> tuple[Any, Any, Any]:
+        """Return how a camera is mounted and looks in each world: p_BC [m], q_BC, and the number of its lens.
+
+        They are device arrays of vec3d, quatd and int32, shape [N], and may be written where a world is about
+        to begin anew. Cameras that share its rays have the same.
+
+        Raises:
+            ValueError: There is no such camera.
+        """
+        for group, plan in zip(self._state.groups, self._model.groups, strict=True):
+            if camera in plan.names:
+                return group.p_BC, group.q_BC, group.lens_of_world
+        raise ValueError(f"there is no camera {camera!r}")
+
+    def light(self, name: str) -> Any:
+        """Return `dark_floor` or `exposure` of the renderer in each world, device array of float32, [N].
+
+        They may be written where a world is about to begin anew. g times the light is 1/g of the dark floor
+        and g times the exposure: of log radiance all that changes else is a constant, log(g).
+
+        Raises:
+            ValueError: The worlds were made without `own_light`.
+        """
+        return self._scenes.light(name)
 
     @property
     def airframes(self) -> Any:
@@ -359,28 +392,8 @@ class Simulation:
         if period not in self._observations:
             if len(self._observations) >= PERIOD_COUNT_MAX:
                 self._observations.clear()
-            self._observations[period] = self._make_observation(period)
+            self._observations[period] = make_observation(self._state, period)
         return self._observations[period]
-
-    def _make_observation(self, period: Period) -> Observation:
-        state, arrays = self._state, self._state.vehicle.arrays
-        samples = {}
-        for index, (name, sampler) in enumerate(state.samplers.items()):
-            offsets_ns = period.sample_offsets_ns(index)
-            samples[name] = Samples(
-                arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
-                offsets_ns=offsets_ns,
-            )
-        return Observation(
-            state=arrays,
-            clock_ns=state.fleet.clock_ns,
-            frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
-            images={name: picture for group in state.groups for name, picture in group.pictures.items()},
-            fresh=frozenset(name for names in period.pictures for name in names),
-            samples=samples,
-            collided=state.fleet.collided,
-            status=arrays.status,
-        )
 
     def _take_commands(self, commands: Any, mode: CommandMode) -> None:
         """Copy commands into the fixed buffer that the graph reads."""
@@ -478,10 +491,3 @@ def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> N
                 f"sensors.{name}.rate_hz must divide control.rate_hz = {control.rate_hz:g} in worlds, where "
                 f"pictures are taken at the end of steps, got {rate.rate_hz:g}"
             )
-
-
-def _first(rows: Any, count: int) -> Any:
-    """Return the first rows; Warp refuses an empty slice."""
-    if count == 0:
-        return wp.empty((0, *rows.shape[1:]), dtype=rows.dtype, device=rows.device)
-    return rows[:count]

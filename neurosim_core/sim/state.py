@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.clock import to_ns
-from neurosim_core.control import CommandMode, Controller, make_controller
+from neurosim_core.control import CommandMode, Controller, ControllerContext, PathController
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.packets import Odometry
 from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy, make_stream
@@ -113,7 +113,7 @@ class State:
     """What they can touch (`trace.Surfaces`)."""
     start: Any
     """Where vehicles begin, one row for each world (`integrate.Start`)."""
-    path_controller: Controller
+    path_controller: PathController
     trace: Trace
     groups: list[RenderGroupState]
     samplers: dict[str, Sampler]
@@ -314,16 +314,14 @@ def _is_cuda(model: Model) -> bool:
     return bool(wp.get_device(model.device).is_cuda)
 
 
-def _path_controller(model: Model, worlds: WorldSettings) -> Controller:
-    """Return what follows the paths of all worlds, which may share one."""
-    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
-    return make_controller(
-        "path",
-        model.airframe,
-        model.config.control.gains,
-        count=len(worlds.seeds),
-        device=model.device,
-        paths=paths[0] if all(path is paths[0] for path in paths) else paths,
+def _path_controller(model: Model, worlds: WorldSettings) -> PathController:
+    """Return what follows the paths of all worlds."""
+    return model.config.control.make(
+        ControllerContext(
+            airframe=model.airframe,
+            paths=[worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world],
+            device=model.device,
+        )
     )
 
 
@@ -400,5 +398,6 @@ def reset_vehicles(model: Model, state: State, mask: Any) -> None:
         device=model.device,
     )
     state.vehicle.begin(mask)
+    state.path_controller.begin(mask)
     for sampler in state.samplers.values():
         sampler.reset(mask)

@@ -129,8 +129,8 @@ def _record(
 @wp.kernel
 def _camera_poses(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     # In:
     states: wp.array3d[wp.float64],
@@ -148,8 +148,8 @@ def _camera_poses(
     q_WB = wp.quatd(
         states[slot, world, 3], states[slot, world, 4], states[slot, world, 5], states[slot, world, 6]
     )
-    p_WC = p_WB + wp.quat_rotate(q_WB, p_BC)
-    q_WC = q_WB * q_BC
+    p_WC = p_WB + wp.quat_rotate(q_WB, p_BC[world])
+    q_WC = q_WB * q_BC[world]
     p_WC_out[row] = wp.vec3(p_WC)
     q_WC_out[row] = wp.quat(q_WC)
     if stamps_out.shape[0] > 0:
@@ -159,8 +159,8 @@ def _camera_poses(
 @wp.kernel
 def _ray_poses(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     offsets_ns: wp.array[wp.int64],
     # In:
@@ -181,8 +181,8 @@ def _ray_poses(
     p_WB = at.position
     q_WB = at.orientation
     row = (world * stride + instant) * offsets_ns.shape[0] + part
-    p_WC_out[row] = wp.vec3(p_WB + wp.quat_rotate(q_WB, p_BC))
-    q_WC_out[row] = wp.quat(q_WB * q_BC)
+    p_WC_out[row] = wp.vec3(p_WB + wp.quat_rotate(q_WB, p_BC[world]))
+    q_WC_out[row] = wp.quat(q_WB * q_BC[world])
     if stamps_out.shape[0] > 0:
         stamps_out[row, 0] = stamp_ns
 
@@ -190,8 +190,8 @@ def _ray_poses(
 @wp.kernel
 def _camera_twists(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
+    p_BC: wp.array[wp.vec3d],
+    q_BC: wp.array[wp.quatd],
     stride: int,
     # In:
     states: wp.array3d[wp.float64],
@@ -207,8 +207,8 @@ def _camera_twists(
     )
     v_W = wp.vec3d(states[slot, world, 7], states[slot, world, 8], states[slot, world, 9])
     w_B = wp.vec3d(states[slot, world, 10], states[slot, world, 11], states[slot, world, 12])
-    v_W += wp.quat_rotate(q_WB, wp.cross(w_B, p_BC))
-    w_C = wp.quat_rotate_inv(q_BC, w_B)
+    v_W += wp.quat_rotate(q_WB, wp.cross(w_B, p_BC[world]))
+    w_C = wp.quat_rotate_inv(q_BC[world], w_B)
     twist = wp.spatial_vectord(v_W[0], v_W[1], v_W[2], w_C[0], w_C[1], w_C[2])
     if status[slot, world] != STATUS_OK:
         twist = wp.spatial_vectord()
@@ -307,8 +307,8 @@ class Trace:
         slots: wp.array[int],
         *,
         count: int,
-        p_BC: wp.vec3d,
-        q_BC: wp.quatd,
+        p_BC: Any,
+        q_BC: Any,
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         stamps: Any,
@@ -318,8 +318,8 @@ class Trace:
         Args:
             slots: Slots of the instants, shape [K].
             count: How many of them to use.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
+            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
+            q_BC: Orientation of the camera against the body, xyzw, likewise.
             p_WC: Positions, shape [world K]; overwritten.
             q_WC: Orientations, shape [world K]; overwritten.
             stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
@@ -347,8 +347,8 @@ class Trace:
         offsets_ns: Any,
         *,
         count: int,
-        p_BC: wp.vec3d,
-        q_BC: wp.quatd,
+        p_BC: Any,
+        q_BC: Any,
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         stamps: Any,
@@ -369,17 +369,15 @@ class Trace:
             device=p_WC.device,
         )
 
-    def camera_twists(
-        self, slots: wp.array[int], twist: Any, *, count: int, p_BC: wp.vec3d, q_BC: wp.quatd
-    ) -> None:
+    def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
         Args:
             slots: Slots of the instants, shape [K].
             twist: spatial_vectord, shape [world K]; overwritten.
             count: How many of them to use.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
+            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
+            q_BC: Orientation of the camera against the body, xyzw, likewise.
         """
         world_count = self.states.shape[1]
         wp.launch(

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from neurosim_core import cli
@@ -88,6 +90,37 @@ def test_resuming_keeps_what_is_there(asked, tmp_path, capsys):
     assert list(told) == ["two"]
     assert "one: kept from" in capsys.readouterr().out
     assert (tmp_path / "report.html").read_text().count("<section") == 1 + 2
+
+
+@pytest.mark.parametrize(
+    ("more", "measured"),
+    [
+        (["--resume"], ["1 m/s", "2 m/s", "2 m/s"]),
+        (["--resume", "--quick"], ["1 m/s", "2 m/s", "1 m/s", "2 m/s"]),
+        ([], ["1 m/s", "2 m/s", "1 m/s", "2 m/s"]),
+    ],
+)
+def test_stages_that_an_interrupted_question_left(asked, tmp_path, monkeypatch, more, measured):
+    """They are kept where a run with the same options is resumed."""
+    begun = []
+
+    def value_of(name):
+        begun.append(name)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        return {"first": np.float64(name[0]), "none": np.nan}
+
+    def measure(self, options, progress):
+        found = [options.stage(name, partial(value_of, name)) for name in ("1 m/s", "2 m/s")]
+        return Chapter(name="one", title="", summary=f"{found[0]['first']:g} {found[1]['first']:g}")
+
+    asked("one")
+    monkeypatch.setattr(Question, "measure", measure)
+    assert cli.main(["bench", "one", "--out", str(tmp_path)]) == 130
+    assert cli.main(["bench", "one", "--out", str(tmp_path), *more]) == 0
+    assert begun == measured
+    assert json.loads((tmp_path / "one.json").read_text())["summary"] == "1 2"
+    assert {file.name for file in tmp_path.iterdir()} == {"one.json", "report.html"}
 
 
 def test_what_fails_is_told_and_the_others_go_on(asked, tmp_path, capsys):

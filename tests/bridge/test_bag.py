@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 from runtime_directory import own_directory
 
 from cortex import messages as msg
-from cortex.log import open_log
+from cortex.log import LogWriter, open_log
 from cortex_ros2_bridge.backend.bag import BagBackend, bag_directory, stamp_reader
 from cortex_ros2_bridge.backend.base import BackendError, Qos
 from cortex_ros2_bridge.backend.choose import open_backend
@@ -339,3 +339,30 @@ def test_a_bag_becomes_a_log_and_the_log_a_bag(tmp_path: Path, capsys: pytest.Ca
         for topic, message in sent.items():
             assert found[topic][0].stamp_ns == message.stamp_ns
         assert np.allclose(found["/drone/imu"][0].angular_rate, 2 * THREE)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"), [("a.bag", "b.mcap"), ("a.mcap", "b.bag"), ("a.mcap", "b.mcap")]
+)
+@pytest.mark.parametrize("error", [OSError("no space left"), KeyboardInterrupt()])
+def test_half_a_conversion_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, target: str, error: BaseException
+) -> None:
+    """But what was there before stays."""
+    imu = msg.Imu(5_000_000_000, THREE, THREE)
+    with contextlib.closing(BagWriter(tmp_path / "a.bag")) as bag:
+        bag.write("/drone/imu", imu)
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.write("/drone/imu", imu, 1)
+    before = sorted(tmp_path.rglob("*"))
+    real = {kind: kind.write for kind in (BagWriter, LogWriter)}
+    for kind, write in real.items():
+
+        def fail(*arguments: Any, write: Any = write, **options: Any) -> None:
+            write(*arguments, **options)
+            raise error
+
+        monkeypatch.setattr(kind, "write", fail)
+    assert main(["--convert", str(tmp_path / source), str(tmp_path / target)]) != 0
+    assert main(["--convert", str(tmp_path / source), str(tmp_path / "a.mcap")]) != 0  # it is there
+    assert sorted(tmp_path.rglob("*")) == before

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from peer import Number
-from processes import SOON_S, Child
+from peer import Number, connect
+from processes import Child
 from runtime_directory import runtime
 
 from cortex.node import Node
@@ -39,9 +39,7 @@ def node(make_node: Callable[..., Node]) -> Node:
 @pytest.fixture
 def numbers(node: Node) -> tuple[Publisher[Number], Subscriber[Number]]:
     """A publisher and its reliable subscriber."""
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, reliable(256, 60.0))
     return publisher, subscriber
 
 

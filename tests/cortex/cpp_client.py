@@ -59,6 +59,20 @@ class Peer:
         line, self._rest = self._rest.split(b"\n", 1)
         return line.decode()
 
+    def await_complaint(self, text: str) -> None:
+        """Wait until it writes this to standard error, which `end` returns no more then."""
+        assert self.process.stderr is not None
+        said = b""
+        while text.encode() not in said:
+            assert select.select([self.process.stderr], [], [], SOON_S)[0], said
+            said += os.read(self.process.stderr.fileno(), 4096)
+
+    def close_input(self) -> None:
+        """Have it say what it has counted, and end."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.stdin = None
+
     def end(self) -> str:
         """Close its input, wait, and return what it wrote to standard error."""
         try:
@@ -170,6 +184,11 @@ class Impostor:
             event = self.xpub.recv()
             if event[:5] == b"\x01CTXA":
                 return bytes(event[1:])
+
+    def leave(self) -> None:
+        """Be gone."""
+        self.welcome = wire.control_frame(records.Welcome(1, 2, [], []))
+        self.record = wire.control_frame(records.Gone(2, 5, ""))
 
     def close(self) -> None:
         self.stopping = True

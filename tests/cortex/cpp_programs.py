@@ -1,9 +1,10 @@
-"""The test programs and examples of the C++ client, built once per session, and what starts them."""
+"""The test programs and examples of the C++ client, built once for the same sources, and what starts them."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import os
 import shutil
 import subprocess
@@ -23,6 +24,9 @@ from cortex.schema import Schema
 CPP = Path(__file__).parents[2] / "cortex" / "cpp"
 PATIENCE_S = 900.0
 """After this a program that takes seconds hangs, also on a machine that does a lot besides."""
+
+_KEPT = 4
+"""Builds that are kept, the newest."""
 
 
 def _missing() -> str:
@@ -45,15 +49,23 @@ def short(schema: Schema) -> str:
     return schema.name.rpartition("/")[2]
 
 
+def _headers() -> dict[str, str]:
+    """The headers of the test programs."""
+    schemas = [Schema.from_json(vector["schema"]) for vector in load_vectors().values()]
+    table = " ".join(f"X({short(schema)})" for schema in schemas)
+    return {
+        "vectors.hpp": f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n",
+        "peer_messages.hpp": generate([Rich, Picture, Scan]),
+    }
+
+
 def _build(build: Path) -> None:
     """Build everything with all warnings as errors."""
     shutil.rmtree(build, ignore_errors=True)
     headers = build / "headers"
     headers.mkdir(parents=True)
-    schemas = [Schema.from_json(vector["schema"]) for vector in load_vectors().values()]
-    table = " ".join(f"X({short(schema)})" for schema in schemas)
-    (headers / "vectors.hpp").write_text(f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n")
-    (headers / "peer_messages.hpp").write_text(generate([Rich, Picture, Scan]))
+    for name, text in _headers().items():
+        (headers / name).write_text(text)
     for command in (
         [
             *("cmake", "-S", CPP, "-B", build, "-DCORTEX_EXAMPLES=ON"),
@@ -67,17 +79,30 @@ def _build(build: Path) -> None:
     (build / "built").touch()
 
 
+def _fingerprint() -> str:
+    """What a build comes of: the compiler, the C++ sources, and what writes headers."""
+    version = subprocess.run(["g++", "--version"], capture_output=True, check=True).stdout
+    digest = hashlib.sha256(version + "".join(_headers().values()).encode())
+    package = CPP.parent
+    sources = [*CPP.rglob("*"), package / "cppgen.py", *(package / "messages").glob("*.py"), Path(__file__)]
+    for path in sorted(path for path in sources if path.is_file()):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 @pytest.fixture(scope="session")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of the programs; workers of one session share it."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    build = folder / "cpp"
-    with open(folder / "cpp.lock", "w", encoding="ascii") as lock:
+def programs() -> Path:
+    """The directory of the programs: as Warp's kernels, they are kept for later sessions."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "neurosim" / "cpp_tests"
+    folder.mkdir(parents=True, exist_ok=True)
+    build = folder / _fingerprint()
+    with open(folder / "lock", "w", encoding="ascii") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (build / "built").exists():
             _build(build)
+        others = sorted(folder.glob("*/built"), key=lambda path: path.stat().st_mtime)
+        for old in others[:-_KEPT]:
+            shutil.rmtree(old.parent)
     return build
 
 

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import os
-import random
 import secrets
-import selectors
-import shutil
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
+import pytest
 import zmq
+from processes import SOON_S
 
 from cortex.control import LEASE_NS, control_types, make_control_socket
 from cortex.discovery import Directory
@@ -39,30 +30,7 @@ from cortex.records import (
 from cortex.registry import Registry
 from cortex.wire import parse_control
 
-ROOT = Path(__file__).resolve().parents[2]
-NODE = Path(__file__).with_name("discovery_node.py")
-SOON_S = 60.0
-"""Deadline of things that take milliseconds, on a machine that does a lot besides."""
 LEASE_S = LEASE_NS / 1e9
-
-
-def private_runtime(monkeypatch) -> Iterator[Path]:
-    """A runtime directory for the test; whatever serves in it is ended with it."""
-    path = Path(tempfile.mkdtemp(prefix="cortex-test-"))
-    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(path))
-    yield path
-    pid = registry_pid()
-    if pid is not None:
-        os.kill(pid, signal.SIGKILL)
-        wait_for(lambda: registry_pid() is None)
-    shutil.rmtree(path)
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "the condition did not come true in time"
-        time.sleep(0.005)
 
 
 def registry_pid(domain: int = 0) -> int | None:
@@ -146,8 +114,16 @@ def drive_for(nodes, seconds):
     drive(nodes, lambda: time.monotonic() >= end, seconds + SOON_S)
 
 
-@contextlib.contextmanager
-def node_maker(context):
+@pytest.fixture
+def context():
+    """For sockets of the test."""
+    with zmq.Context() as made:
+        made.linger = 0
+        yield made
+
+
+@pytest.fixture
+def make(runtime, context):
     """Makes nodes, and closes them."""
     with contextlib.ExitStack() as stack:
 
@@ -174,42 +150,6 @@ def serving(domain=0, **options):
         registry.close()
 
 
-@contextlib.contextmanager
-def node_process(name, **options):
-    """A node in a process of its own."""
-    arguments = [sys.executable, str(NODE), json.dumps({"name": name, **options})]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipe = subprocess.PIPE
-    # No buffer: what lies in one, `select` does not see.
-    process = subprocess.Popen(arguments, env=environment, stdin=pipe, stdout=pipe, bufsize=0)
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(signal.SIGCONT)
-        process.stdin.close()
-        try:
-            process.wait(SOON_S)
-        finally:
-            process.kill()
-            process.wait()
-            process.stdout.close()
-
-
-def read_until(process, condition, timeout_s=SOON_S):
-    """Read what a node process prints until a line satisfies the condition, and return it."""
-    deadline = time.monotonic() + timeout_s
-    with selectors.DefaultSelector() as selector:
-        selector.register(process.stdout, selectors.EVENT_READ)
-        while selector.select(max(deadline - time.monotonic(), 0)):
-            line = process.stdout.readline()
-            assert line, "the node has ended"
-            seen = json.loads(line)
-            if "names" in seen and condition(seen):
-                return seen
-    raise AssertionError("the node did not print what was expected in time")
-
-
 def dealer(context):
     socket = context.socket(zmq.DEALER)
     socket.connect(f"ipc://{runtime_dir(0) / REGISTRY_SOCKET}")
@@ -222,27 +162,6 @@ TYPES = control_types(Alive, Changed, Gone, Heartbeat, Hello, Leave, Refused, We
 def receive(socket, timeout_ms=1e3 * SOON_S):
     assert socket.poll(timeout_ms), "no answer"
     return parse_control(socket.recv(), TYPES)[0]
-
-
-def mutate(frame: bytes, random: random.Random) -> bytes:
-    data = bytearray(frame)
-    for _ in range(random.randint(1, 4)):
-        position = random.randrange(len(data))
-        kind = random.randrange(5)
-        if kind == 0:
-            data[position] ^= 1 << random.randrange(8)
-        elif kind == 1:
-            data[position] = random.choice((0, 1, 0x7F, 0x80, 0xFF))
-        elif kind == 2:
-            del data[position:]
-        elif kind == 3:
-            data[position:position] = random.randbytes(random.randint(1, 16))
-        else:
-            start = max(position - 4, 0)
-            data[start : start + 4] = random.choice((b"\xff" * 4, b"\0" * 4, b"\0\0\0\x80"))
-        if not data:
-            return b""
-    return bytes(data)
 
 
 def answers_unknown(socket):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 
 import numpy as np
 import pytest
-from peer import Number, Scan
+from peer import Number, Scan, connect
 from processes import SOON_S, wait_for
 
 from cortex import reliable
@@ -23,42 +22,13 @@ def scan(number, size=LARGE):
 
 def test_callbacks_are_called_in_order(node):
     received = []
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, reliable(64, 60.0), received.append)
     for value in range(3000):
         assert publisher.publish(Number(value, value))
     wait_for(lambda: len(received) == 3000)
     assert [message.value for message in received] == list(range(3000))
     assert subscriber.counters.received == 3000
     assert sum(subscriber.counters.latency) >= 3000 / 8
-
-
-def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
-    received = []
-
-    def fail(message):
-        received.append(message)
-        raise KeyError(message.stamp_ns)
-
-    publisher = node.publisher("/scans", Scan)
-    node.subscriber("/scans", Scan, fail)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for number in range(3):
-        publisher.publish(scan(number, 1))
-    wait_for(lambda: len(received) == 3)
-    wait_for(lambda: sum(r.exc_info is not None and r.levelno == logging.ERROR for r in caplog.records) == 3)
-
-
-def test_callbacks_of_large_and_small_messages_keep_the_order(node):
-    received = []
-    publisher = node.publisher("/scans", Scan)
-    node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 60.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for number in range(300):
-        assert publisher.publish(scan(number, LARGE if number % 3 == 0 else 5))
-    wait_for(lambda: len(received) == 300)
-    assert received == list(range(300))
 
 
 def test_no_callback_after_close(node):
@@ -75,9 +45,7 @@ def test_no_callback_after_close(node):
             time.sleep(1e-3)
         state["running"] = False
 
-    publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, slow)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, callback=slow)
     for value in range(30):
         publisher.publish(Number(value, value))
     assert started.wait(SOON_S)
@@ -125,9 +93,7 @@ def test_a_callback_closes_its_node(make_node):
         node.close()
         closed.set()
 
-    publisher = node.publisher("/numbers", Number)
-    node.subscriber("/numbers", Number, close)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, _ = connect(node, "/numbers", Number, callback=close)
     publisher.publish(Number(0, 0))
     assert closed.wait(SOON_S)
     with pytest.raises(Closed):
@@ -145,9 +111,7 @@ def test_a_callback_publishes_and_subscribes(node):
             extra.append(node.subscriber("/second", Number, received.append, policy=reliable()))
         second.publish(Number(message.stamp_ns, message.value + 1))
 
-    first = node.publisher("/first", Number)
-    node.subscriber("/first", Number, forward, policy=reliable())
-    assert first.wait_for_subscribers(timeout_s=SOON_S)
+    first, _ = connect(node, "/first", Number, reliable(), forward)
     first.publish(Number(0, 0))
     assert second.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(1, 100):

@@ -9,7 +9,7 @@ import threading
 import time
 
 import pytest
-from peer import Block, Number, make_block
+from peer import Block, Number, connect, make_block
 from processes import SOON_S, wait_for
 
 import cortex.link
@@ -23,8 +23,6 @@ PATIENT = ["reliable", {"timeout_s": SOON_S}]  # as long as a machine may stand 
 
 def subscribe(publisher, start_child, policy: list, count: int = 1) -> list:
     children = [start_child("endless_subscriber", topic="/blocks", policy=policy) for _ in range(count)]
-    for child in children:
-        child.hear()
     assert publisher.wait_for_subscribers(count, timeout_s=SOON_S)
     return children
 
@@ -149,9 +147,7 @@ def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
 def test_a_forked_child_leaves_a_publisher_alone(make_node, use):
     """Also where a large message is written at the moment of the fork."""
     node = make_node(registry="off")
-    publisher = node.publisher("/blocks", Block)
-    subscriber = node.subscriber("/blocks", Block)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/blocks", Block)
     with publisher._large_lock, publisher._lock:
         child = os.fork()
         if child == 0:
@@ -190,39 +186,12 @@ def test_what_a_reader_has_no_time_for_is_counted(make_node, start_child, policy
     assert policy == "keep_last" or found["lost"] == sent.refused
 
 
-def test_what_a_reader_without_a_ring_loses_at_the_end_is_counted(make_node):
-    """One of the same process: it has room again, and hears of it, before the linger is over."""
-    node = make_node()
-    publisher = node.publisher("/blocks", Block)
-    subscriber = node.subscriber("/blocks", Block, policy=reliable(1, 0.01))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    sent = Sent(publisher, 100)
-    while sent.refused < 5:
-        sent()
-    thread = begin_close(publisher, linger_s=SOON_S)
-    count = 0
-
-    def all_accounted() -> bool:
-        nonlocal count
-        with contextlib.suppress(TimeoutError):
-            subscriber.recv(0.0)
-            count += 1
-        return count + subscriber.counters.lost == sent.count
-
-    wait_for(all_accounted, every_s=0.0)
-    assert subscriber.counters.lost == sent.refused
-    thread.join(SOON_S)
-    assert not thread.is_alive()
-
-
 @pytest.mark.parametrize("policy", [["keep_last"], ["latest"], ["reliable"]], ids=lambda policy: policy[0])
 def test_a_publisher_that_dies_after_its_first_large_message(start_child, policy):
     """Nobody can map its memory any more: the subscriber goes on, and accounts for every message."""
     subscriber = start_child("endless_subscriber", topic="/blocks", policy=policy)
-    subscriber.hear()
     for round_ in range(1, 3):
         child = start_child("peer")
-        child.hear()
         child.ask(do="publisher", topic="/blocks", type="Block")
         assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
         with subscriber.stopped():
@@ -242,7 +211,6 @@ def test_a_publisher_leaves_while_its_reader_reads(make_node, start_child, monke
     monkeypatch.setattr(cortex.link, "native", None)
     subscriber = make_node(listen=listen.get("listen")).subscriber("/blocks", Block, policy=reliable())
     child = start_child("peer", **listen)
-    child.hear()
     child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
     child.say(
@@ -260,7 +228,6 @@ def test_a_stream_that_was_cut_off_is_counted(make_node, start_child, monkeypatc
     subscriber = make_node().subscriber("/numbers", Number, policy=reliable())
     for orderly in (True, False):
         child = start_child("peer")
-        child.hear()
         child.ask(do="publisher", topic="/numbers", type="Number")
         assert child.ask(do="await_subscribers", topic="/numbers")["ok"]
         child.say(do="leave", topic="/numbers", count=10, orderly=orderly)

@@ -166,27 +166,6 @@ def test_loans_arrive_as_views_of_shared_memory(
         pictures.close()
 
 
-@pytest.mark.parametrize("size", [10, 20_000])
-def test_reliable_flood_arrives_whole(
-    start: Callable[..., Peer], make_node: Callable[..., Node], size: int
-) -> None:
-    """Frames and slots: every message of a flood from Python arrives once and in order."""
-    node = make_node()
-    scans = node.publisher("/scan", Scan)
-    peer = start("count", "/scan", "reliable", 0, 3)
-    assert scans.wait_for_subscribers(1, SOON_S)
-    for number in range(3000):
-        assert scans.publish(Scan(number, np.full(size, number, np.float32)))
-    assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
-    assert json.loads(peer.line()) == {
-        **CLEAN,
-        "received": 3000,
-        "sequence": 3000,
-        "sources": 1,
-        "last": 2999,
-    }
-
-
 @pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
 def test_slow_reader_knows_what_it_missed(
     start: Callable[..., Peer], make_node: Callable[..., Node], policy: str, size: int
@@ -205,19 +184,6 @@ def test_slow_reader_knows_what_it_missed(
     assert (result["wrong"], result["rejected"]) == (0, 0)
     assert result["received"] < 2000  # 0 if it was asleep until the end overtook them all
     assert result["received"] + result["lost"] + result["overtaken"] == result["sequence"]
-
-
-def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
-    node = make_node()
-    for size in (10, 20_000):
-        scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-        peer = start("publish", "/scan", 3000, size)
-        for number in range(3000):
-            scan = scans.recv(SOON_S)
-            assert (scan.stamp_ns, scan.ranges.size, scan.ranges[-1]) == (number, size, number)
-        assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
-        peer.end()
-        scans.close()
 
 
 def test_late_reliable_reader_of_python_is_told(
@@ -332,54 +298,6 @@ def test_the_clock_is_that_of_the_registry(
             return offsets[0] if offsets else 0
 
         wait_for(lambda: abs(offset_ns() - (time.time_ns() - time.monotonic_ns())) < 10**9)
-
-
-def test_killed_cpp_reader_frees_its_slots(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
-    """A reliable reader that dies with leases does not hold up the publisher longer than its death takes."""
-    scans = make_node().publisher("/scan", Scan)
-    peer = start("count", "/scan", "reliable", 2000, 3)
-    assert scans.wait_for_subscribers(1, SOON_S)
-    for number in range(20):
-        assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
-    peer.process.kill()
-    wait_for(lambda: scans.subscriber_count == 0)
-    began_s = time.monotonic()
-    for number in range(100):
-        assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
-    assert time.monotonic() - began_s < 50.0  # its patience of a minute is not used up
-
-
-def test_cpp_publisher_takes_slots_of_the_dead_back(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
-    """A reader that is killed with all slots of its share leaves them to the next one."""
-    node = make_node()
-    start("publish", "/scan", -1, 20_000)
-    slow = start("count", "/scan", "reliable", 20_000, 3)
-    # More than the ring has slots: the reader has as many as it may.
-    wait_for(lambda: any(found.published > 45 for found in publishers_in_cpp(node)))
-    slow.process.kill()
-    scans = node.subscriber("/scan", Scan, policy=reliable(8, SOON_S))
-    first = scans.recv(SOON_S).stamp_ns
-    began_s = time.monotonic()
-    for number in range(first + 1, first + 200):
-        assert scans.recv(SOON_S).stamp_ns == number
-    assert time.monotonic() - began_s < 50.0
-    assert scans.counters.lost == 0
-
-
-def test_killed_cpp_publisher_leaves_no_trace(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
-    node = make_node()
-    scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    peer = start("publish", "/scan", 10, 20_000)
-    held = [scans.recv(SOON_S) for _ in range(3)]
-    peer.process.kill()
-    wait_for(lambda: not any(record.name == "cpp" for record in node.nodes()))
-    assert [int(scan.ranges[0]) for scan in held] == [0, 1, 2]  # what was received stays
 
 
 def test_lies_are_rejected(

@@ -78,7 +78,8 @@ def start_cpp(
         authorize(places[name], load_keys(places["python"]).public)
         with monkeypatch.context() as environment:
             environment.setenv("CORTEX_TEST_REGISTRY", str(registry.address))
-            environment.setenv("CORTEX_TEST_KEYS", str(places[name]))
+            environment.setenv("HOME", str(places[name].parent))
+            environment.setenv("CORTEX_TEST_KEYS", f"~/{places[name].name}")
             environment.setenv("CORTEX_TEST_LISTEN", "127.0.0.1")
             environment.setenv("CORTEX_RUNTIME_DIR", str(elsewhere))
             command = [programs / "peer", *map(str, arguments)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from peer import Scan
+from peer import Scan, connect
 from processes import SOON_S
 
 from cortex import keep_last, latest, reliable
@@ -40,9 +40,7 @@ def test_messages_find_the_memory_that_was_made_before_them(node, policy):
 
 
 def test_a_larger_message_than_expected_makes_memory_of_its_own(node):
-    publisher = node.publisher("/large", Scan, expected_bytes=EXPECTED)
-    subscriber = node.subscriber("/large", Scan, policy=latest())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/large", Scan, latest(), expected_bytes=EXPECTED)
     publisher.publish(scan(1, 3 * EXPECTED))
     message = subscriber.recv(SOON_S)
     assert (message.stamp_ns, message.ranges.nbytes) == (1, 3 * EXPECTED)
@@ -67,9 +65,7 @@ def test_one_reader_more_is_given_its_share_when_it_comes(node):
 
 
 def test_small_messages_need_no_memory(node):
-    publisher = node.publisher("/large", Scan, expected_bytes=1000)
-    subscriber = node.subscriber("/large", Scan, policy=latest())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/large", Scan, latest(), expected_bytes=1000)
     publisher.publish(scan(1, 400))
     assert subscriber.recv(SOON_S).stamp_ns == 1
     assert slots_of(publisher) == (0, 0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import zmq
-from peer import Number, Scan, make
+from peer import Number, Scan, connect, make
 from processes import SOON_S
 
 from cortex.codec import codec_of, coder_of
@@ -137,21 +137,6 @@ def test_drain_passes_errors_on_and_keeps_count():
             path.drain(link, messages, 4, False)
 
 
-def test_frames_that_are_none_of_this_publisher():
-    lock, messages, frame = ReceiveLock(), deque(), frame_of(3, Scan)
-    path = make_fast_receive(lock, deque(), SubscriberCounters(), lambda link, frame: None)
-    others = [b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)]
-    script = Script(lock.lock, *others, frame, frame)
-    link = SimpleNamespace(receive=script, coder=coder_with_head(Scan), expected=3, clock_offset_ns=0)
-    with lock.lock:
-        for other in others:
-            assert path.drain(link, messages, 4, False) == other
-        assert path.drain(link, messages, 1, False) is None
-        assert list(messages) == [make(Scan, 3, 40)]
-        link.coder, link.expected = coder_of(codec_of(Scan), b""), 3  # it has no head
-        assert path.drain(link, messages, 4, False) == frame
-
-
 def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
     """It is not taken where it is free, but nobody passes one who has it."""
     publisher, subscriber = numbers
@@ -185,9 +170,7 @@ def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
 @pytest.mark.parametrize("size", [3, 50_000], ids=["small", "in a slot"])
 def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, monkeypatch, size):
     """It gets the lock before it gets the GIL, while another thread finds a frame that takes more care."""
-    publisher = node.publisher("/gap", Scan)
-    subscriber = node.subscriber("/gap", Scan, policy=reliable(64))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/gap", Scan, reliable(64))
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
     interval, got = sys.getswitchinterval(), []
     for number in range(3):

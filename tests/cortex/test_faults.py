@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 import pytest
-from peer import Block, Number, is_whole, make_block
+from peer import Block, is_whole, make_block
 from processes import SOON_S, fork_server, processes_with, shared_mappings, wait_for
 
 from cortex import keep_last, latest, reliable
@@ -124,7 +124,6 @@ def test_publishers_are_killed(make_node, start_child, runtime, tmp_path, policy
             count_file=str(count_file),
             forked=True,
         )
-        child.hear()
         first, known, last = accounted(), len(sources), -1
         end = None
         while end is None or time.monotonic() < end:
@@ -183,7 +182,6 @@ def test_subscribers_are_killed(make_node, start_child, runtime, policy):
     with Stream(publisher) as stream:
         for _ in range(max(KILLS // 5, 1)):
             child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=2, forked=True)
-            child.hear()
             wait_for(lambda child=child: child.ask()["count"] > 20)
             assert child.ask()["torn"] == 0
             assert publisher.subscriber_count == 2
@@ -216,7 +214,6 @@ def test_registries_are_killed(make_node, start_child, runtime):
     generator = random.Random(3)
     found_s = []
     child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=500.0)
-    child.hear()
     numbers = []
 
     def take(block):
@@ -247,7 +244,7 @@ def test_files_of_the_dead_are_removed(make_node, start_child, runtime):
     """The registry sweeps what a killed node has left."""
     node = make_node()
     child = start_child("peer", listen="127.0.0.1")
-    stem = f"{child.hear()['node']:016x}"
+    stem = f"{child.hello['node']:016x}"
     wait_for(lambda: len(node.nodes()) == 2)  # what dies before anybody knew it is swept by the next node
     assert len(list(runtime.glob(f"*/{stem}.*"))) == 5
     child.kill()
@@ -266,7 +263,6 @@ def test_a_subscriber_is_stopped(make_node, start_child, runtime, policy, sizes)
     """The publisher waits once, for as long as the policy says; the subscriber learns what it has missed."""
     publisher = make_node().publisher("/blocks", Block)
     child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=1)
-    child.hear()
     assert publisher.wait_for_subscribers(1, SOON_S)
 
     def accounted(found):
@@ -297,7 +293,6 @@ def test_a_subscriber_is_stopped(make_node, start_child, runtime, policy, sizes)
 def test_a_publisher_is_stopped(make_node, start_child, runtime):
     """It is not taken for dead, what it had sent is kept, and it goes on."""
     child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=500.0)
-    child.hear()
     node = make_node()
     subscriber = node.subscriber("/blocks", Block, policy=reliable(64, 60.0))
     last = subscriber.recv(SOON_S).number
@@ -319,34 +314,10 @@ def test_a_publisher_is_stopped(make_node, start_child, runtime):
 # Other faults
 
 
-def test_a_publisher_is_restarted(make_node, start_child, runtime):
-    """Under the same topic: the subscriber hears the new one, and counts no loss between two publishers."""
-    subscriber = make_node().subscriber("/numbers", Number, policy=reliable(64, 60.0))
-    sources = set()
-    for round_ in range(3):
-        child = start_child("peer", name=f"round {round_}")
-        child.hear()
-        child.ask(do="publisher", topic="/numbers", type="Number")
-        child.ask(do="await_subscribers", topic="/numbers")
-        child.say(do="publish", topic="/numbers", count=200, start=1000 * round_)
-        for value in range(200):
-            message, info = subscriber.recv_with_info(SOON_S)
-            assert (message.value, info.sequence) == (1000 * round_ + value, value)
-            sources.add(info.source)
-        child.hear()
-        if round_ == 1:
-            child.kill()
-        else:
-            child.finish()
-    assert len(sources) == 3
-    assert (subscriber.counters.received, subscriber.counters.lost) == (600, 0)
-
-
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(8, 60.0)], ids=str)
 def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
     """A limit on the size of files stands for a full memory: the messages go through the socket."""
     child = start_child("peer", limit_file_bytes=100_000)
-    child.hear()
     child.ask(do="publisher", topic="/blocks", type="Block")
     subscriber = make_node().subscriber("/blocks", Block, policy=policy)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
@@ -362,7 +333,6 @@ def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
 def test_no_memory_for_slots(make_node, start_child, runtime):
     """Readers of a ring go on through their sockets, in order: who is reliable and reads loses nothing."""
     child = start_child("peer", limit_file_bytes=1_000_000)
-    child.hear()
     child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(8, SOON_S))
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
@@ -381,8 +351,6 @@ def test_no_memory_for_slots(make_node, start_child, runtime):
 def test_no_memory_for_slots_and_a_reader_that_stands_still(start_child, runtime, policy):
     """The publisher waits for its time only; what came before is there, and what is lost is counted once."""
     child, reader = start_child("peer", limit_file_bytes=1_000_000), start_child("peer")
-    child.hear()
-    reader.hear()
     child.ask(do="publisher", topic="/blocks", type="Block")
     reader.ask(do="subscriber", topic="/blocks", type="Block", policy=policy)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]

@@ -13,19 +13,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cable import ADDRESSES, DEVICE, ip, two_hosts
+from processes import ROOT, SOON_S, Child
 
 from cortex.security import AUTHORIZED_FILE, Keys, new_keys
-
-ROOT = Path(__file__).resolve().parents[2]
-NODE = Path(__file__).with_name("discovery_node.py")
-SOON_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +74,6 @@ class Process:
                 if match := re.search(pattern, line):
                     return match
         return None
-
-    def sees(self, *names: str, timeout_s: float = SOON_S) -> bool:
-        return self.read(re.escape(f'"names": {json.dumps(sorted(names))}'), timeout_s) is not None
 
     def signal(self, number: int) -> None:
         self._process.send_signal(number)
@@ -139,57 +133,70 @@ def serve(start, host: str, *options: str) -> tuple[Process, str]:
     return registry, match[1]
 
 
-def node(start, host: str, name: str, **options) -> Process:
-    return start(host, str(NODE), json.dumps({"name": name, **options}))
+@pytest.fixture
+def node(start_child, place) -> Callable[..., Child]:
+    def start_node(host: str, name: str, **options: object) -> Child:
+        there = {"prefix": ["ip", "netns", "exec", host], "env": {"CORTEX_RUNTIME_DIR": str(place / host)}}
+        return start_child("peer", name=name, **there, **options)
+
+    return start_node
 
 
-def test_nodes_of_two_hosts_see_each_other_through_one_registry(hosts, start, keyring):
+def sees(child: Child, *names: str, timeout_s: float = SOON_S, always: Sequence[str] = ()) -> bool:
+    """Whether a node comes to know these, itself among them, and no others, some of them always."""
+    deadline_s = time.monotonic() + timeout_s
+    while (found := child.ask(do="nodes")["names"]) != sorted(names):
+        assert set(always) <= set(found)
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(2e-3)
+    return True
+
+
+def test_nodes_of_two_hosts_see_each_other_through_one_registry(hosts, start, node, keyring):
     _, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", "--keys", str(keyring.registry))
-    address = f"tcp://{ADDRESSES[0]}:{port}"
-    near = node(start, hosts[0], "near")
-    far = node(start, hosts[1], "far", registry=address, keys=str(keyring.friend))
-    assert near.sees("far"), near.said
-    assert far.sees("near"), far.said
+    near = node(hosts[0], "near")
+    far = node(hosts[1], "far", registry=f"tcp://{ADDRESSES[0]}:{port}", keys=str(keyring.friend))
+    assert sees(near, "near", "far")
+    assert sees(far, "near", "far")
     # The cable is pulled: the far node's lease runs out here, but it forgets nobody itself.
     ip("-n", hosts[1], "link", "set", DEVICE, "down")
-    assert near.sees(), near.said
-    assert not far.sees(timeout_s=1.5), far.said
+    assert sees(near, "near", always=["near"])
+    assert not sees(far, "far", timeout_s=1.5)
     ip("-n", hosts[1], "link", "set", DEVICE, "up")
-    assert near.sees("far"), near.said
-    far.signal(signal.SIGKILL)
-    assert near.sees(), near.said
+    assert sees(near, "near", "far")
+    far.kill()
+    assert sees(near, "near")
 
 
-def test_a_registry_on_another_host_that_is_killed_and_comes_back(hosts, start, keyring):
+def test_a_registry_on_another_host_that_is_killed_and_comes_back(hosts, start, node, keyring):
     options = ("--keys", str(keyring.registry))
     first, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", *options)
-    address = f"tcp://{ADDRESSES[0]}:{port}"
-    far = [node(start, hosts[1], f"far {k}", registry=address, keys=str(keyring.friend)) for k in range(2)]
-    assert far[0].sees("far 1"), far[0].said
-    assert far[1].sees("far 0"), far[1].said
-    before = len(far[0].said)
+    place = {"registry": f"tcp://{ADDRESSES[0]}:{port}", "keys": str(keyring.friend)}
+    far = [node(hosts[1], f"far {k}", **place) for k in range(2)]
+    assert all(sees(each, "far 0", "far 1") for each in far)
     first.signal(signal.SIGKILL)
     first.close()
     serve(start, hosts[0], "--listen", f"tcp://0.0.0.0:{port}", *options)
-    late = node(start, hosts[1], "late", registry=address, keys=str(keyring.friend))
-    assert late.sees("far 0", "far 1"), late.said
-    assert far[0].sees("far 1", "late"), far[0].said
-    assert not [line for line in far[0].said[before:] if "far 1" not in line]  # it was never forgotten
+    late = node(hosts[1], "late", **place)
+    assert sees(far[0], "far 0", "far 1", "late", always=["far 1"])  # it was never forgotten
+    assert sees(late, "far 0", "far 1", "late")
 
 
 @pytest.mark.parametrize("keys", ["stranger", None])
-def test_a_stranger_sees_nobody_and_is_seen_by_nobody(hosts, start, keyring, keys):
+def test_a_stranger_sees_nobody_and_is_seen_by_nobody(hosts, start, node, keyring, keys):
     registry, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", "--keys", str(keyring.registry))
     address = f"tcp://{ADDRESSES[0]}:{port}"
-    near = node(start, hosts[0], "near")
-    directory = str(getattr(keyring, keys)) if keys else None
-    stranger = node(start, hosts[1], "stranger", registry=address, keys=directory, insecure=keys is None)
-    friend = node(start, hosts[1], "friend", registry=address, keys=str(keyring.friend))
-    assert friend.sees("near"), friend.said
-    assert near.sees("friend"), near.said
-    assert not stranger.sees("friend", "near", timeout_s=1.5), stranger.said
-    assert not any('"connected": true' in line for line in stranger.said)
-    assert not any("stranger" in line for line in near.said + friend.said)
+    near = node(hosts[0], "near")
+    options = {"keys": str(getattr(keyring, keys))} if keys else {"insecure": True}
+    stranger = node(hosts[1], "stranger", registry=address, **options)
+    friend = node(hosts[1], "friend", registry=address, keys=str(keyring.friend))
+    assert sees(friend, "friend", "near")
+    assert sees(near, "friend", "near")
+    assert not sees(stranger, "friend", "near", "stranger", timeout_s=1.5)
+    assert stranger.ask(do="nodes") == {"names": ["stranger"], "connected": False}
+    assert sees(near, "friend", "near")
+    assert sees(friend, "friend", "near")
     if keys:
         assert registry.read("refused key"), registry.said
 

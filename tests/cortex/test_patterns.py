@@ -45,7 +45,6 @@ def test_a_pattern_hears_all_topics_of_its_type(make_node, start_child):
     other = node.publisher("/b/number", OtherNumber)
     subscriber = make_node("reader").subscriber("/*/number", Number, policy=reliable())
     child = start_child("peer")
-    child.hear()
     child.ask(do="publisher", topic="/c/number", type="Number")
     last = node.publisher("/d/number", Number)
     for publisher in (first, last):
@@ -79,7 +78,6 @@ def test_a_callback_for_publishers_that_come_and_die(make_node, start_child):
     took_s = []
     for _ in range(3):
         child = start_child("peer", name="there")
-        child.hear()
         seen.clear()
         child.ask(do="publisher", topic="/b/number", type="Number")
         child.ask(do="publisher", topic="/other", type="Number")

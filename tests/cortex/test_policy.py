@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from peer import Number, Scan, memory
+from peer import Number, Scan, connect, memory
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
@@ -20,9 +20,7 @@ MANY = int(os.environ.get("CORTEX_MESSAGES", "100000"))
 
 def connected(node, policy, **options):
     """A publisher and a subscriber of one node."""
-    publisher = node.publisher("/numbers", Number, **options)
-    subscriber = node.subscriber("/numbers", Number, policy=policy)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/numbers", Number, policy, **options)
     assert subscriber.wait_for_publisher(SOON_S)
     return publisher, subscriber
 
@@ -87,26 +85,10 @@ def test_latest_gives_the_newest_at_once(node):
     assert take_all(subscriber) == []
 
 
-@pytest.mark.parametrize("policy", [latest(), keep_last(10)], ids=str)
-def test_the_newest_after_a_long_absence(make_node, start_child, policy):
-    """A reader that was away for 20 000 messages, more than the sockets hold, finds the last ones."""
-    child = start_child("peer")
-    child.hear()
-    child.ask(do="publisher", topic="/numbers", type="Number")
-    subscriber = make_node().subscriber("/numbers", Number, policy=policy)
-    assert subscriber.wait_for_publisher(SOON_S)
-    child.ask(do="publish", topic="/numbers", count=20_000, rate_hz=20_000)
-    depth, counters = policy.depth, subscriber.counters
-    wait_for(lambda: counters.overtaken + counters.lost == 20_000 - depth)
-    assert [subscriber.recv(SOON_S).value for _ in range(depth)] == list(range(20_000 - depth, 20_000))
-    assert counters.received == depth
-
-
 @pytest.mark.alone
 def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
     """Age of the datum: with 5 ms of work for each message at 2 kHz, what is read was published just now."""
     child = start_child("peer")
-    child.hear()
     child.ask(do="publisher", topic="/numbers", type="Number")
     subscriber = make_node().subscriber("/numbers", Number, policy=latest())
     assert subscriber.wait_for_publisher(SOON_S)
@@ -136,7 +118,6 @@ def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
 def test_every_message_of_a_reliable_stream_comes_in_order(make_node, start_child, place):
     """Received + lost == sent, and lost 0, whatever the pace of the two; and neither of them grows by it."""
     child = start_child("peer", **place)
-    child.hear()
     child.ask(
         do="subscriber",
         topic="/numbers",
@@ -196,34 +177,15 @@ def test_back_pressure_has_an_end(node):
     assert publisher.counters.timeouts >= lost
 
 
-def test_back_pressure_of_large_messages(node):
-    """A reader that keeps its views holds up the publisher, and no longer than allowed."""
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=2, timeout_s=0.05))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    ranges = np.zeros(100_000, np.float32)
-    delivered = []
-    while all(delivered) or len(delivered) < 3:
-        assert len(delivered) < 1000
-        begin = time.monotonic()
-        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
-    assert 0.045 < time.monotonic() - begin < 10.0
-    received = [subscriber.recv(SOON_S).stamp_ns for _ in range(sum(delivered))]
-    assert received == [number for number, came in enumerate(delivered) if came]
-    assert publisher.publish(Scan(-1, ranges))
-    assert subscriber.recv(SOON_S).stamp_ns == -1
-    assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
-
-
 def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=4, timeout_s=1.0))
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(node, "/scans", Scan, reliable(depth=4, timeout_s=1.0))
     ranges = np.zeros(50_000, np.float32)
     delivered = []
     while all(delivered):
+        begin = time.monotonic()
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert 0.9 < time.monotonic() - begin < 10.0
     begin = time.monotonic()
     for _ in range(20):
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
@@ -236,23 +198,6 @@ def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
 
 
-def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
-    publisher, subscriber = connected(node, reliable(depth=4, timeout_s=60.0))
-    received = []
-
-    def take(message):
-        time.sleep(20e-6)
-        received.append(message.value)
-
-    other = node.subscriber("/numbers", Number, take, policy=reliable(depth=2, timeout_s=60.0))
-    assert publisher.wait_for_subscribers(2, SOON_S)
-    subscriber.close()
-    assert all(publisher.publish(Number(0, value)) for value in range(5000))
-    wait_for(lambda: len(received) == 5000)
-    assert received == list(range(5000))
-    assert other.counters.lost == 0
-
-
 def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_child):
     """On one topic: the first is stopped, the second gets everything, the publisher waits for neither."""
     stopped, steady = start_child("peer", name="stopped"), start_child("peer", name="steady")
@@ -260,7 +205,6 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
         (stopped, ["keep_last", {"depth": 10}]),
         (steady, ["reliable", {"timeout_s": 60.0}]),
     ):
-        child.hear()
         child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
     publisher = make_node().publisher("/numbers", Number)
     assert publisher.wait_for_subscribers(2, SOON_S)

@@ -13,27 +13,24 @@ from pathlib import Path
 
 import pytest
 import zmq
+from damage import mutate
 from directories import (
-    ROOT,
     answers_unknown,
+    context,
     dealer,
     drive,
     drive_for,
     fake_registry,
+    make,
     make_record,
-    mutate,
-    node_maker,
-    node_process,
-    private_runtime,
     publisher,
-    read_until,
     receive,
     registry_pid,
     serving,
-    wait_for,
 )
-from processes import SOON_S
+from processes import ROOT, SOON_S, wait_for
 
+import cortex.registry
 from cortex.codec import MalformedMessage
 from cortex.discovery import main
 from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, runtime_dir
@@ -53,29 +50,15 @@ from cortex.registry import Registry, RegistryRunning, ensure_registry
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
 from cortex.wire import control_frame
 
+__all__ = ["context", "make"]
 
-@pytest.fixture(autouse=True)
-def base(monkeypatch):
-    yield from private_runtime(monkeypatch)
-
-
-@pytest.fixture
-def context():
-    with zmq.Context() as made:
-        made.linger = 0
-        yield made
-
-
-@pytest.fixture
-def make(context):
-    with node_maker(context) as make_node:
-        yield make_node
+pytestmark = pytest.mark.usefixtures("runtime")
 
 
 # The registry's process
 
 
-def test_many_processes_at_once_start_one_registry(base):
+def test_many_processes_at_once_start_one_registry():
     code = (
         "import sys, time\nfrom cortex.registry import ensure_registry\n"
         "print('ready', flush=True)\nsys.stdin.read()\nprint(ensure_registry(0, linger_s=20.0))"
@@ -97,8 +80,9 @@ def test_many_processes_at_once_start_one_registry(base):
     wait_for(registry_pid)
 
 
-def test_the_registry_is_detached_from_who_started_it(base):
+def test_the_registry_is_detached_from_who_started_it(monkeypatch):
     """It keeps none of our descriptors, our session, our directory or our standard streams."""
+    monkeypatch.setattr(cortex.registry, "_spawn", cortex.registry._spawn.real)
     read, write = os.pipe()
     os.set_inheritable(write, True)
     try:
@@ -124,14 +108,12 @@ def test_the_registry_is_detached_from_who_started_it(base):
         os.close(write)
 
 
-def test_the_registry_ends_after_the_last_node_even_if_all_were_killed(base):
-    with node_process("one") as one, node_process("two") as two:
-        read_until(one, lambda seen: seen["names"] == ["two"])
-        pid = registry_pid()
-        one.kill()
-        two.kill()
-        one.wait()
-        two.wait()
+def test_the_registry_ends_after_the_last_node_even_if_all_were_killed(start_child):
+    one, two = (start_child("peer", name=name) for name in ("one", "two"))
+    wait_for(lambda: one.ask(do="nodes")["names"] == ["one", "two"])
+    pid = registry_pid()
+    one.kill()
+    two.kill()
     wait_for(lambda: registry_pid() is None)
     wait_for(lambda: not Path(f"/proc/{pid}").exists())
     left = {path.name for path in runtime_dir(0).iterdir()}
@@ -139,7 +121,7 @@ def test_the_registry_ends_after_the_last_node_even_if_all_were_killed(base):
     assert (runtime_dir(0) / REGISTRY_LOG).read_text() == ""
 
 
-def test_two_registries_cannot_serve_one_domain(base, caplog):
+def test_two_registries_cannot_serve_one_domain(caplog):
     with serving() as first:
         with pytest.raises(RegistryRunning, match=f"process {os.getpid()}"):
             Registry(0)
@@ -241,7 +223,7 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
         for _ in range(20):
             socket = dealer(context)
             for _ in range(1000):
-                frames = [mutate(rng.choice(seeds), rng)]
+                frames = [mutate(rng, rng.choice(seeds))]
                 if rng.random() < 0.02:
                     frames.append(b"more")
                 socket.send_multipart(frames)
@@ -282,7 +264,7 @@ def test_mutated_answers_do_no_harm_to_a_directory(context, make):
     identity, _ = fake.recv_multipart()
     for _ in range(50):
         for _ in range(100):
-            fake.send_multipart([identity, mutate(rng.choice(seeds), rng)])
+            fake.send_multipart([identity, mutate(rng, rng.choice(seeds))])
         drive_for([node], 0.01)
     assert node.directory.rejected > 2500
     fake.close()
@@ -298,6 +280,7 @@ def test_a_record_that_no_node_of_ours_would_send_is_rejected():
     for bad in (
         dataclasses.replace(good, node=0),
         dataclasses.replace(good, revision=0),
+        *(dataclasses.replace(good, clock_offset_ns=offset_ns) for offset_ns in (2**62, -(2**63))),
         dataclasses.replace(good, publishers=[publisher("no slash")]),
         dataclasses.replace(good, publishers=[publisher("/a/../b")]),
         dataclasses.replace(good, publishers=[dataclasses.replace(publisher("/a"), source=0)]),
@@ -326,19 +309,20 @@ def test_a_heartbeat_on_another_connection_keeps_nobody_alive(context):
         stranger.close()
 
 
-def test_a_node_belongs_to_the_process_that_came_with_it(make):
+def test_a_node_belongs_to_the_process_that_came_with_it(make, start_child):
     """Another process of this host cannot put its record in its place, whatever revision it says."""
-    with serving(), node_process("owner", node=0xACE) as owner:
-        watcher = make("watcher")
+    with serving():
+        owner, watcher = start_child("peer", name="owner"), make("watcher")
+        node = owner.hello["node"]
         drive([watcher], lambda: watcher.names == ["owner"])
         thief = make("thief")
-        thief.record = make_record("thief", node=0xACE)
+        thief.record = make_record("thief", node=node)
         thief.directory._revision = 1000
         thief.directory.announce()
         drive_for([watcher, thief], 0.3)
-        assert watcher.directory.nodes[0xACE].name == "owner"
+        assert watcher.directory.nodes[node].name == "owner"
         owner.kill()
-        drive([watcher], lambda: not watcher.directory.nodes.get(0xACE))
+        drive([watcher], lambda: node not in watcher.directory.nodes)
 
 
 def test_a_node_belongs_to_its_key(make, tmp_path):

@@ -19,7 +19,7 @@ from peer import Block, Number, Scan, is_whole, make_block
 from processes import ROOT, SOON_S
 from wire_vectors import message_to_plain
 
-from cortex import Node, keep_last, reliable
+from cortex import keep_last, reliable
 from cortex.registry import ensure_registry
 from cortex.schema import schema_of
 
@@ -29,8 +29,24 @@ CARGO = shutil.which(
     "cargo", path=os.pathsep.join([os.environ.get("PATH", ""), str(Path.home() / ".cargo/bin")])
 )
 OLDEST = (1, 89)
+DEBIAN = Path("/usr/share/cargo/registry")
+"""Where `apt install librust-zmq-dev` and the like put crates: they are taken from there, if they are."""
+CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-derive,serde-json,zmq}-dev"
 PATIENCE_S = 900.0
 """After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
+
+
+def _cargo(*arguments: str, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
+    """Run cargo in the crate; builds are kept in `build/rust`, which cargo itself locks."""
+    assert CARGO is not None
+    command = [CARGO, *arguments]
+    if any(DEBIAN.glob("zmq-*")):
+        command += ["--offline", "--config", 'source.crates-io.replace-with="debian"']
+        command += ["--config", f'source.debian.directory="{DEBIAN}"']
+    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET)}
+    return subprocess.run(
+        command, cwd=CRATE, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False
+    )
 
 
 def _missing() -> str:
@@ -40,7 +56,8 @@ def _missing() -> str:
     found = re.match(r"cargo (\d+)\.(\d+)", shown)
     if found is None or (int(found[1]), int(found[2])) < OLDEST:
         return f"cargo {OLDEST[0]}.{OLDEST[1]} or newer is needed, this is {shown.strip()!r}"
-    return ""
+    found_crates = _cargo("fetch", timeout_s=60.0)
+    return f"no crates: apt install {CRATES}" if found_crates.returncode else ""
 
 
 MISSING = _missing()
@@ -48,10 +65,7 @@ pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"the Rust example cannot 
 
 
 def cargo(*arguments: str) -> str:
-    """Run cargo in the crate; builds are kept in `build/rust`, which cargo itself locks."""
-    assert CARGO is not None
-    command = [CARGO, arguments[0], "--offline", "--locked", "--target-dir", str(TARGET), *arguments[1:]]
-    done = subprocess.run(command, cwd=CRATE, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = _cargo(*arguments)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return done.stdout
 
@@ -141,35 +155,26 @@ def test_vectors():
     assert {"test bodies ... ok", "test frames ... ok", "test types ... ok"} <= set(output.splitlines())
 
 
+def blocks_of(count: int) -> list[Block]:
+    """Small messages, and every hundredth a large one."""
+    return [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(count)]
+
+
 @pytest.mark.parametrize("over", ["ipc", "tcp"])
 def test_reliable_from_python(start, make_node, over):
-    """Far more than all queues hold: the subscriber gets each message, and the publisher's end."""
-    publisher = make_node(listen="127.0.0.1").publisher("/numbers", Number, max_wait_s=SOON_S)
-    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once", *transport(over)))
-    assert publisher.wait_for_subscribers(1, SOON_S)
-    count = 10_000
-    delivered = sum(publisher.publish(Number(number, -number)) for number in range(count))
-    publisher.close()
-    messages, counted = reading.finish()
-    assert len(messages) == counted["received"]
-    assert counted["received"] + counted["lost"] == count
-    assert (counted["rejected"], counted["cut_off"]) == (0, 0)
-    assert counted["received"] >= delivered
-    if delivered == count:  # nobody had to wait for longer than the reader asks for
-        assert messages == [{"stamp_ns": number, "value": -number} for number in range(count)]
-
-
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_small_and_large_messages_from_python(start, make_node, over):
+    """More than all queues hold: the subscriber gets each message, and the publisher's end."""
     publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, max_wait_s=SOON_S)
     reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
     assert publisher.wait_for_subscribers(1, SOON_S)
-    blocks = [make_block(number, 20_000 if number % 10 == 9 else number) for number in range(100)]
-    assert all(publisher.publish(block) for block in blocks)
+    blocks = blocks_of(6_000)
+    delivered = sum(map(publisher.publish, blocks))
     publisher.close()
     messages, counted = reading.finish()
-    assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
-    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
+    assert len(messages) == counted["received"] >= delivered
+    assert counted["received"] + counted["lost"] == len(blocks)
+    assert (counted["rejected"], counted["cut_off"]) == (0, 0)
+    if delivered == len(blocks):  # nobody had to wait for longer than the reader asks for
+        assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
 
 
 @pytest.mark.parametrize("over", ["ipc", "tcp"])
@@ -179,10 +184,7 @@ def test_reliable_from_rust(start, make_node, over):
     publishing = Publishing(start("cortex-pub", "/blocks", *transport(over)), Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
     publishing.await_subscribers(1)
-    count, blocks = (
-        3_000,
-        [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(3_000)],
-    )
+    count, blocks = 3_000, blocks_of(3_000)
     closing: list[dict[str, int]] = []
 
     def feed() -> None:
@@ -222,7 +224,9 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     assert lost > 0
     publishing.publish(make_block(count, 5))
     assert subscriber.recv(SOON_S).number == count
-    assert publishing.close() == {"published": count + 1, "timeouts": lost}
+    counted = publishing.close()
+    assert counted["published"] == count + 1
+    assert lost <= counted["timeouts"] <= lost + 1  # it may not have heard yet that we read again
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
 
 
@@ -244,18 +248,6 @@ def test_several_subscribers_of_rust(start, make_node):
     assert publishing.close() == {"published": 1, "timeouts": 0}
 
 
-def test_rust_to_rust(start):
-    reading = Reading(start("cortex-sub", "/numbers", "--reliable", "--once"))
-    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
-    publishing.await_subscribers(1)
-    for number in range(100):
-        publishing.publish(Number(number, number * number))
-    assert publishing.close() == {"published": 100, "timeouts": 0}
-    messages, counted = reading.finish()
-    assert messages == [{"stamp_ns": number, "value": number * number} for number in range(100)]
-    assert counted == {"received": 100, "lost": 0, "rejected": 0, "cut_off": 0}
-
-
 def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     """Connected peers go on; who comes later is found through the registry that takes over."""
     publishing = Publishing(start("cortex-pub", "/numbers"), Number)
@@ -268,17 +260,3 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     publishing.publish(Number(1, 2))
     assert first.recv(SOON_S) == second.recv(SOON_S) == Number(1, 2)
     assert publishing.close() == {"published": 1, "timeouts": 0}
-
-
-def test_a_killed_rust_publisher_is_gone(start, make_node):
-    process = start("cortex-pub", "/numbers")
-    publishing = Publishing(process, Number)
-    node: Node = make_node()
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(8))
-    publishing.await_subscribers(1)
-    publishing.publish(Number(1, 2))
-    assert subscriber.recv(SOON_S) == Number(1, 2)
-    process.kill()
-    while any(record.publishers for record in node.nodes()):
-        with pytest.raises(TimeoutError):
-            subscriber.recv(0.01)

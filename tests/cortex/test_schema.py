@@ -8,8 +8,6 @@ import copy
 import dataclasses
 import hashlib
 import json
-import subprocess
-import sys
 from typing import Annotated, Any
 
 import numpy as np
@@ -22,8 +20,6 @@ from cortex import schema as schema_module
 from cortex.codec import codec_of
 from cortex.message import Array, Unit, message
 from cortex.schema import (
-    DTYPE_NAMES,
-    SCALAR_SIZES,
     ArrayType,
     EnumType,
     Field,
@@ -201,72 +197,6 @@ def test_a_fixed_part_at_the_limit_has_a_codec():
     codec = codec_of(type_from_schema(schema))
     assert codec.fixed_size == 2**30
     assert Schema("a", (field(ArrayType("uint8", (2**31, "n"))),))
-
-
-CHANGES = {
-    "name": lambda s: dataclasses.replace(s, name=s.name + "x"),
-    "order": lambda s: dataclasses.replace(s, fields=s.fields[::-1]),
-    "field left out": lambda s: dataclasses.replace(s, fields=s.fields[1:]),
-    "field added": lambda s: dataclasses.replace(s, fields=(*s.fields, field(name="added_last"))),
-    "field name": lambda s: with_first(s, name="renamed_1st"),
-    "unit": lambda s: with_first(s, unit=s.fields[0].unit[:60] + "x"),
-    "frame": lambda s: with_first(s, frame=s.fields[0].frame[:60] + "x"),
-    "optional": lambda s: with_first(s, type=ListType(s.fields[0].type)),
-}
-
-
-def with_first(schema: Schema, **changes: Any) -> Schema:
-    return dataclasses.replace(
-        schema, fields=(dataclasses.replace(schema.fields[0], **changes), *schema.fields[1:])
-    )
-
-
-@given(schemas.filter(lambda schema: len(schema.fields) > 1), st.sampled_from(sorted(CHANGES)))
-def test_every_change_of_structure_changes_the_fingerprint(schema, change):
-    try:
-        changed = CHANGES[change](schema)
-    except SchemaError:  # a list around a type that is as deep as can be
-        return
-    assert changed != schema
-    assert changed.fingerprint != schema.fingerprint
-
-
-def test_every_change_of_a_type_changes_the_fingerprint():
-    arrays = [
-        ArrayType(dtype, shape)
-        for dtype in (*DTYPE_NAMES, "any")
-        for shape in ((), ("n",), ("m",), (3,), (4,), ("n", 3), (3, "n"), ("n", "n"), ("n", "m"))
-    ]
-    enums = [
-        EnumType(name, values)
-        for name in ("E", "F")
-        for values in ((("A", 0),), (("A", 1),), (("B", 0),), (("A", 0), ("B", 1)), (("B", 1), ("A", 0)))
-    ]
-    plain: list[Any] = [*SCALAR_SIZES, "str", "bytes", *arrays, *enums]
-    kinds = [
-        *plain,
-        *(ListType(kind) for kind in plain),
-        *(OptionalType(kind) for kind in plain),
-        *(Schema("S", (field(kind),)) for kind in plain),
-    ]
-    prints = {Schema("a", (field(kind),)).fingerprint for kind in kinds}
-    assert len(prints) == len(kinds) > 500
-
-
-def test_the_fingerprint_is_the_same_in_every_process():
-    program = "from cortex.messages import Events; print(Events.__cortex_fingerprint__)"
-    prints = {
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env={"PYTHONHASHSEED": seed, "PYTHONPATH": ":".join(sys.path)},
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=300.0,
-        ).stdout
-        for seed in ("0", "1")
-    }
-    assert len(prints) == 1
 
 
 def test_description_shows_the_structure():

@@ -34,13 +34,6 @@ def double(request):
     return Number(request.stamp_ns, 2 * request.value)
 
 
-def served(child, name="/double"):
-    """A child that offers a service; its hello."""
-    hello = child.hear()
-    child.ask(do="serve", name=name)
-    return hello
-
-
 # Replies
 
 
@@ -70,16 +63,6 @@ def test_a_call_is_answered(node):
         assert client.available()
         for value in range(50):
             assert client.call(Number(value, value), SOON_S) == Number(value, 2 * value)
-
-
-def test_a_call_between_processes(make_node, start_child):
-    """Found through discovery; the deadline covers finding it."""
-    child = start_child("peer")
-    served(child)
-    client = make_node().client("/double", Number, Number)
-    assert client.call(Number(0, 21), timeout_s=SOON_S) == Number(child.pid, 42)
-    assert child.ask(do="serve", name="/other") == {}
-    client.close()
 
 
 # Failures
@@ -363,7 +346,7 @@ def test_a_handler_that_calls_its_own_node(node, caplog):
 def test_a_server_that_is_killed_during_a_call(make_node, start_child):
     """The caller hears of it when the server's lease is over, long before its own deadline."""
     child = start_child("peer")
-    served(child)
+    child.ask(do="serve", name="/double")
     with make_node().client("/double", Number, Number) as client:
         assert client.call(Number(0, 1), timeout_s=SOON_S).value == 2
 
@@ -377,7 +360,7 @@ def test_a_server_that_is_killed_during_a_call(make_node, start_child):
             client.call(Number(100_000, 1), timeout_s=SOON_S)
         killer.join()
         other = start_child("peer")
-        served(other)
+        other.ask(do="serve", name="/double")
         assert client.call(Number(0, 3), timeout_s=SOON_S) == Number(other.pid, 6)
 
 

@@ -40,17 +40,6 @@ def test_what_is_sent_arrives(pair, direct):
     assert [receive(0) for _ in FRAMES] == FRAMES
 
 
-def test_parts_of_a_message_keep_together(pair):
-    left, right = pair
-    sender, receiver = Frames(left), Frames(right)
-    sender.send(b"head", zmq.SNDMORE)
-    left.send(b"body" * 30_000, copy=False)
-    assert receiver.receive(0) == b"head"
-    assert right.get(zmq.RCVMORE)
-    assert right.recv() == b"body" * 30_000
-    assert not right.get(zmq.RCVMORE)
-
-
 def test_nothing_there_and_no_room(pair):
     _, right = pair
     receiver = Frames(right)

@@ -133,6 +133,7 @@ def test_surfaces_come_in_the_type_that_is_asked_for(make, dtype):
 def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
     """In the same environment and in another one, with all that is drawn, sensors, and a world that ended."""
     drawn = Randomisation(lag_s=(0.01, 0.05), latency_steps=2, mass_factor=(0.9, 1.1), wind_m_s=1.0)
+    drawn = dataclasses.replace(drawn, mount_rad=0.1, focal_factor=(0.9, 1.1), light_factor=(0.02, 1.0))
     options = {"randomise": drawn, "sensors": {"imu": {"kind": "imu", "rate_hz": 100}}}
     actions = actions_of(25, 3)
     actions[:, 0, 0] = -1.0
@@ -405,7 +406,7 @@ def test_a_fast_turn_loses_no_events(make):
 
 def test_the_rate_counts_steps_of_all_worlds(hall):
     """Episodes are cut where that is asked for only, and as many as that in each step."""
-    from neurosim_core.learn.rate import measure_steps
+    from neurosim_core.learn.rate import measure_steps, measure_updates
 
     env = ns.learn.make_env("hover", worlds=8, device="cpu", pixels=8, models=[hall])
     cut = 0
@@ -423,3 +424,5 @@ def test_the_rate_counts_steps_of_all_worlds(hall):
     assert cut == 0
     measure_steps(env, ending=2, seconds=0.1)
     assert cut >= 2 * (5 + 3 + 5)
+    rate, least, most = measure_updates(env)
+    assert 0.0 < least <= rate <= most

@@ -70,8 +70,7 @@ def test_a_policy_in_cpp_commands_what_one_in_python_does(tmp_path, runtime):
                 expected = pilot.act(t, x, y, polarity, stamp_ns=stamp_ns, orientation=q, body_rate=rate)
                 assert command.stamp_ns == stamp_ns
                 acted.append(np.array([command.thrust_n, *command.body_rate]))
-                # surfaces in Python are in 1/65536, and summed in another order
-                np.testing.assert_allclose(acted[-1], [expected.thrust_n, *expected.body_rate], atol=2e-4)
+                np.testing.assert_allclose(acted[-1], [expected.thrust_n, *expected.body_rate], atol=1e-5)
             states.publish(state)
             again = commands.recv(SOON_S)
             np.testing.assert_array_equal([again.thrust_n, *again.body_rate], acted[-1])

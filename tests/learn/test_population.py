@@ -18,6 +18,8 @@ pytest.importorskip("ray", reason="needs the extra distributed")
 pytest.importorskip("onnx", reason="needs the extra learn")
 pytest.importorskip("tensorboard", reason="needs the extra learn")
 
+from neurosim_core.cli import main  # noqa: E402
+from neurosim_core.learn import population  # noqa: E402
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.population import _lacking, train_population  # noqa: E402
 from neurosim_core.learn.ppo import PpoConfig  # noqa: E402
@@ -96,3 +98,19 @@ def test_a_cluster_that_is_too_small_is_told(tmp_path):
     for configs, workers in (({"a": CONFIG}, 0), ({}, 1)):
         with pytest.raises(ValueError, match="1 training and 1 worker at least"):
             train_population(tmp_path, configs, workers=workers)
+
+
+def test_without_an_address_the_cluster_is_that_of_this_machine(tmp_path, monkeypatch):
+    asked: dict[str, object] = {}
+    monkeypatch.setattr(population, "train_population", lambda folder, configs, **given: asked.update(given))
+    assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray", "--workers", "2"]) == 0
+    assert asked == {"address": "auto", "workers": 2}
+
+
+def test_where_no_cluster_runs_that_is_said(tmp_path, monkeypatch, capsys):
+    def init(address, **_):
+        raise ConnectionError("Could not find any running Ray instance")
+
+    monkeypatch.setattr("ray.init", init)
+    assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray"]) == 1
+    assert "no Ray cluster on this machine (`ray start --head` begins one)" in capsys.readouterr().err

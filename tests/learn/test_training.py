@@ -62,6 +62,7 @@ CONDITIONS = (
     "actions one step later",
     "three tenths of the actions lost",
     "three tenths of the event packets lost",
+    "lenses 0.9 to 1.1 times as long, k1 up to 0.05",
 )
 
 
@@ -135,10 +136,12 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
             surface[2 * scale : 2 * scale + 2] *= np.exp(-0.02 / tau_s)
             np.add.at(surface, (2 * scale + polarity, y, x), np.exp(-(20_000 * step - t) / (1e6 * tau_s)))
         vector = torch.tensor(np.concatenate([[0.0, 0.0, -1.0], 0.3 * rate]), dtype=torch.float32)[None]
-        seen = torch.tensor(surface, dtype=torch.float32)[None]
+        shown = pilot._surface.array.numpy()
+        np.testing.assert_allclose(shown[0], surface, atol=2e-4)  # sums are in 1/65536
+        seen = torch.tensor(shown)
         with torch.no_grad():
             action, memory = policy(seen, torch.cat([vector, action], dim=1), memory)
-        np.testing.assert_allclose(pilot.action, action[0], atol=2e-4)
+        np.testing.assert_allclose(pilot.action, action[0], atol=1e-5)
         card = pilot.card
         thrust_n = card["hover_thrust_n"] * (1.0 + card["thrust_span"] * pilot.action[0])
         assert command.thrust_n == pytest.approx(thrust_n)
@@ -276,6 +279,27 @@ def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     assert slow.metrics["speed_m_s"] < 0.7 * found["events"].metrics["speed_m_s"]
     with pytest.raises(ValueError, match="nowhere"):
         next(evaluate_run(tmp_path, scenes="nowhere", worlds=3))
+
+
+def test_a_run_says_how_far_a_block_has_come(tmp_path, hall, monkeypatch):
+    pytest.importorskip("tensorboard")
+    monkeypatch.setattr("neurosim_core.learn.train._TELL_S", 0.0)
+    said: list[str] = []
+    Training(tmp_path, small(block=4), say=said.append, models=[hall]).run(until=(4, 0))
+    assert [line.split()[1] for line in said] == ["1/4:", "2/4:", "3/4:", "4/4"]
+    assert all(line.startswith("teacher ") and "reward" in line for line in said)
+
+
+def test_a_run_sees_events_as_it_is_told(tmp_path, hall):
+    pytest.importorskip("tensorboard")
+    training = Training(tmp_path, small(surface="time", rate_hz=25.0), models=[hall])
+    card = make_card(training.env, "brief-hover")["surface"]
+    assert card["kind"] == "TimeSurface"
+    np.testing.assert_allclose(card["tau_s"], (0.04, 0.12, 0.6))  # of the task, for steps twice as long
+    training.run(until=(2, 2))
+    assert next(evaluate_run(tmp_path, scenes=str(hall.config.scene.file), worlds=1))[0] == "events"
+    with pytest.raises(ValueError, match="unknown surface 'voxel', known: leaky, time, counts, voxels"):
+        small(surface="voxel")
 
 
 def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):

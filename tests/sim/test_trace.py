@@ -109,8 +109,8 @@ def test_camera_pose_is_body_pose_times_mount(device):
     trace.camera_poses(
         wp.array([2], dtype=int, device=device),
         count=1,
-        p_BC=wp.vec3d(*mount.position_m),
-        q_BC=wp.quatd(*mount.optical_quaternion()),
+        p_BC=wp.array([mount.position_m], dtype=wp.vec3d, device=device),
+        q_BC=wp.array([mount.optical_quaternion()], dtype=wp.quatd, device=device),
         p_WC=p_WC,
         q_WC=q_WC,
         stamps=wp.zeros((0, 1), dtype=wp.int64, device=device),

@@ -204,7 +204,7 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
 
     # noise and arbiters begin at once, from arrays that are ready
     noise, readout = event_noise.PixelNoise, event_readout.Readout
-    for owner, name in ((noise, "reset"), (noise, "_draw"), (readout, "reset")):
+    for owner, name in ((noise, "_draw"), (readout, "reset")):
         monkeypatch.setattr(owner, name, after_all(getattr(owner, name)))
     numpy, zero, fill = wp.array.numpy, wp.array.zero_, wp.array.fill_
 

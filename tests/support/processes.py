@@ -148,8 +148,17 @@ class Child:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(words).encode() + b"\n")
 
+    @functools.cached_property
+    def hello(self) -> dict[str, Any]:
+        """The first line that it prints, once it is ready."""
+        return self._next_line(SOON_S)
+
     def hear(self, within_s: float = SOON_S) -> dict[str, Any]:
-        """The next line that it prints."""
+        """The next line that it prints after that."""
+        assert self.hello
+        return self._next_line(within_s)
+
+    def _next_line(self, within_s: float) -> dict[str, Any]:
         assert self.process.stdout is not None
         deadline = time.monotonic() + within_s
         while b"\n" not in self._rest:

@@ -26,7 +26,7 @@ class RegistryForks:
     """Takes the place of `cortex.registry._spawn`; `real` is what it takes it from."""
 
     def __init__(self, real: Callable[[list[str], int, Path], None]) -> None:
-        self._real = real
+        self.real = real
         self._lock = threading.Lock()
         self._owner = os.getpid()
         self._socket, theirs = socket.socketpair()
@@ -43,7 +43,7 @@ class RegistryForks:
     def __call__(self, command: list[str], descriptor: int, log: Path) -> None:
         directory = os.environ[DIRECTORY]
         if os.getpid() != self._owner or len(directory) != len(_BLANK):
-            self._real(command, descriptor, log)
+            self.real(command, descriptor, log)
             return
         arguments = command[command.index("-m") + 2 : -1]  # all but the number of the descriptor
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC

@@ -24,7 +24,7 @@ _RANGES_M = (0.8, 1.6, 2.8, 4.5)
 _BEARINGS_RAD = tuple(math.radians(angle) for angle in (-70, -45, -25, -10, 0, 10, 25, 45, 70))
 _FAR_M = 2.0
 """Obstacles that are farther than this from a point leave it free."""
-_NEAR_M = 0.6
+_NEAR_M = 0.9
 """Distances to the scene below this cost something."""
 _SHARE = 0.75
 """Of the speed that is asked for, in the mean and towards the goal, to succeed."""
@@ -65,8 +65,8 @@ class Avoid(Task):
     }
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of twelve halls to train in, or of four others."""
-        return [_hall(seed) for seed in (range(100, 104) if unseen else range(12))]
+        """Return settings of 36 halls to train in, or of four others."""
+        return [_hall(seed) for seed in (range(100, 104) if unseen else range(36))]
 
     def routes(self, scene: SceneConfig) -> Routes | None:
         """Return ways along the hall, from one end to the other."""

@@ -32,14 +32,6 @@ for (int sample = 0; sample < samples; ++sample) {
         for (int lane = 0; lane < N; ++lane)
             for (int channel = 0; channel < 3; ++channel) total[channel][place_of(lane)] += radiance[channel][lane];
 }
-alignas(64) float luma[N];
 const float share = layers > 1 ? 1.0f / (float)(layers - 1) : 1.0f;
-for (int lane = 0; lane < N; ++lane) {
-    luma[lane] = 0.2126f * (share * total[0][lane]) + 0.7152f * (share * total[1][lane])
-                 + 0.0722f * (share * total[2][lane]);
-    luma[lane] = luma[lane] + scene.dark_floor;
-}
-for (int y = 0; y < rows; ++y) {
-    float* out = wp::address(log_radiance_out, instant, top + y, left);
-    for (int x = 0; x < columns; ++x) out[x] = wp::log(luma[SIDE * y + x]);
-}
+auto radiance_of = [&](int channel, int lane) { return share * total[channel][lane]; };
+#include "log_luma.cuh"

@@ -1,5 +1,6 @@
 // Radiance of N lanes: from `ray`, `spread`, `faces`, `ts`, `us`, `vs` and `normal` to `radiance`. Textures are
 // looked up twice, as `shading.py` says: `slope` [2][N] is the change of us and vs along the footprint [1/rad], 0: once.
+#include "logarithm.cuh"
 constexpr float COSINE_MIN = 0.05f;
 constexpr float TEXEL_UNIT[3] = {1.0f / (2047 * 2047), 1.0f / (2047 * 2047), 1.0f / (1023 * 1023)}; // as in `materials.py`
 alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
@@ -77,7 +78,7 @@ if (sampled) {
     }
     for (int lane = 0; lane < N; ++lane)
         lod[lane] = spread[lane] * ts[lane] / wp::max(wp::abs(facing[lane]), COSINE_MIN);
-    for (int lane = 0; lane < N; ++lane) lod[lane] = wp::log2(lod[lane]);
+    for (int lane = 0; lane < N; ++lane) lod[lane] = binary_logarithm(lod[lane]);
     for (int lane = 0; lane < N; ++lane) {
         const float wanted = lod[lane] + face_lods[lane] + scene.mip_bias;
         x[lane] = us[lane] * uv[0][0][lane] + vs[lane] * uv[0][1][lane] + w[lane] * uv[0][2][lane];

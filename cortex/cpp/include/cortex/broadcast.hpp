@@ -96,6 +96,8 @@ class RingReader {
   int state() const noexcept { return reader_.state; }
   // 1 if the publisher has taken us in, -1 if we cannot map its ring, else 0.
   int welcomed() noexcept { return cortex_reader_welcomed(&reader_); }
+  // The sequence of the first message for us, then.
+  std::uint64_t first() const noexcept { return reader_.first; }
   // Whether the next message waits, because too many large ones are kept.
   bool is_crowded() const noexcept { return is_crowded_; }
   // Leaves it out.

@@ -14,6 +14,7 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/clock.hpp"
 #include "cortex/codec.hpp"
 #include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
@@ -93,8 +94,8 @@ class Directory {
   // Whether `nodes` has changed since the last call.
   bool take_changed() noexcept { return std::exchange(changed_, false); }
 
-  // CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one, by the quickest of its latest answers; 0: not known.
-  std::int64_t clock_offset_ns() const noexcept { return clock_offset_ns_; }
+  // CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one; 0: not known.
+  std::int64_t clock_offset_ns() const { return clock_.offset_ns(monotonic_ns()); }
 
   // This node's record has changed; the next `tick` says so.
   void announce() noexcept { dirty_ = true; }
@@ -126,6 +127,7 @@ class Directory {
  private:
   static constexpr std::int64_t first_wait_ns = 2'000'000;
   static constexpr std::int64_t last_wait_ns = 50'000'000;
+  static constexpr std::int64_t clock_max_ns = std::int64_t{1} << 62;
 
   bool has_registry() const noexcept { return !address_.empty(); }
 
@@ -255,6 +257,7 @@ class Directory {
   void on_welcome(const records::Welcome& welcome, std::int64_t now_ns) {
     if (welcome.nodes.size() != welcome.revisions.size()) throw MalformedMessage("a welcome with lists of different lengths");
     greet(now_ns);
+    if (welcome.epoch != epoch_) clock_.forget();
     epoch_ = welcome.epoch;
     version_ = welcome.version;
     missing_.clear();
@@ -285,14 +288,10 @@ class Directory {
     if (alive.held != own_.revision) say_hello(now_ns, false);
   }
 
-  void read_clock(const wire::Header& header, std::int64_t now_ns) noexcept {
+  void read_clock(const wire::Header& header, std::int64_t now_ns) {
     const auto asked_ns = static_cast<std::int64_t>(header.sequence);
-    if (!net::is_tcp(address_) || asked_ns <= 0 || asked_ns > now_ns || header.publish_ns <= 0) return;
-    const std::int64_t trip_ns = now_ns - asked_ns;
-    trip_limit_ns_ += trip_limit_ns_ / 16;  // clocks drift: what was quick once does not count for ever
-    if (trip_ns > trip_limit_ns_) return;
-    trip_limit_ns_ = trip_ns;
-    clock_offset_ns_ = header.publish_ns - (asked_ns + trip_ns / 2);
+    const bool is_told = asked_ns > 0 && asked_ns < now_ns && header.publish_ns > 0 && header.publish_ns < clock_max_ns;
+    if (is_told && net::is_tcp(address_)) clock_.add(asked_ns, header.publish_ns, now_ns);
   }
 
   void on_changed(records::Changed changed) {
@@ -339,8 +338,7 @@ class Directory {
   std::uint64_t rejected_ = 0;
   std::int64_t tick_ns_ = 0;
   Nodes nodes_;
-  std::int64_t clock_offset_ns_ = 0;
-  std::int64_t trip_limit_ns_ = 10 * lease_ns;
+  ClockEstimate clock_;
   const std::string address_;  // of the registry; empty: there is none
   zmq::socket_t socket_;
   std::int64_t next_ns_ = 0;   // when to send the next heartbeat or `Hello`

@@ -80,11 +80,19 @@ class Link {
     if (leaving_ns != 0) leaving_ns = now_ns;
   }
 
+  // The publisher has left: what it wrote into its ring counts, also if its answer never came.
+  void leave() {
+    if (!attached_ && end_ != nullptr && end_->welcomed() > 0) enter_ring();
+  }
+
+  // Whether the publisher has said that nothing follows what has come.
+  bool has_ended() const noexcept { return marks_end_ && known_ && expected_ + 1 == ended_; }
+
   // The publisher has left, and all that came of it has been read: what it has published besides is lost.
   void end() {
     try {
       if (known_ && expected_ < reached_) advance(reached_, 0);
-      if (!policy_.is_reliable || !known_ || is_told_) return;
+      if (!policy_.is_reliable || !known_ || expected_ < ended_) return;
       ++counters_->cut_off;
       complaints_->once("cut off " + address_, "a publisher at " + address_ + " ended without saying how much it had sent");
     } catch (const MalformedMessage& error) {
@@ -147,7 +155,7 @@ class Link {
     key.reader = reader_ = random_number();
     key.shared_memory = shared_memory;
     key.strict = policy_.is_reliable;
-    key.confirms = policy_.is_reliable;
+    key.confirms = key.confirms_end = policy_.is_reliable;
     key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
     key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
     key_ = wire::pack_key(key, flags());
@@ -168,10 +176,7 @@ class Link {
       reject(error.what());
       // A message that was rejected is accounted for, if it is the one that was to come.
       const bool large = (header.kind == 'L' || header.kind == 'S') && header.source == source_;
-      if (large && known_ && header.sequence == expected_) {
-        ++expected_;
-        is_told_ = false;
-      }
+      if (large && known_ && header.sequence == expected_) ++expected_;
       return false;
     }
   }
@@ -214,7 +219,6 @@ class Link {
       if (policy_.is_reliable) confirm(sequence);  // the publisher may have given us up
     }
     known_ = true;
-    is_told_ = count == 0;
     expected_ = sequence + count;
     return true;
   }
@@ -263,10 +267,13 @@ class Link {
     }
   }
 
-  // Tells which number comes next, so that a loss at the end of a burst is known.
+  // Tells which number comes next, so that a loss at the end of a burst is known, or that none does.
   void on_next(const wire::Header& header, const Arrival& arrival) {
     if (header.body_size != 0 || arrival.bytes.size() != wire::header_size) throw MalformedMessage("a body where there is none");
-    if (advance(header.sequence, 0) && policy_.is_reliable && !in_ring_) confirm(header.sequence);
+    if (!advance(header.sequence, 0)) return;
+    const std::uint64_t last = header.aux & wire::last;
+    if (last != 0 || !marks_end_) ended_ = header.sequence + 1;
+    if (policy_.is_reliable && !in_ring_) confirm(header.sequence + last);
   }
 
   void on_slot(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
@@ -287,14 +294,16 @@ class Link {
     const bool first = !attached_;
     attached_ = true;
     reached_ = std::max(reached_, answer.sequence);
+    marks_end_ = answer.marks_end;
+    const bool known = known_;
     if (first && !use_ring()) {
       attached_ = false;
       return;  // it is asked again
     }
-    if (!first || known_) return;
-    if (!answer.latched.empty()) latched(answer.latched, queue);
     known_ = true;
-    expected_ = answer.sequence;
+    if (!known) expected_ = answer.sequence;
+    if (policy_.is_reliable && !in_ring_) confirm(expected_);
+    if (!known && !answer.latched.empty()) latched(answer.latched, queue);
   }
 
   void subscribe(char kind, bool wanted) {
@@ -309,10 +318,14 @@ class Link {
   bool use_ring() {
     const int welcomed = end_ == nullptr ? 0 : end_->welcomed();
     if (welcomed < 0) go_without_memory("its ring cannot be mapped");
-    if (welcomed <= 0) return welcomed == 0;
-    in_ring_ = true;
+    if (welcomed > 0) enter_ring();
+    return welcomed >= 0;
+  }
+
+  void enter_ring() {
+    in_ring_ = attached_ = true;
+    if (!std::exchange(known_, true)) expected_ = end_->first();  // what is lost counts from there on
     for (const char kind : {'M', 'N', 'L'}) subscribe(kind, false);
-    return true;
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
@@ -354,7 +367,8 @@ class Link {
   std::uint64_t reader_ = 0;
   bool attached_ = false;
   bool known_ = false;  // whether `expected_` is
-  bool is_told_ = false;  // whether the publisher has said so after its last message
+  bool marks_end_ = true;
+  std::uint64_t ended_ = 0;  // one more than the number at which the publisher said that the stream ends
   std::uint64_t expected_ = 0;
   std::uint64_t reached_ = 0;  // the highest number below which all has been given away
   std::uint64_t sample_ = 0;

@@ -174,10 +174,13 @@ class PublisherCore {
 
   // A reliable reader has accounted for all below a sequence; called under the lock.
   void resume(std::uint64_t number, std::uint64_t sequence) noexcept {
+    bool is_new = false;
     for (const auto& reader : readers_.all()) {
-      if (reader->request.reader == number) reader->confirmed = std::max(reader->confirmed, sequence);
+      if (reader->request.reader != number) continue;
+      reader->confirmed = std::max(reader->confirmed, sequence);
+      is_new = !std::exchange(reader->has_answer, true);
     }
-    if (sequence >= late_until_) is_late_ = false;  // else it was too late once more since
+    if (!is_new && sequence >= late_until_) is_late_ = false;  // else it was too late once more since, or another was
     if (closed_) settle();
   }
 
@@ -195,7 +198,7 @@ class PublisherCore {
   std::size_t reader_count() {
     const Lock lock(pub_sockets_->mutex);
     if (!pub_sockets_->closed) pub_sockets_->refresh();
-    return readers_.size();
+    return readers_.attached_count();
   }
 
   PublisherCounters counters() const {
@@ -250,10 +253,10 @@ class PublisherCore {
     pub_sockets_->refresh();
   }
 
-  // Says how many messages there were.
+  // Says how many messages there were, and at the end that there are no more.
   zmq::message_t last_frame() const {
     zmq::message_t frame(wire::header_size);
-    write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, 0);
+    write_header(static_cast<std::uint8_t*>(frame.data()), 'N', sequence_, 0, 0, closed_ ? wire::last : 0);
     return frame;
   }
 

@@ -23,7 +23,8 @@ struct Reader {
   wire::AttachKey request;
   PubSocket* pub_socket = nullptr;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the socket
-  std::uint64_t confirmed = 0;  // it has accounted for all below this
+  std::uint64_t confirmed = 0;  // it has accounted for all below this; the end of the stream counts as one
+  bool has_answer = false;      // whether it has said so, or need not
   bool is_moving = false;       // it was sent from the ring to its socket, and has not come there yet
 };
 
@@ -37,6 +38,11 @@ class Readers {
   bool has_members() const noexcept { return members_ > 0; }
   bool empty() const noexcept { return all_.empty(); }
   std::size_t size() const noexcept { return all_.size(); }
+  // Those that know from where on they count what they lose.
+  std::size_t attached_count() const noexcept {
+    const auto has_answer = [](const auto& reader) { return reader->has_answer; };
+    return static_cast<std::size_t>(std::count_if(all_.begin(), all_.end(), has_answer));
+  }
   // Those that the socket itself serves.
   std::size_t socket_count(const PubSocket& pub_socket) const noexcept { return pub_socket.strict ? strict_ : lossy_; }
 
@@ -49,6 +55,7 @@ class Readers {
     reader->request = request;
     reader->pub_socket = &pub_socket;
     if (request.shared_memory) join(*reader, first, listener);
+    reader->has_answer = reader->member >= 0 || !request.confirms_end;
     ++(reader->member >= 0 ? members_ : pub_socket.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -129,11 +136,12 @@ class Readers {
     if (has_members()) cortex_writer_give_up(ring_.get(), size, waited_ms);
   }
 
-  // Keeps those only that have yet to say that they have accounted for all below a sequence, which come through sockets.
+  // Keeps those only that have yet to say that they know of the end at a sequence, which come through sockets.
   void settle(std::uint64_t sequence) noexcept {
     ring_.reset();  // its readers keep what is in it
     const auto is_settled = [&](const auto& reader) {
-      return reader->member >= 0 || !reader->request.confirms || reader->confirmed >= sequence;
+      const auto& request = reader->request;
+      return reader->member >= 0 || !request.confirms || reader->confirmed >= sequence + (request.confirms_end ? 1 : 0);
     };
     all_.erase(std::remove_if(all_.begin(), all_.end(), is_settled), all_.end());
     const auto strict = std::count_if(all_.begin(), all_.end(), [](const auto& reader) { return reader->pub_socket->strict; });

@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <fstream>
 #include <iterator>
@@ -38,8 +39,8 @@ inline bool is_key(std::string_view text) {
 
 class Keys {
  public:
-  // Throws std::runtime_error if a key is missing, is none, or could be read or changed by others.
-  explicit Keys(std::string directory) : directory_(std::move(directory)) {
+  // Throws std::runtime_error if a key is missing, is none, or could be read or changed by others. A path may begin with "~/".
+  explicit Keys(const std::string& directory) : directory_(expand(directory)) {
     secret_ = first_word(read_private("key.secret", 077));
     public_ = first_word(read(directory_ + "/key.public"));
     if (!is_key(secret_) || !is_key(public_)) {  // never named: it may be the secret
@@ -97,6 +98,11 @@ class Keys {
     }
     if ((status.st_mode & forbidden) != 0) throw std::runtime_error(path + " is open to others: chmod go-rwx " + path);
     return read(path);
+  }
+
+  static std::string expand(const std::string& path) {
+    const char* home = std::getenv("HOME");
+    return home != nullptr && path.rfind("~/", 0) == 0 ? home + path.substr(1) : path;
   }
 
   static std::string first_word(const std::string& text) {

@@ -106,6 +106,7 @@ class SubscriptionCore {
                                       [&](const Source& source) { return source.source == link->source(); });
       const bool there = found != sources.end();
       if (there) link->clock_offset_ns = found->clock_offset_ns;
+      if (!there && link->leaving_ns == 0) link->leave();
       link->leaving_ns = there ? 0 : link->leaving_ns != 0 ? link->leaving_ns : monotonic_ns();
     }
     for (const auto& source : sources) {
@@ -135,7 +136,9 @@ class SubscriptionCore {
     if (!lock.owns_lock() || closed_) return;
     const bool waiting = !queue_.empty();
     drain();
-    const auto stays = [&](const auto& link) { return link->leaving_ns == 0 || now_ns - link->leaving_ns <= leaving_ns; };
+    const auto stays = [&](const auto& link) {
+      return link->leaving_ns == 0 || (!link->has_ended() && now_ns - link->leaving_ns <= leaving_ns);
+    };
     const auto gone = std::stable_partition(links_.begin(), links_.end(), stays);
     std::for_each(gone, links_.end(), [](const auto& link) { link->end(); });
     links_.erase(gone, links_.end());

@@ -32,6 +32,7 @@ constexpr std::size_t key_size = 32;     // of an attach key
 constexpr std::size_t resume_size = 32;  // of a resume key
 constexpr std::uint64_t jump_max = std::uint64_t{1} << 32;  // no source loses more messages at once
 constexpr std::uint8_t flag_stamp = 1;
+constexpr std::uint64_t last = 1;  // `aux` of a frame of kind N: nothing follows, the stream ends here
 constexpr std::uint64_t body_limit = std::uint64_t{1} << 30;
 constexpr std::uint64_t control_limit = 16u << 20;
 
@@ -112,6 +113,7 @@ struct AttachKey {
   std::uint8_t quota = 0;
   std::uint32_t timeout_ms = 0;
   bool confirms = false;  // it says how far it has read, when it is told how many messages there have been
+  bool confirms_end = false;  // it says so of the answer, too, and of the end of the stream
 };
 
 inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
@@ -120,7 +122,7 @@ inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
   write_prefix(out, 'A', flags, key.source);
   store(out + 16, key.reader);
   store(out + 24, static_cast<std::uint64_t>(key.shared_memory ? 1 : 0) | (key.strict ? 2u : 0u) | (key.confirms ? 4u : 0u) |
-                      static_cast<std::uint64_t>(key.quota) << 8 | static_cast<std::uint64_t>(key.timeout_ms) << 32);
+                      (key.confirms_end ? 8u : 0u) | static_cast<std::uint64_t>(key.quota) << 8 | static_cast<std::uint64_t>(key.timeout_ms) << 32);
   return bytes;
 }
 
@@ -153,6 +155,7 @@ inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
   key.shared_memory = (options & 1) != 0;
   key.strict = (options & 2) != 0;
   key.confirms = (options & 4) != 0;
+  key.confirms_end = (options & 8) != 0;
   key.quota = static_cast<std::uint8_t>(options >> 8);
   key.timeout_ms = static_cast<std::uint32_t>(options >> 32);
   return true;
@@ -161,6 +164,7 @@ inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
 struct AttachAnswer {
   std::uint64_t sequence = 0;
   Span<const std::uint8_t> latched;
+  bool marks_end = true;  // it will say when the stream ends; older versions did not
 };
 
 inline std::string pack_answer(const std::string& key, const AttachAnswer& answer) {
@@ -168,6 +172,7 @@ inline std::string pack_answer(const std::string& key, const AttachAnswer& answe
   std::memcpy(frame.data(), key.data(), key_size);
   auto* out = reinterpret_cast<std::uint8_t*>(frame.data()) + key_size;
   store(out, answer.sequence);
+  store(out + 8, static_cast<std::uint64_t>(answer.marks_end ? 1 : 0));
   store(out + 16, static_cast<std::uint64_t>(answer.latched.size()));
   frame.append(reinterpret_cast<const char*>(answer.latched.data()), answer.latched.size());
   return frame;
@@ -178,6 +183,7 @@ inline AttachAnswer read_answer(Span<const std::uint8_t> frame) {
   const std::uint8_t* at = frame.data() + key_size;
   AttachAnswer answer;
   answer.sequence = load<std::uint64_t>(at);
+  answer.marks_end = (load<std::uint64_t>(at + 8) & 1) != 0;
   const auto latched = load<std::uint64_t>(at + 16);
   if (latched > body_limit + header_size || frame.size() != header_size + latched) {
     throw MalformedMessage("an attach answer cannot hold its latched message");

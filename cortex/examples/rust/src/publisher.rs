@@ -1,178 +1,220 @@
-//! A publisher: its readers, each with a bounded queue, and how the reliable ones hold it up [A, E].
+//! A publisher: its readers, how the reliable ones hold it up, and its end [A, E].
 
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::collections::HashMap;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::json::Json;
-use crate::node::{monotonic_ns, random};
-use crate::wire::{CONFIRMS, Header, number};
-use crate::zmtp::{Message, Reader, Writer};
-use crate::{Result, body, schema};
+use anyhow::{Result, ensure};
+use nix::time::ClockId;
+use serde_json::{Value, json};
+use zmq::{Context, DONTWAIT, Socket, XPUB};
 
-const QUEUE: usize = 1000;
-const INLINE_MAX: usize = 16_384;
+use crate::body;
+use crate::node::{Node, clock_ns};
+use crate::schema::Schema;
+use crate::wire::{CONFIRMS, CONFIRMS_END, Header, LAST, MARKS_END, number};
+
+const SUBSCRIPTION_MAX: i64 = 1024;
 /// The longest that a reader may ask for.
 const MAX_WAIT: Duration = Duration::from_secs(60);
 const LINGER: Duration = Duration::from_millis(500);
 const SILENCE: Duration = Duration::from_millis(100);
+const AGAIN: Duration = Duration::from_millis(20);
 const PAUSE: Duration = Duration::from_micros(200);
 
-/// What a peer has asked for.
-#[derive(Default)]
-struct Wishes {
-    prefixes: Vec<Vec<u8>>,
-    reader: u64,
+/// What a reader has asked for, and below which sequence it has accounted for everything; none: it has no answer yet.
+struct Reader {
+    strict: bool,
     wait: Duration,
     confirms: bool,
-    confirmed: u64,
-    /// The sequence that it must have accounted for before it is waited for again; 0: it is in time.
-    lagging: u64,
-}
-
-/// One connection to an XPUB socket.
-struct Peer {
-    strict: bool,
-    queue: SyncSender<Arc<Message>>,
-    wishes: Mutex<Wishes>,
-}
-
-impl Peer {
-    /// Queue a message if it was subscribed to; false if a reliable reader has lost it.
-    fn push(&self, message: &Arc<Message>, sequence: u64) -> bool {
-        let begin = Instant::now();
-        loop {
-            let mut wishes = self.wishes.lock().unwrap();
-            let matches = wishes.prefixes.iter().any(|prefix| message[0].starts_with(prefix));
-            if !matches || !matches!(self.queue.try_send(message.clone()), Err(TrySendError::Full(_))) {
-                return true;
-            }
-            if !self.strict || wishes.lagging > 0 || begin.elapsed() >= wishes.wait {
-                wishes.lagging = if wishes.lagging > 0 { wishes.lagging } else { sequence + 1 };
-                return !self.strict;
-            }
-            drop(wishes);
-            thread::sleep(PAUSE);
-        }
-    }
+    /// How many sequences more than there were messages it confirms at the end.
+    end: u64,
+    confirmed: Option<u64>,
 }
 
 pub struct Publisher {
-    pub schema: Json,
-    pub source: u64,
-    fingerprint: u64,
-    /// The sequence that comes next, when the last message was sent, and how many messages were told of.
-    next: Mutex<(u64, Instant, u64)>,
-    peers: Mutex<Vec<Arc<Peer>>>,
+    node: Node,
+    lossy: Socket,
+    strict: Socket,
+    schema: Schema,
+    /// What all frames have in common.
+    head: Header,
+    /// By attach key.
+    readers: HashMap<Vec<u8>, Reader>,
+    /// The sequence that comes next: how many messages there have been.
+    pub next: u64,
+    /// Messages that some reliable reader may have lost.
+    pub timeouts: u64,
+    /// The sequence that a reliable reader must have accounted for before it is in time again.
+    late: Option<u64>,
+    silent: Instant,
+    tell_after: Duration,
 }
 
 impl Publisher {
-    pub fn new(schema: Json) -> Publisher {
-        let (fingerprint, next) = (schema::fingerprint(&schema), Mutex::new((0, Instant::now(), 0)));
-        Publisher { schema, source: random(), fingerprint, next, peers: Mutex::default() }
+    /// Publish a topic over "ipc" or "tcp".
+    pub fn open(context: &Context, topic: &str, schema: Schema, transport: &str) -> Result<Publisher> {
+        let mut node = Node::open(context)?;
+        let listen = |role| -> Result<(Socket, String)> {
+            let socket = context.socket(XPUB)?;
+            socket.set_linger(1000)?;
+            socket.set_maxmsgsize(SUBSCRIPTION_MAX)?;
+            let path = format!("ipc://{}", node.path(role).display());
+            socket.bind(if transport == "tcp" { "tcp://127.0.0.1:*" } else { &path })?;
+            let bound = socket.get_last_endpoint()?.unwrap_or(path);
+            Ok((socket, bound))
+        };
+        let ((lossy, lossy_address), (mut strict, strict_address)) = (listen("lossy")?, listen("strict")?);
+        set_nodrop(&mut strict, true)?;
+        let (source, fingerprint, stamped) = (rand::random(), schema.fingerprint(), schema.is_stamped());
+        node.announce(
+            json!([{"transport": transport, "lossy": lossy_address, "strict": strict_address, "control": "",
+                    "server_key": ""}]),
+            json!([{"topic": topic, "source": source, "type_name": schema.name, "fingerprint": fingerprint,
+                    "schema": schema.to_json(), "latch": false}]),
+            json!([]),
+        )?;
+        let head = Header { source, fingerprint, stamped, ..Header::default() };
+        let (readers, silent, tell_after) = (HashMap::new(), Instant::now(), SILENCE);
+        Ok(Publisher {
+            node,
+            lossy,
+            strict,
+            schema,
+            head,
+            readers,
+            next: 0,
+            timeouts: 0,
+            late: None,
+            silent,
+            tell_after,
+        })
     }
 
-    /// Serve a peer of the lossy or the strict socket until it goes.
-    pub fn serve(&self, strict: bool, mut reader: Reader, writer: Writer) {
-        let (queue, messages) = sync_channel::<Arc<Message>>(QUEUE);
-        let peer = Arc::new(Peer { strict, queue, wishes: Mutex::default() });
-        self.peers.lock().unwrap().push(peer.clone());
-        thread::spawn(move || messages.iter().all(|message| writer.send(&message).is_ok()));
-        while let Ok(message) = reader.receive() {
-            if let Some((on, key)) = message[0].split_first() {
-                self.subscribe(&peer, *on == 1, key);
-            }
+    /// How many readers count what they lose from here on [E7].
+    pub fn subscribers(&self) -> usize {
+        self.readers.values().filter(|reader| reader.confirmed.is_some()).count()
+    }
+
+    /// Send through the lossy or the strict socket; false if a reliable reader has no room.
+    fn send(&self, strict: bool, frame: &[u8]) -> Result<bool> {
+        match if strict { &self.strict } else { &self.lossy }.send(frame, DONTWAIT) {
+            Err(zmq::Error::EAGAIN) => Ok(false),
+            sent => Ok(sent.map(|_| true)?),
         }
-        self.peers.lock().unwrap().retain(|other| !Arc::ptr_eq(other, &peer));
     }
 
-    fn subscribe(&self, peer: &Peer, on: bool, key: &[u8]) {
-        let ours = key.len() == 32 && number(key, 8) == self.source;
-        match (if ours { key[3] } else { 0 }, on) {
-            (b'A', true) => {
-                let next = self.next.lock().unwrap(); // nothing is published meanwhile
-                let (mut wishes, options) = (peer.wishes.lock().unwrap(), number(key, 24));
-                wishes.wait = Duration::from_millis(options >> 32).min(MAX_WAIT);
-                (wishes.reader, wishes.confirms) = (number(key, 16), options & CONFIRMS != 0);
-                wishes.prefixes.push(key.to_vec());
-                drop(wishes);
-                let rest = [next.0, 0, 0, 0].map(u64::to_le_bytes).concat();
-                peer.push(&Arc::new(vec![[key, &rest].concat()]), next.0);
-            }
-            (b'R', true) => {
-                let (mut wishes, sequence) = (peer.wishes.lock().unwrap(), number(key, 24));
-                wishes.confirmed = wishes.confirmed.max(sequence);
-                wishes.lagging = if sequence >= wishes.lagging { 0 } else { wishes.lagging };
-            }
-            (_, true) => peer.wishes.lock().unwrap().prefixes.push(key.to_vec()),
-            (kind, false) => {
-                let mut wishes = peer.wishes.lock().unwrap();
-                wishes.reader = if kind == b'A' { 0 } else { wishes.reader };
-                let found = wishes.prefixes.iter().position(|prefix| prefix == key);
-                found.map(|index| wishes.prefixes.swap_remove(index));
-            }
-        }
+    /// Send to those reliable readers that have room. Libzmq passes over the others until they have read.
+    fn send_anyway(&mut self, frame: &[u8]) -> Result<()> {
+        set_nodrop(&mut self.strict, false)?;
+        self.send(true, frame)?;
+        set_nodrop(&mut self.strict, true)
     }
 
-    pub fn readers(&self) -> usize {
-        self.peers.lock().unwrap().iter().filter(|peer| peer.wishes.lock().unwrap().reader != 0).count()
+    /// The longest that readers of the strict socket wait; of those that have not confirmed a sequence.
+    fn longest_wait(&self, below: u64) -> Duration {
+        let waits = self.readers.values().filter(|reader| reader.strict && reader.confirmed < Some(below));
+        waits.map(|reader| reader.wait).max().unwrap_or_default()
     }
 
-    fn push(&self, message: Message, sequence: u64) -> bool {
-        let (message, peers) = (Arc::new(message), self.peers.lock().unwrap().clone());
-        peers.iter().map(|peer| peer.push(&message, sequence)).fold(true, |all, one| all & one)
-    }
-
-    fn header(&self, kind: u8, sequence: u64) -> Header {
-        let (source, fingerprint, stamped) = (self.source, self.fingerprint, schema::is_stamped(&self.schema));
-        Header { kind, stamped, source, fingerprint, sequence, publish_ns: monotonic_ns(), ..Header::default() }
-    }
-
-    /// Send a message; false if a reliable reader has lost it.
-    pub fn publish(&self, message: &Json) -> Result<bool> {
+    /// Send a message; false if a reliable reader may have lost it.
+    pub fn publish(&mut self, message: &Value) -> Result<bool> {
         let body = body::encode(&self.schema, message)?;
-        let mut next = self.next.lock().unwrap();
-        let mut header = self.header(if body.len() > INLINE_MAX { b'L' } else { b'M' }, next.0);
-        header.stamp_ns = if header.stamped { message.get("stamp_ns").int() as i64 } else { 0 };
-        header.size = body.len() as u64;
-        (next.0, next.1) = (next.0 + 1, Instant::now());
-        let frames = if header.kind == b'L' { vec![header.pack(), body] } else { vec![[header.pack(), body].concat()] };
-        Ok(self.push(frames, header.sequence))
-    }
-
-    /// Which sequence comes next, and the readers to whom that is to be sent.
-    fn news(&self, next: u64) -> (Arc<Message>, Vec<Arc<Peer>>) {
-        let peers = self.peers.lock().unwrap().clone();
-        let readers = peers.into_iter().filter(|peer| peer.wishes.lock().unwrap().reader != 0).collect();
-        (Arc::new(vec![self.header(b'N', next).pack()]), readers)
-    }
-
-    /// Tell readers after a silence how many messages there have been [G2]; to be called now and then.
-    pub fn tell(&self) {
-        let mut next = self.next.lock().unwrap();
-        if next.1.elapsed() > SILENCE && next.2 != next.0 {
-            let (news, readers) = self.news(next.0);
-            let told = readers.iter().all(|peer| peer.queue.try_send(news.clone()).is_ok());
-            next.2 = if told { next.0 } else { next.2 };
-        }
-    }
-
-    /// Say that the stream is over [E1], and wait until reliable readers have confirmed all of it [E2].
-    pub fn close(&self) {
-        let (next, begin) = (self.next.lock().unwrap().0, Instant::now());
-        let (last, mut untold) = self.news(next);
-        loop {
-            untold.retain(|peer| matches!(peer.queue.try_send(last.clone()), Err(TrySendError::Full(_))));
-            let owes = |peer: &Arc<Peer>| {
-                let wishes = peer.wishes.lock().unwrap();
-                wishes.confirms && wishes.confirmed < next && begin.elapsed() < wishes.wait
-            };
-            let written = untold.is_empty() && Arc::strong_count(&last) == 1; // else it waits in some queue
-            if (written || begin.elapsed() > LINGER) && !self.peers.lock().unwrap().iter().any(owes) {
-                return;
+        let stamp_ns = if self.head.stamped { message["stamp_ns"].as_i64().unwrap_or(0) } else { 0 };
+        let (publish_ns, size) = (clock_ns(ClockId::CLOCK_MONOTONIC)?, body.len() as u64);
+        let header = Header { kind: b'M', sequence: self.next, stamp_ns, publish_ns, size, ..self.head };
+        let (frame, begin) = ([header.pack(), body].concat(), Instant::now());
+        while !self.send(true, &frame)? {
+            if begin.elapsed() >= self.longest_wait(u64::MAX) {
+                self.send_anyway(&frame)?;
+                self.late = Some(self.next + 1);
+                break;
             }
             thread::sleep(PAUSE);
+            self.poll()?;
         }
+        self.send(false, &frame)?;
+        (self.next, self.silent, self.tell_after) = (self.next + 1, Instant::now(), SILENCE);
+        self.timeouts += self.late.is_some() as u64;
+        Ok(self.late.is_none())
     }
+
+    /// See who has come and gone, and tell readers after a silence how many messages there were [G2].
+    pub fn poll(&mut self) -> Result<()> {
+        self.node.poll()?;
+        for strict in [false, true] {
+            while let Ok(event) = if strict { &self.strict } else { &self.lossy }.recv_bytes(DONTWAIT) {
+                self.hear(strict, &event)?;
+            }
+        }
+        if self.next > 0 && self.silent.elapsed() > self.tell_after {
+            self.tell_after *= 2;
+            self.tell(0)?;
+        }
+        Ok(())
+    }
+
+    fn hear(&mut self, strict: bool, event: &[u8]) -> Result<()> {
+        let Some((on, key)) = event.split_first().filter(|(_, key)| key.len() == 32) else { return Ok(()) };
+        let (kind, reader, last) = (key[3], number(key, 16), number(key, 24));
+        if !key.starts_with(&self.head.prefix(kind)) {
+            return Ok(());
+        }
+        match (kind, on) {
+            (b'A', 1) => {
+                let (wait, confirms) = (Duration::from_millis(last >> 32).min(MAX_WAIT), last & CONFIRMS != 0);
+                let end = (last & CONFIRMS_END != 0) as u64;
+                let confirmed = (end == 0).then_some(0);
+                self.readers.insert(key.to_vec(), Reader { strict, wait, confirms, end, confirmed });
+                let answer = [key, &[self.next, MARKS_END, 0, 0].map(u64::to_le_bytes).concat()].concat();
+                if !self.send(strict, &answer)? {
+                    self.send_anyway(&answer)?;
+                }
+            }
+            (b'A', _) => drop(self.readers.remove(key)),
+            (b'R', 1) => {
+                let who = self.readers.iter_mut().find(|(key, _)| number(key, 16) == reader);
+                who.into_iter().for_each(|(_, found)| found.confirmed = found.confirmed.max(Some(last)));
+                self.late = self.late.filter(|late| last < *late);
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Tell readers how many messages there were, or with `LAST` will be; false if a reliable one has no room for it.
+    fn tell(&self, aux: u64) -> Result<bool> {
+        let publish_ns = clock_ns(ClockId::CLOCK_MONOTONIC)?;
+        let frame = Header { kind: b'N', sequence: self.next, publish_ns, aux, ..self.head }.pack();
+        self.send(false, &frame)?;
+        self.send(true, &frame)
+    }
+
+    /// Say that the stream is over [E1], and wait until those that say so have read all of it [E2].
+    pub fn close(mut self) -> Result<()> {
+        let (begin, mut told, mut again) = (Instant::now(), false, Duration::ZERO);
+        let owes = |readers: &HashMap<_, Reader>, next| {
+            readers.values().any(|r| r.confirms && r.confirmed < Some(next + r.end))
+        };
+        while !told || owes(&self.readers, self.next) {
+            if begin.elapsed() >= LINGER.max(self.longest_wait(self.next + 1)) {
+                break;
+            }
+            if begin.elapsed() >= again {
+                again = begin.elapsed() + AGAIN;
+                told = self.tell(LAST)? && self.late.is_none();
+            }
+            thread::sleep(PAUSE);
+            self.poll()?;
+        }
+        self.node.close()
+    }
+}
+
+/// Whether a full queue refuses a message instead of dropping it [D4]; this option the crate does not know.
+fn set_nodrop(socket: &mut Socket, on: bool) -> Result<()> {
+    let (value, option) = (on as i32, zmq_sys::ZMQ_XPUB_NODROP as i32);
+    let code = unsafe { zmq_sys::zmq_setsockopt(socket.as_mut_ptr(), option, (&raw const value).cast(), 4) };
+    ensure!(code == 0, "libzmq has no ZMQ_XPUB_NODROP");
+    Ok(())
 }

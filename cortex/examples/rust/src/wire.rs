@@ -2,16 +2,24 @@
 
 use std::sync::LazyLock;
 
+use anyhow::{Context, Result, ensure};
+use serde_json::Value;
+
 use crate::body::{decode, encode};
-use crate::json::Json;
-use crate::{Result, ensure, schema};
+use crate::schema::Schema;
 
 pub const HEADER: usize = 64;
 pub const BODY_MAX: u64 = 1 << 30;
+/// Options of an attach key.
 pub const STRICT: u64 = 1 << 1;
 pub const CONFIRMS: u64 = 1 << 2;
+pub const CONFIRMS_END: u64 = 1 << 3;
+/// Options of an answer: the end of the stream will be marked [E1].
+pub const MARKS_END: u64 = 1;
+/// In `aux` of kind `N`: the stream ends here.
+pub const LAST: u64 = 1;
 
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Header {
     pub kind: u8,
     pub stamped: bool,
@@ -24,34 +32,35 @@ pub struct Header {
     pub aux: u64,
 }
 
-/// The first 16 bytes of a header: what a subscription matches.
-pub fn prefix(kind: u8, stamped: bool, source: u64) -> Vec<u8> {
-    [b"CTX", &[kind, 1, stamped as u8, HEADER as u8, 0][..], &source.to_le_bytes()].concat()
-}
-
-/// A key of 32 bytes: kind `A` with reader and options, kind `R` with reader and sequence.
-pub fn key(kind: u8, stamped: bool, source: u64, reader: u64, last: u64) -> Vec<u8> {
-    [prefix(kind, stamped, source), [reader, last].map(u64::to_le_bytes).concat()].concat()
-}
-
 pub fn number(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap())
 }
 
 impl Header {
+    /// The first 16 bytes: what a subscription matches.
+    pub fn prefix(&self, kind: u8) -> Vec<u8> {
+        [b"CTX", &[kind, 1, self.stamped as u8, HEADER as u8, 0][..], &self.source.to_le_bytes()].concat()
+    }
+
+    /// A key of 32 bytes: kind `A` with reader and options, kind `R` with reader and sequence.
+    pub fn key(&self, kind: u8, reader: u64, last: u64) -> Vec<u8> {
+        [self.prefix(kind), [reader, last].map(u64::to_le_bytes).concat()].concat()
+    }
+
     pub fn pack(&self) -> Vec<u8> {
         let (stamp, publish) = (self.stamp_ns as u64, self.publish_ns as u64);
         let rest = [self.fingerprint, self.sequence, stamp, publish, self.size, self.aux];
-        [prefix(self.kind, self.stamped, self.source), rest.map(u64::to_le_bytes).concat()].concat()
+        [self.prefix(self.kind), rest.map(u64::to_le_bytes).concat()].concat()
     }
 
     pub fn parse(frame: &[u8]) -> Result<Header> {
         ensure!(frame.len() >= HEADER, "a frame of {} bytes", frame.len());
-        let (kind, stamped, source) = (frame[3], frame[5] == 1, number(frame, 8));
-        ensure!(frame[..16] == prefix(kind, stamped, source), "not a frame of Cortex 1");
-        let [fingerprint, sequence, stamp, publish, size, aux] = [16, 24, 32, 40, 48, 56].map(|at| number(frame, at));
-        let (stamp_ns, publish_ns) = (stamp as i64, publish as i64);
-        Ok(Header { kind, stamped, source, fingerprint, sequence, stamp_ns, publish_ns, size, aux })
+        let [source, fingerprint, sequence, stamp, publish, size, aux] =
+            [8, 16, 24, 32, 40, 48, 56].map(|at| number(frame, at));
+        let (kind, stamped, stamp_ns, publish_ns) = (frame[3], frame[5] == 1, stamp as i64, publish as i64);
+        let header = Header { kind, stamped, source, fingerprint, sequence, stamp_ns, publish_ns, size, aux };
+        ensure!(frame.starts_with(&header.prefix(kind)), "not a frame of Cortex 1");
+        Ok(header)
     }
 }
 
@@ -59,29 +68,30 @@ impl Header {
 pub fn parse_answer(frame: &[u8]) -> Result<(u64, &[u8])> {
     ensure!(frame.len() >= 64, "an answer of {} bytes", frame.len());
     let (sequence, latched) = (number(frame, 32), number(frame, 48));
-    ensure!(frame.len() as u64 == 64 + latched.min(BODY_MAX), "an answer: {latched}");
+    ensure!(frame.len() as u64 == 64 + latched.min(BODY_MAX), "an answer that says it has {latched} more bytes");
     Ok((sequence, &frame[64..]))
 }
 
-/// Schemas and fingerprints of the control messages.
-static TYPES: LazyLock<Vec<(u64, Json)>> = LazyLock::new(|| {
-    let types = Json::parse(include_str!("../../../vectors/types.json")).unwrap();
-    let schemas = types.items().iter().map(|entry| schema::parse(entry.get("schema").text()).unwrap());
-    schemas.map(|schema| (schema::fingerprint(&schema), schema)).collect()
+/// Fingerprints and schemas of the control messages.
+static TYPES: LazyLock<Vec<(u64, Schema)>> = LazyLock::new(|| {
+    let types: Value = serde_json::from_str(include_str!("../../../vectors/types.json")).unwrap();
+    let schemas =
+        types.as_array().unwrap().iter().map(|entry| Schema::parse(entry["schema"].as_str().unwrap()).unwrap());
+    schemas.map(|schema| (schema.fingerprint(), schema)).collect()
 });
 
-pub fn pack_control(name: &str, message: &Json) -> Result<Vec<u8>> {
-    let found = TYPES.iter().find(|(_, schema)| schema.get("name").text() == format!("cortex/{name}"));
-    let (fingerprint, schema) = found.ok_or("no such control message")?;
+pub fn pack_control(name: &str, message: &Value) -> Result<Vec<u8>> {
+    let found = TYPES.iter().find(|(_, schema)| schema.name == format!("cortex/{name}"));
+    let (fingerprint, schema) = found.context("no such control message")?;
     let body = encode(schema, message)?;
     let header = Header { kind: b'C', fingerprint: *fingerprint, size: body.len() as u64, ..Header::default() };
     Ok([header.pack(), body].concat())
 }
 
 /// Name and content of a control message.
-pub fn parse_control(frame: &[u8]) -> Result<(&'static str, Json)> {
+pub fn parse_control(frame: &[u8]) -> Result<(&'static str, Value)> {
     let header = Header::parse(frame)?;
     ensure!(header.kind == b'C' && header.size as usize == frame.len() - HEADER, "not a control message");
-    let (_, schema) = TYPES.iter().find(|(known, _)| *known == header.fingerprint).ok_or("of no known type")?;
-    Ok((schema.get("name").text().trim_start_matches("cortex/"), decode(schema, &frame[HEADER..])?))
+    let (_, schema) = TYPES.iter().find(|(known, _)| *known == header.fingerprint).context("of no known type")?;
+    Ok((schema.name.trim_start_matches("cortex/"), decode(schema, &frame[HEADER..])?))
 }

@@ -1,0 +1,85 @@
+# mypy: disable-error-code="no-untyped-call"
+"""The base of controllers that are computed in Python on the host."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.control.config import ControllerContext
+from neurosim_core.control.modes import Controller, make_controller
+from neurosim_core.control.se3 import Se3Config
+from neurosim_core.control.setpoints import Setpoint
+from neurosim_core.trajectory.path import PathCursor
+from neurosim_core.vehicle.multirotor import MultirotorState
+
+
+class HostController:
+    """Base of a controller that is computed in Python: define `command`, and `forget` if it remembers.
+
+    It flies on the CPU, one world after the other.
+    """
+
+    def __init__(self, context: ControllerContext, gains: Se3Config | None = None) -> None:
+        """Prepare the paths.
+
+        Args:
+            context: What it is made for.
+            gains: With which its setpoints become rotor speeds.
+
+        Raises:
+            ValueError: The device is not the CPU.
+        """
+        if wp.get_device(context.device).is_cuda:
+            raise ValueError(f"{type(self).__name__} is computed in Python: it needs device: cpu")
+        self.airframe, self._gains = context.airframe, gains
+        self._cursors = [PathCursor(path) for path in context.paths]
+        self._lower: Controller | None = None
+
+    def command(self, state: MultirotorState, target: np.void, *, stamp_ns: int, world: int) -> Setpoint:
+        """Return what one vehicle is to do until the next control period, always in one mode.
+
+        Args:
+            state: Of the vehicle, without a leading axis.
+            target: Where the path is at the stamp: a record with the fields of `PathPoint`, such as
+                `position`, `velocity`, `acceleration` and `yaw`; valid until the next call.
+            stamp_ns: Time since the start of the episode [ns].
+            world: Index of the world.
+        """
+        raise NotImplementedError
+
+    def forget(self, world: int) -> None:
+        """Begin a new episode in a world."""
+
+    def begin(self, mask: Any) -> None:
+        """Begin a new episode in all worlds of which the mask is not 0."""
+        for world in np.flatnonzero(mask.numpy()).tolist():
+            self.forget(world)
+
+    def update(self, arrays: Any) -> None:
+        """Write the rotor speeds that are commanded to the vehicles of all worlds.
+
+        Raises:
+            ValueError: A setpoint is not finite, or of another mode than the first.
+        """
+        stamps_ns = arrays.stamp_ns.numpy()
+        fields = [getattr(arrays, name).numpy() for name in MultirotorState._fields]
+        rows = []
+        for world, cursor in enumerate(self._cursors):
+            stamp_ns = int(stamps_ns[world])
+            state = MultirotorState(*(field[world].copy() for field in fields))
+            setpoint = self.command(state, cursor.at(stamp_ns), stamp_ns=stamp_ns, world=world)
+            if self._lower is None:
+                self._lower = make_controller(
+                    setpoint.mode, self.airframe, self._gains, count=len(self._cursors)
+                )
+            if setpoint.mode != self._lower.mode:
+                raise ValueError(
+                    f"{type(self).__name__} commands {self._lower.mode}: it cannot go over to {setpoint.mode}"
+                )
+            rows.append(setpoint.row())
+        assert self._lower is not None
+        self._lower.set(rows)
+        self._lower.update(arrays)

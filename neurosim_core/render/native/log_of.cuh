@@ -1,0 +1,2 @@
+#include "logarithm.cuh"
+return BINARY ? binary_logarithm(x) : logarithm(x);

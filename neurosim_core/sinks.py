@@ -1,0 +1,327 @@
+"""Where the packets of a flight go, by kind: files, viewers, other processes; `sinks` of the settings."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
+
+from pydantic import Field
+
+from neurosim_core.clock import NS_PER_S
+from neurosim_core.install import install_hint
+from neurosim_core.packets import Events, Packet
+from neurosim_core.registry import register
+from neurosim_core.settings import Settings
+
+if TYPE_CHECKING:
+    from neurosim_core.record.header import RecordingHeader
+    from neurosim_core.sim.model import Model
+
+_ROOM_BYTES = 32_000_000
+"""When less is left on the disk, sinks that can give way do [bytes]."""
+_CHECK_S = 1.0
+
+
+class Sink(Protocol):
+    """Takes the packets of one flight."""
+
+    def write(self, packet: Packet) -> None:
+        """Take a packet; they come in the order of time.
+
+        Raises:
+            OSError: It cannot be written: the flight ends.
+        """
+
+    def close(self, *, complete: bool = True) -> None:
+        """Complete what was written. Closing twice is allowed.
+
+        Args:
+            complete: All that was to be written was.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SinkContext:
+    """What a sink is opened for."""
+
+    name: str
+    """The sink's name in the settings."""
+    folder: Path
+    """Of the flight; it exists."""
+    stem: str
+    """What files of the flight begin with: flight; after a reset of a live run flight-2, ..."""
+    model: Model
+    """What is flown."""
+    header: RecordingHeader
+    """Settings, sensors and path, as a recording has them."""
+
+
+class SinkConfig(Settings):
+    """Settings that all sinks have. A kind adds its `kind`, what it needs, and `open`."""
+
+    kind: str
+    """Under which name the class is registered."""
+
+    library: ClassVar[tuple[str, str] | None] = None
+    """A library that it needs, and the extra that brings it: where that is missing, the sink is left out."""
+    is_live: ClassVar[bool] = True
+    """Whether it takes part in the recording of a live run (`neurosim serve --record`)."""
+    gives_way: ClassVar[bool] = False
+    """Whether it is given up when it, or the disk, cannot be written any more, and the flight goes on."""
+    again: ClassVar[str] = ""
+    """What makes it again from flight.h5, where it was given up; {folder} is that of the flight."""
+
+    def file(self, stem: str) -> str:
+        """Return the name of its file; empty: it has none."""
+        return ""
+
+    def load(self) -> None:
+        """Import what it needs, beside other work."""
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return the sink of one flight.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        raise NotImplementedError
+
+
+@register("sink", "hdf5")
+class Hdf5SinkConfig(SinkConfig):
+    """The recording, flight.h5: all packets of all sensors."""
+
+    kind: Literal["hdf5"] = "hdf5"
+    library = ("h5py", "record")
+
+    def file(self, stem: str) -> str:
+        """Return the name of the recording."""
+        return f"{stem}.h5"
+
+    def load(self) -> None:
+        """Import h5py."""
+        from neurosim_core.record.hdf5 import import_h5py
+
+        import_h5py()
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return the writer."""
+        from neurosim_core.record.hdf5 import RecordingWriter
+
+        return RecordingWriter(context.folder / self.file(context.stem), context.header)
+
+
+@register("sink", "rerun")
+class RerunSinkConfig(SinkConfig):
+    """A file of the Rerun viewer, flight.rrd; can be made again from the recording."""
+
+    kind: Literal["rerun"] = "rerun"
+    library = ("rerun", "view")
+    is_live = False
+    gives_way = True
+    again = "`neurosim view {folder} --save FILE.rrd` makes it from flight.h5"
+
+    def file(self, stem: str) -> str:
+        """Return the name of the file."""
+        return f"{stem}.rrd"
+
+    def load(self) -> None:
+        """Import Rerun."""
+        from neurosim_core.view.rerun_sdk import import_rerun
+
+        import_rerun()
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return what writes it."""
+        from neurosim_core.view.sinks import RerunSink
+
+        return RerunSink(context.folder / self.file(context.stem), context)
+
+
+@register("sink", "overview")
+class OverviewSinkConfig(SinkConfig):
+    """A picture of the flight on one page, overview.png."""
+
+    kind: Literal["overview"] = "overview"
+    library = ("matplotlib", "view")
+    is_live = False
+    gives_way = True
+
+    def file(self, stem: str) -> str:
+        """Return the name of the picture."""
+        return "overview.png"
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return what draws it."""
+        from neurosim_core.view.sinks import OverviewSink
+
+        return OverviewSink(context.folder / self.file(context.stem), context)
+
+
+def default_sinks() -> dict[str, SinkConfig]:
+    """Return what a flight leaves unless its settings say otherwise."""
+    return {"recording": Hdf5SinkConfig(), "rerun": RerunSinkConfig(), "overview": OverviewSinkConfig()}
+
+
+@register("sink", "event_file")
+class EventFileSinkConfig(SinkConfig):
+    """The events of one camera in a format of other tools, such as events.raw; a bag has all sensors."""
+
+    kind: Literal["event_file"] = "event_file"
+    name: Annotated[str, Field(pattern=r"^[^/]+$")]
+    """Its name; the suffix says the format, as for `neurosim convert`: events.raw, events.aedat4, a.mcap."""
+    sensor: str = ""
+    """Which event camera; empty: the first."""
+
+    def file(self, stem: str) -> str:
+        """Return the name of the file."""
+        return self.name if stem == "flight" else f"{stem}-{self.name}"
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return the writer.
+
+        Raises:
+            ValueError: There is no such camera, or no such format.
+        """
+        return _EventFileSink(self, context)
+
+
+class _EventFileSink:
+    """Writes the events of a camera, and other packets where the format has a place for them."""
+
+    def __init__(self, config: EventFileSinkConfig, context: SinkContext) -> None:
+        from neurosim_core.io import create_events
+
+        cameras = {s.name: s.intrinsics for s in context.header.sensors if s.kind == "event_camera"}
+        self._sensor = config.sensor or next(iter(cameras), "")
+        lens = cameras.get(self._sensor)
+        if lens is None:
+            known = ", ".join(cameras) or "there is none"
+            raise ValueError(f"sinks.{context.name}: no event camera {self._sensor!r}, known: {known}")
+        file = context.folder / config.file(context.stem)
+        self._writer = create_events(file, width=lens.width, height=lens.height)
+
+    def write(self, packet: Packet) -> None:
+        """Append a packet."""
+        if not isinstance(packet, Events):
+            if self._writer.write_packet is not None:
+                self._writer.write_packet(packet)
+        elif packet.sensor == self._sensor:
+            self._writer.write(packet.numpy())
+
+    def close(self, *, complete: bool = True) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
+class Sinks:
+    """The sinks of one flight, as one. A context manager."""
+
+    def __init__(
+        self, settings: Mapping[str, SinkConfig], *, say: Callable[[str], None], **context: Any
+    ) -> None:
+        """Open them.
+
+        Args:
+            settings: By name.
+            say: Told what is left out or given up.
+            context: `folder`, `stem`, `model` and `header` of `SinkContext`.
+
+        Raises:
+            OSError, ValueError: One cannot be opened.
+        """
+        self._settings, self._say = dict(settings), say
+        self._context = context
+        self._open: dict[str, Sink] = {}
+        self._checked_s = -math.inf  # so before the first packet is written
+        with contextlib.ExitStack() as opened:
+            opened.callback(self._abandon)
+            for name, each in settings.items():
+                if each.library is not None and importlib.util.find_spec(each.library[0]) is None:
+                    say(f"{self._title(name)} is left out: {install_hint(each.library[1])}")
+                    continue
+                self._open[name] = each.open(SinkContext(name=name, **context))
+            opened.pop_all()
+
+    def write(self, packet: Packet) -> None:
+        """Hand a packet to all.
+
+        Raises:
+            OSError: One that does not give way cannot be written; the message says up to when it is kept.
+        """
+        if time.monotonic() - self._checked_s >= _CHECK_S:
+            self._make_room()
+        for name in [*self._open]:
+            self._try(name, lambda sink: sink.write(packet))
+
+    def close(self, *, complete: bool = True) -> None:
+        """Close all. Closing twice is allowed.
+
+        Raises:
+            OSError: One that does not give way cannot be written.
+        """
+        with contextlib.ExitStack() as stack:  # each of them, whatever another one raises
+            stack.callback(self._open.clear)
+            for name in reversed([*self._open]):
+                stack.callback(self._try, name, lambda sink: sink.close(complete=complete))
+
+    def __enter__(self) -> Sinks:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._abandon()
+
+    def _abandon(self) -> None:
+        """Close what is open; what fails has been told."""
+        for sink in self._open.values():
+            with contextlib.suppress(OSError):
+                sink.close()
+        self._open.clear()
+
+    def _try(self, name: str, act: Callable[[Sink], None]) -> None:
+        sink = self._open[name]
+        try:
+            act(sink)
+        except OSError as error:
+            if self._settings[name].gives_way:
+                self._give_up(name, str(error))
+                return
+            kept_ns: int | None = getattr(sink, "kept_ns", None)
+            if kept_ns is None:
+                raise
+            kept = f"{self._title(name)} is kept up to {kept_ns / NS_PER_S:.3f} s"
+            raise OSError(f"{error}; {kept}") from error
+
+    def _make_room(self) -> None:
+        """Give up files that give way before they take the last room of the disk from others."""
+        self._checked_s = time.monotonic()
+        giving = [name for name in self._open if self._settings[name].gives_way and self._path(name).exists()]
+        if not giving or len(giving) == len(self._open):
+            return
+        if shutil.disk_usage(self._context["folder"]).free < _ROOM_BYTES:
+            for name in giving:
+                self._give_up(name, f"less than {_ROOM_BYTES / 1e6:g} MB are left on the disk")
+
+    def _give_up(self, name: str, why: str) -> None:
+        with contextlib.suppress(OSError):
+            self._open.pop(name).close(complete=False)
+        self._path(name).unlink(missing_ok=True)
+        again = self._settings[name].again.format(folder=self._context["folder"])
+        self._say(f"{self._title(name)} is given up: {why}" + (f"; {again}" if again else ""))
+
+    def _path(self, name: str) -> Path:
+        folder: Path = self._context["folder"]
+        return folder / self._title(name)
+
+    def _title(self, name: str) -> str:
+        return self._settings[name].file(self._context["stem"]) or name

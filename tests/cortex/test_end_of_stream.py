@@ -1,0 +1,152 @@
+"""What a reliable reader reports of a publisher that is gone, by what it has heard of it; Python and C++.
+
+Its publishers speak through a raw socket, and leave without a word besides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from cpp_client import Impostor, Peer, make_frame
+from cpp_messages import Scan
+from cpp_programs import needs_compiler, programs
+from processes import wait_for
+
+import cortex
+from cortex import records, reliable, wire
+from cortex.codec import codec_of
+from cortex.host import host_id
+from cortex.node import Node
+from cortex.schema import schema_of
+
+__all__ = ["programs"]
+
+COUNTERS = ("received", "lost", "rejected", "cut_off")
+
+
+class Case(NamedTuple):
+    """One publisher, and what its reader has to count."""
+
+    name: str
+    heard: list[str]
+    """An answer, of a publisher that marks its end or of an older one; messages; what comes next; the end."""
+    received: int = 0
+    lost: int = 0
+    rejected: int = 0
+    cut_off: int = 1
+
+
+CASES = [
+    Case("nothing, so that nothing was promised", [], cut_off=0),
+    Case("only the answer", ["answer 0"]),
+    Case("only a message", ["message 0"], 1),
+    Case("what comes next, then silence", ["answer 0", "message 0", "next 1"], 1),
+    Case("the end", ["answer 0", "message 0", "end 1"], 1, cut_off=0),
+    Case("the end of a stream without messages", ["answer 0", "end 0"], cut_off=0),
+    Case("the end twice", ["answer 0", "message 0", "end 1", "end 1"], 1, cut_off=0),
+    Case("the end, not what came before", ["answer 0", "message 0", "next 2", "end 3"], 1, 2, cut_off=0),
+    Case("a second answer", ["answer 0", "message 0", "next 1", "answer 4"], 1, 3),
+    Case("a large message that is none", ["answer 0", "message 0", "end 1", "bad 1"], 1, rejected=1),
+    Case("an older one: all", ["old answer 0", "message 0", "next 1"], 1, cut_off=0),
+    Case("an older one: not all", ["old answer 0", "message 0", "next 1", "message 1"], 2),
+    Case("an older one: bad", ["old answer 0", "message 0", "next 1", "bad 1"], 1, rejected=1),
+]
+
+
+class Leavers(Impostor):
+    """A publisher for each case, on the topic `/cut0` or `/cut1`, as its stream is cut off or not."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.router.bind("tcp://127.0.0.1:*")
+        self.tcp_registry = self.router.last_endpoint.decode()
+        schema, data = schema_of(Scan), f"ipc://{directory}/data"
+        publishers = [
+            records.PublisherRecord(
+                f"/cut{case.cut_off}", 100 + index, schema.name, schema.fingerprint, schema.to_json(), False
+            )
+            for index, case in enumerate(CASES)
+        ]
+        endpoint = records.Endpoint("ipc", data, data, "", "")
+        record = records.NodeRecord(5, "leavers", host_id(), 1, 1, 0, [endpoint], publishers, [], [])
+        self.record = wire.control_frame(records.Changed(1, record))
+
+    def speak(self) -> None:
+        """Say to each reader what its case is to hear."""
+        for _ in CASES:
+            key = self.await_key()
+            assert key[24] & 0b1110 == 0b1110  # it is reliable, confirms, and the end, too
+            source = int.from_bytes(key[8:16], "little")
+            for heard in CASES[source - 100].heard:
+                self._say(heard, key, source)
+
+    def _say(self, heard: str, key: bytes, source: int) -> None:
+        what, _, text = heard.rpartition(" ")
+        number = int(text)
+        if what.endswith("answer"):
+            self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(number, b"", what == "answer")))
+        elif what == "message":
+            body = codec_of(Scan).encode(Scan(number, np.full(2, number, np.float32)), 1000)
+            assert body is not None
+            self.xpub.send(make_frame(b"M", number, body, source=source))
+        elif what == "bad":
+            self.xpub.send_multipart([make_frame(b"L", number, b"", size=9, source=source), b"short"])
+        else:
+            self.xpub.send(make_frame(b"N", number, b"", aux=int(what == "end"), source=source))
+
+
+@pytest.fixture
+def leavers(runtime: Path) -> Iterator[Leavers]:
+    impostor = Leavers(runtime)
+    yield impostor
+    impostor.close()
+    shutil.rmtree(runtime, ignore_errors=True)
+    runtime.mkdir(mode=0o700)
+
+
+def expected(cut_off: int) -> dict[str, int]:
+    """What the reader of a topic counts in all."""
+    cases = [case for case in CASES if case.cut_off == cut_off]
+    return {name: sum(getattr(case, name) for case in cases) for name in COUNTERS}
+
+
+def test_python_reports_what_it_has_not_heard_the_end_of(
+    leavers: Leavers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 3 * 10**8)
+    with Node("reader", registry=leavers.tcp_registry) as node:
+        readers = [node.subscriber(f"/cut{number}", Scan, policy=reliable()) for number in (0, 1)]
+        leavers.speak()
+        leavers.leave()
+        for number, reader in enumerate(readers):
+            wait_for(lambda reader=reader: not reader.sources() and not reader._links)
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    reader.recv(0.0)
+            counted = {name: getattr(reader.counters, name) for name in COUNTERS}
+            assert counted == expected(number), number
+
+
+@needs_compiler
+def test_cpp_reports_what_it_has_not_heard_the_end_of(
+    programs: Path, leavers: Leavers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CORTEX_TEST_REGISTRY", leavers.registry)
+    peers = [Peer([programs / "peer", "count", f"/cut{number}", "reliable", 0, 0]) for number in (0, 1)]
+    leavers.speak()
+    leavers.leave()
+    peers[1].await_complaint("ended without saying how much it had sent")
+    time.sleep(0.5)  # for the other, which has nothing to say
+    for number, peer in enumerate(peers):
+        peer.close_input()
+        counted = json.loads(peer.line())
+        assert {name: counted[name] for name in COUNTERS} == expected(number), number
+        peer.end()

@@ -1,0 +1,213 @@
+"""Where the packets of a flight go: sinks of our own and of outside packages, by kind."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import yaml
+from small_room import room_scene
+
+import cortex
+import neurosim_core as ns
+from neurosim_core.io import open_events
+from neurosim_core.live.recorder import Recorder
+from neurosim_core.sinks import SinkConfig, SinkContext
+
+
+@ns.register("sink", "test_list")
+class ListSinkConfig(SinkConfig):
+    """Keeps what it is given; `fails_at` is the packet that it cannot take."""
+
+    kind: Literal["test_list"] = "test_list"
+    fails_at: int = -1
+    gives_way = False
+
+    def open(self, context: SinkContext) -> ListSink:
+        """Return the sink."""
+        sink = ListSink(self, context)
+        OPENED.append(sink)
+        return sink
+
+
+@ns.register("sink", "test_weak")
+class WeakSinkConfig(ListSinkConfig):
+    """The same, and the flight goes on without it."""
+
+    kind: Literal["test_weak"] = "test_weak"  # type: ignore[assignment]
+    gives_way = True
+
+
+class ListSink:
+    def __init__(self, config: ListSinkConfig, context: SinkContext) -> None:
+        self.config, self.context = config, context
+        self.packets: list[ns.Packet] = []
+        self.closed: list[bool] = []
+
+    def write(self, packet: ns.Packet) -> None:
+        if len(self.packets) == self.config.fails_at:
+            raise OSError("the line is dead")
+        self.packets.append(packet)
+
+    def close(self, *, complete: bool = True) -> None:
+        self.closed.append(complete)
+
+
+OPENED: list[ListSink] = []
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> dict[str, Any]:
+    return room_scene(tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture(autouse=True)
+def none_opened():
+    OPENED.clear()
+
+
+LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.4}
+
+
+def settings(scene: dict[str, Any], **sinks: Any) -> ns.SimulationConfig:
+    return ns.load_config(
+        {
+            "scene": scene,
+            "device": "cpu",
+            "duration_s": 0.2,
+            "path": {"kind": "line", "start_m": [-0.2, 0.0, 1.2], "end_m": [0.2, 0.0, 1.2]},
+            "sensors": {
+                "events": {"kind": "event_camera", "lens": LENS, "pixel": {"threshold_on": 0.02}},
+                "depth": {"kind": "depth", "lens": LENS, "rate_hz": 20.0},
+                "odometry": {"kind": "odometry", "rate_hz": 100.0},
+            },
+            "sinks": {"recording": {"kind": "hdf5"}, **sinks},
+        }
+    )
+
+
+def recorded(folder: Path, name: str = "flight.h5") -> list[ns.Packet]:
+    with ns.Recording(folder / name) as recording:
+        return list(recording.packets())
+
+
+def test_an_outside_sink_gets_what_the_recording_gets(scene, tmp_path):
+    ns.fly(settings(scene, mine={"kind": "test_list"}), tmp_path)
+    (sink,) = OPENED
+    assert (sink.context.name, sink.context.folder, sink.context.stem) == ("mine", tmp_path, "flight")
+    assert [s.name for s in sink.context.header.sensors] == ["events", "depth", "odometry"]
+    kept = recorded(tmp_path)
+    assert [(p.sensor, p.stamp_ns) for p in sink.packets] == [(p.sensor, p.stamp_ns) for p in kept]
+    assert sum(len(p) for p in sink.packets if isinstance(p, ns.Events)) > 100
+    assert sink.closed == [True]
+    assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "flight.h5"}
+
+
+def test_one_that_fails_ends_the_flight_and_the_others_are_whole(scene, tmp_path):
+    with pytest.raises(OSError, match="the line is dead"):
+        ns.fly(settings(scene, mine={"kind": "test_list", "fails_at": 5}), tmp_path)
+    assert len(recorded(tmp_path)) == 6  # the recording comes before it
+
+
+def test_one_that_gives_way_does_not(scene, tmp_path, capsys):
+    ns.fly(settings(scene, mine={"kind": "test_weak", "fails_at": 5}), tmp_path)
+    assert "mine is given up: the line is dead" in capsys.readouterr().out
+    assert OPENED[0].closed == [False]
+    assert recorded(tmp_path)[-1].stamp_ns == 200_000_000
+
+
+def test_live_runs_hand_their_packets_to_it_too(scene, tmp_path):
+    config = settings(scene, mine={"kind": "test_list"}, rerun={"kind": "rerun"})
+    model = ns.make_model(config)
+    recorder = Recorder({"drone": tmp_path}, {"drone": model})
+    packets = list(ns.run_model(model, ns.make_state(model)))
+    for _ in range(2):  # the second time after a reset
+        recorder.begin({"drone": 0}, replace=False)
+        for packet in packets:
+            recorder.write("drone", packet)
+    recorder.close()
+    assert [(sink.context.stem, len(sink.packets)) for sink in OPENED] == [
+        ("flight", len(packets)),
+        ("flight-2", len(packets)),
+    ]
+    assert len(recorded(tmp_path, "flight-2.h5")) == len(packets)
+    assert not list(tmp_path.glob("*.rrd"))  # a viewer shows what is live
+
+
+@pytest.mark.parametrize("name", ["events.raw", "events.csv", "bag.mcap"])
+def test_events_go_to_files_of_other_tools(scene, tmp_path, name):
+    if name.endswith(".mcap"):
+        pytest.importorskip("rosbags")
+    ns.fly(settings(scene, other={"kind": "event_file", "name": name}), tmp_path)
+    reader = open_events(tmp_path / name, size=(32, 24))
+    blocks = list(reader.blocks())
+    reader.close()
+    wanted = [p.numpy() for p in recorded(tmp_path) if isinstance(p, ns.Events)]
+    for column in range(4):
+        found = np.concatenate([block[column] for block in blocks])
+        assert (found == np.concatenate([events[column] for events in wanted])).all()
+
+
+def test_an_event_file_needs_an_event_camera(scene, tmp_path):
+    other = {"kind": "event_file", "name": "events.raw", "sensor": "left"}
+    with pytest.raises(ValueError, match=r"sinks\.other: no event camera 'left', known: events"):
+        ns.fly(settings(scene, other=other), tmp_path)
+
+
+def test_a_flight_is_published(scene, tmp_path, monkeypatch):
+    """A reliable reader gets every packet, as it is recorded."""
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path))
+    found: dict[str, list[Any]] = {"events": [], "odometry": []}
+    flying = threading.Thread(
+        target=ns.fly,
+        args=(settings(scene, out={"kind": "cortex", "wait_s": 30.0}), tmp_path / "flight"),
+    )
+    with cortex.Node("reader") as node:
+        kinds = {"events": cortex.messages.Events, "odometry": cortex.messages.Odometry}
+        kinds["depth"] = cortex.messages.Image
+        subscribers = {
+            name: node.subscriber(f"/drone/{name}", kind, policy=cortex.reliable())
+            for name, kind in kinds.items()
+        }
+        flying.start()
+        for name, messages in found.items():
+            while not messages or messages[-1].stamp_ns < 200_000_000:
+                messages.append(subscribers[name].recv(60.0))
+        flying.join(60.0)
+    for name, messages in found.items():
+        kept = [packet for packet in recorded(tmp_path / "flight") if packet.sensor == name]
+        assert [message.stamp_ns for message in messages] == [packet.stamp_ns for packet in kept]
+    assert (found["odometry"][-1].position == kept[-1].position).all()
+
+
+def test_settings_change_the_default_set_or_replace_it():
+    kinds = {"recording": "hdf5", "rerun": "rerun", "overview": "overview"}
+
+    def loaded(source: Any = None, **overrides: Any) -> dict[str, str]:
+        config = ns.load_config(source, overrides=overrides)
+        assert ns.load_config(yaml.safe_load(ns.to_yaml(config))) == config
+        return {name: sink.kind for name, sink in config.sinks.items()}
+
+    mine = {"mine": {"kind": "test_list"}}
+    assert loaded() == kinds
+    assert loaded({"sinks+": {**mine, "rerun": None}}) == {
+        "recording": "hdf5",
+        "overview": "overview",
+        "mine": "test_list",
+    }
+    assert loaded({"sinks": mine}) == {"mine": "test_list"}
+    assert loaded(**{"sinks.overview": None}) == {"recording": "hdf5", "rerun": "rerun"}
+    with pytest.raises(ns.ConfigError, match=r"give `sinks`, which replace the default set, or `sinks\+`"):
+        loaded({"sinks": mine, "sinks+": mine})
+    with pytest.raises(ns.ConfigError, match=r"sinks.mine.kind: must be one of .*'test_list'"):
+        loaded({"sinks": {"mine": {"kind": "test_lis"}}})
+
+
+def test_a_nearly_full_disk_makes_only_files_give_way_that_are_there(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1_000))
+    ns.fly(settings(scene, mine={"kind": "test_weak"}), tmp_path)
+    assert OPENED[0].closed == [True]  # it has no file
