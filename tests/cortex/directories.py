@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import random
 import secrets
 import threading
 import time
@@ -163,27 +162,6 @@ TYPES = control_types(Alive, Changed, Gone, Heartbeat, Hello, Leave, Refused, We
 def receive(socket, timeout_ms=1e3 * SOON_S):
     assert socket.poll(timeout_ms), "no answer"
     return parse_control(socket.recv(), TYPES)[0]
-
-
-def mutate(frame: bytes, random: random.Random) -> bytes:
-    data = bytearray(frame)
-    for _ in range(random.randint(1, 4)):
-        position = random.randrange(len(data))
-        kind = random.randrange(5)
-        if kind == 0:
-            data[position] ^= 1 << random.randrange(8)
-        elif kind == 1:
-            data[position] = random.choice((0, 1, 0x7F, 0x80, 0xFF))
-        elif kind == 2:
-            del data[position:]
-        elif kind == 3:
-            data[position:position] = random.randbytes(random.randint(1, 16))
-        else:
-            start = max(position - 4, 0)
-            data[start : start + 4] = random.choice((b"\xff" * 4, b"\0" * 4, b"\0\0\0\x80"))
-        if not data:
-            return b""
-    return bytes(data)
 
 
 def answers_unknown(socket):

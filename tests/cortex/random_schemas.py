@@ -74,7 +74,7 @@ schemas = messages(kinds, least=0)
 def values(draw: st.DrawFn, kind: FieldType, bound: Any, sizes: dict[str, int]) -> Any:
     """Values of one type; `sizes` holds the dimensions chosen in this scope."""
     if isinstance(kind, Schema):
-        return draw(messages_of(kind))
+        return draw(messages_of(kind, bound))
     if isinstance(kind, OptionalType):
         return draw(values(kind.item, bound, sizes)) if draw(st.booleans()) else None
     if isinstance(kind, ListType):
@@ -105,20 +105,15 @@ def values(draw: st.DrawFn, kind: FieldType, bound: Any, sizes: dict[str, int]) 
 
 
 @st.composite
-def messages_of(draw: st.DrawFn, schema: Schema) -> Any:
-    """Messages of one schema."""
-    cls = type_from_schema(schema)
+def messages_of(draw: st.DrawFn, schema: Schema, cls: type) -> Any:
+    """Messages of a class that has the schema."""
     sizes: dict[str, int] = {}
-    bindings = cls.__cortex_bindings__
-    return cls(
-        *[
-            draw(values(field.type, bound, sizes))
-            for field, bound in zip(schema.fields, bindings, strict=True)
-        ]
-    )
+    bindings = zip(schema.fields, cls.__cortex_bindings__, strict=True)  # type: ignore[attr-defined]
+    return cls(*[draw(values(field.type, bound, sizes)) for field, bound in bindings])
 
 
 @st.composite
 def any_message(draw: st.DrawFn, of: st.SearchStrategy[Schema] = schemas) -> Any:
     """Messages of any schema."""
-    return draw(messages_of(draw(of)))
+    schema = draw(of)
+    return draw(messages_of(schema, type_from_schema(schema)))

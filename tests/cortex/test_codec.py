@@ -19,7 +19,6 @@ from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.compiled import native
 from cortex.message import Array, Float32, Int8, Int32, UInt64, message
 from cortex.messages import Clock, Image, Imu, MotorCommand
-from cortex.schema import schema_of
 
 
 class Mode(Enum):
@@ -48,6 +47,7 @@ class Point:
 class Everything:
     stamp_ns: int
     small: Int8
+    unsigned: UInt64
     flag: bool
     mode: Mode
     level: Level | None
@@ -74,6 +74,7 @@ def everything(**changes: Any) -> Everything:
     fields: dict[str, Any] = {
         "stamp_ns": 1,
         "small": -2,
+        "unsigned": 2**64 - 1,
         "flag": True,
         "mode": Mode.FIRST,
         "level": Level.HIGH,
@@ -146,11 +147,6 @@ def test_a_type_with_everything():
     check_both_ways(everything(open_=np.eye(4, 3)[::2], mask=None, point=None, large=None))
 
 
-@pytest.mark.parametrize("count", [0, 1, 10, 255, 256, 3000])
-def test_the_most_common_shape_of_message(count):
-    check_both_ways(MotorCommand(5, np.arange(count, dtype=np.float64)))
-
-
 def test_a_codec_is_made_once():
     assert codec_of(Point) is codec_of(Point)
     with pytest.raises(TypeError, match="@cortex"):
@@ -175,6 +171,8 @@ WRONG = [
     ("stamp_ns", 2**63, OUT, "out of the range of int64"),
     ("stamp_ns", np.uint64(2**63), OUT, "out of the range of int64"),
     ("small", 128, OUT, "out of the range of int8"),
+    ("unsigned", 2**64, OUT, "out of the range of uint64"),
+    ("unsigned", -1, OUT, "out of the range of uint64"),
     ("flag", "yes", KIND, "no bool"),
     ("flag", np.zeros(2), KIND, "no bool"),
     ("mode", 0, KIND, "allowed are Mode.LAST, Mode.OFF, Mode.FIRST"),
@@ -241,26 +239,6 @@ def test_wrong_values_are_named(field, value, kind, text):
             attempt()
 
 
-@pytest.mark.parametrize("value", [1.5, "x", 2**64, -1, None])
-def test_wrong_values_are_named_on_the_short_cuts(value):
-    @message
-    class Numbers:
-        a: UInt64
-        b: Float32 = 0.0
-
-    @message
-    class Stamped:
-        a: UInt64
-        data: Array["uint8", "n"]
-
-    with pytest.raises((TypeError, ValueError), match=r"Numbers\.a"):
-        codec_of(Numbers).encode(Numbers(value), 100)
-    with pytest.raises((TypeError, ValueError), match=r"Stamped\.a"):
-        codec_of(Stamped).encode(Stamped(value, np.zeros(3, np.uint8)), 100)
-    with pytest.raises(ValueError, match=r"Numbers\.b.*range of float32"):
-        codec_of(Numbers).encode(Numbers(1, 1e300), 100)
-
-
 def test_a_message_of_another_type_is_refused():
     @message(name="Point")
     class Other:
@@ -289,13 +267,6 @@ def test_arrays_of_any_memory_layout_are_accepted():
         assert memory[:size].tobytes() == body_of(image)
     strided = MotorCommand(0, grid[0, ::2])
     assert codec_of(MotorCommand).decode(body_of(strided)) == strided
-
-
-def test_encoding_takes_a_snapshot():
-    command = MotorCommand(0, np.ones(1000))
-    body = body_of(command)
-    command.speed[:] = 0.0
-    assert codec_of(MotorCommand).decode(body).speed.sum() == 1000.0
 
 
 def test_decoded_arrays_are_read_only_views():
@@ -410,16 +381,6 @@ def test_threads_may_share_a_codec():
         sys.setswitchinterval(interval)
     assert not failures
     assert not any(thread.is_alive() for thread in threads)
-
-
-def test_codecs_of_one_schema_read_each_other():
-    from cortex.schema import type_from_schema
-
-    twin = type_from_schema(schema_of(Everything))
-    body = body_of(everything())
-    copy = codec_of(twin).decode(body)
-    assert type(copy) is not Everything
-    assert codec_of(twin).encode(copy, 2**20) == body
 
 
 def test_codecs_die_with_their_classes():

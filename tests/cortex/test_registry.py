@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from damage import mutate
 from directories import (
     answers_unknown,
     context,
@@ -22,7 +23,6 @@ from directories import (
     fake_registry,
     make,
     make_record,
-    mutate,
     publisher,
     receive,
     registry_pid,
@@ -223,7 +223,7 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
         for _ in range(20):
             socket = dealer(context)
             for _ in range(1000):
-                frames = [mutate(rng.choice(seeds), rng)]
+                frames = [mutate(rng, rng.choice(seeds))]
                 if rng.random() < 0.02:
                     frames.append(b"more")
                 socket.send_multipart(frames)
@@ -264,7 +264,7 @@ def test_mutated_answers_do_no_harm_to_a_directory(context, make):
     identity, _ = fake.recv_multipart()
     for _ in range(50):
         for _ in range(100):
-            fake.send_multipart([identity, mutate(rng.choice(seeds), rng)])
+            fake.send_multipart([identity, mutate(rng, rng.choice(seeds))])
         drive_for([node], 0.01)
     assert node.directory.rejected > 2500
     fake.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from directories import mutate
+from damage import mutate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -117,7 +117,7 @@ def test_an_attach_answer_survives(key, answer):
 @given(keys, answers, st.data())
 def test_an_attach_answer_is_refused_or_fits_its_frame(key, answer, data):
     """Whatever is changed, what comes out is all of the frame and no more."""
-    frame = mutate(answer_frame(attach_key(key, stamped=True), answer), data.draw(st.randoms()))
+    frame = mutate(data.draw(st.randoms()), answer_frame(attach_key(key, stamped=True), answer))
     try:
         parsed = parse_answer(frame)
     except MalformedMessage:
@@ -144,7 +144,7 @@ def test_a_control_message_of_another_type_is_refused():
 @settings(max_examples=300)
 @given(st.data())
 def test_a_mutated_control_frame_is_refused_or_a_message(data):
-    frame = mutate(control_frame(Heartbeat(1, 2, 3)), data.draw(st.randoms()))
+    frame = mutate(data.draw(st.randoms()), control_frame(Heartbeat(1, 2, 3)))
     try:
         received, _ = parse_control(frame, control_types(Heartbeat))
     except MalformedMessage:
