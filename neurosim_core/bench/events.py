@@ -320,5 +320,8 @@ def _span(factors: dict[float, float]) -> str:
 def _time_plot(rows: list[Row]) -> Plot:
     distance, median = "distance per event", "timing error, median [us]"
     pairs = [("renders", distance), ("both [s]", distance), ("renders", median), ("renders", "spurious [%]")]
-    panels = [panel(rows, x, y, by="scheme", log="xy") for x, y in (*pairs, ("renders", "missing [%]"))]
-    return Plot("events-time", "In time: error against renders and run time", panels)
+    panels = [
+        panel(rows, x, y, by="scheme", log="xy", x_label=x.replace("both", "to choose and to render"))
+        for x, y in (*pairs, ("renders", "missing [%]"))
+    ]
+    return Plot("events-time", "In time: error against renders and run time; 0 has no mark", panels)

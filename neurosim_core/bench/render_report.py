@@ -11,7 +11,7 @@ import importlib.util
 import io
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -33,6 +33,7 @@ from neurosim_core.bench.report import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 VERDICTS = {True: "met", False: "missed", None: "not measured here"}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -156,6 +157,7 @@ def draw_plot(plot: Plot) -> bytes:
             axes.tick_params(labelbottom=True, labelleft=True)  # of shared axes, too
         for axes in places[len(plot.panels) :]:
             axes.axis("off")
+        _add_legends(figure, places[: len(plot.panels)])
         data = io.BytesIO()
         figure.savefig(data, format="png")
     return data.getvalue()
@@ -172,6 +174,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         look: dict[str, Any] = {"color": colour, "linestyle": _LINES[series.style]}
         look |= {"linewidth": 1.0} if law else {"label": series.label, "marker": marker}
         x, y = (np.array([math.nan if v is None else v for v in values]) for values in (series.x, series.y))
+        if "y" in panel.log:
+            y = np.where(y > 0.0, y, math.nan)  # else a line to 0 falls vertically, as if at the last mark
         axes.plot(x, y, **look)
     for draw, marks in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
         for label, at in marks.items():
@@ -186,5 +190,15 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
             if high < 100.0 * low:  # one or two decades
                 axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 axis.set_major_formatter("{x:g}")
-    if len(axes.get_legend_handles_labels()[1]) > 1:
-        axes.legend()
+
+
+def _add_legends(figure: Figure, panels: Iterable[Axes]) -> None:
+    """Name the lines in each panel, or below all panels if they have the same."""
+    found = [(axes, *axes.get_legend_handles_labels()) for axes in panels]
+    _, handles, labels = found[0]
+    if len(found) > 1 and len(labels) > 1 and all(its == labels for _, _, its in found):
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        return
+    for axes, _, its in found:
+        if len(its) > 1:
+            axes.legend()
