@@ -86,12 +86,13 @@ def _wait_for_end(
 
 
 def _report(path: Path, stats: RecordStats) -> None:
+    names = ("lost", "overtaken", "rejected", "cut_off")
     rows = [
-        (topic, f"{s.written:,}", bytes_of(s.bytes), f"{s.lost:,}", f"{s.overtaken:,}", f"{s.rejected:,}")
+        (topic, f"{s.written:,}", bytes_of(s.bytes), *(f"{getattr(s, name):,}" for name in names))
         for topic, s in stats.topics.items()
     ]
     if rows:
-        for line in table(("topic", "messages", "size", "lost", "overtaken", "rejected"), rows):
+        for line in table(("topic", "messages", "size", *(name.replace("_", " ") for name in names)), rows):
             print(line)
     what = number_of(stats.written, "message")
     print(f"{path}: {what} in {stats.duration_s:.1f} s, {bytes_of(stats.file_bytes)}")

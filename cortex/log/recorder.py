@@ -70,6 +70,8 @@ class TopicStats:
     """Messages that gave way to newer ones; only without `reliable`."""
     rejected: int = 0
     """Frames that were malformed."""
+    cut_off: int = 0
+    """Publishers whose end was not heard: how many of their last messages are missing is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -416,6 +418,7 @@ class Recorder:
         for topic, counters in self._counters.copy().items():
             stats = self._topics[topic]
             stats.lost, stats.overtaken, stats.rejected = counters.lost, counters.overtaken, counters.rejected
+            stats.cut_off = counters.cut_off
 
 
 def _clamp(time_ns: int) -> int:

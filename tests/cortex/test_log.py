@@ -18,10 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from peer import Block as Large
 from peer import Number, OtherNumber, Scan, is_whole, make_block
-from processes import ROOT, SOON_S, wait_for
+from processes import ROOT, SOON_S, Child, wait_for
 
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
-from cortex.log import Log, LogError, Player, Recorder, open_log
+from cortex.log import Log, LogError, Player, Recorder, TopicStats, open_log
 from cortex.log.format import CHUNK_BYTES
 from cortex.schema import Schema, schema_of
 
@@ -81,7 +81,7 @@ def test_what_is_recorded_can_be_read(node: Node, tmp_path: Path) -> None:
         ]
         assert log.start["node"] == "alone"
         assert json.loads(log.end["/number"]) == {
-            "written": 100, "bytes": 1600, "lost": 0, "overtaken": 0, "rejected": 0,
+            "written": 100, "bytes": 1600, "lost": 0, "overtaken": 0, "rejected": 0, "cut_off": 0,
         }  # fmt: skip
         typed = list(log.messages(types={"/number": Number}))
         assert [message for _, message, _ in typed] == [Number(10**18 + i, i) for i in range(100)]
@@ -215,6 +215,22 @@ def test_best_effort_counts_what_it_loses(node: Node, tmp_path: Path) -> None:
         ended = json.loads(log.end["/number"])
         assert ended["written"] == len(values)
         assert ended["written"] + ended["lost"] + ended["overtaken"] == published
+
+
+def test_a_publisher_that_was_killed_is_counted(
+    make_node: MakeNode, tmp_path: Path, start_child: Callable[..., Child]
+) -> None:
+    """The file does not say that all is in it."""
+    node = make_node()
+    child = start_child("peer")
+    with Recorder(node, tmp_path / "run.mcap", ["/numbers"]) as recorder:
+        child.ask(do="publisher", topic="/numbers", type="Number")
+        assert child.ask(do="await_subscribers", topic="/numbers")["ok"]
+        child.say(do="leave", topic="/numbers", count=10, orderly=False)
+        wait_for(lambda: recorder.stats.topics.get("/numbers", TopicStats()).cut_off)
+    with open_log(tmp_path / "run.mcap") as log:
+        assert json.loads(log.end["/numbers"])["cut_off"] == 1
+        assert numbers(log) == list(range(10))
 
 
 # Files that were cut off or damaged
