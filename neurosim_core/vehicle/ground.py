@@ -29,7 +29,8 @@ class GroundConfig(Settings):
     height_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """z of the plane in W [m]."""
     foot_position_m: Annotated[tuple[Vector3, ...], Field(min_length=1)] | None = None
-    """Where the vehicle touches the ground, in B [m]; null: 5 cm below each hub."""
+    """Where the vehicle touches the ground, in B [m]; null: below each hub, 5 cm under the centre
+    of mass."""
     stiffness_n_m: Annotated[float, Field(gt=0.0, le=1e9)] = 2000.0
     """Force on a foot per depth [N/m]."""
     damping_s_m: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
@@ -62,7 +63,8 @@ def make_ground(config: GroundConfig | None, rotor_position_m: tuple[Vector3, ..
     if config is None:
         return ground
     hubs = np.array(rotor_position_m)
-    feet = hubs - [0.0, 0.0, 0.05] if config.foot_position_m is None else np.array(config.foot_position_m)
+    below = hubs * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.05]
+    feet = below if config.foot_position_m is None else np.array(config.foot_position_m)
     ground.height = config.height_m
     ground.stiffness = config.stiffness_n_m
     ground.damping = config.damping_s_m

@@ -30,15 +30,16 @@ CRAZYFLIE = MultirotorConfig(
     inertia_kg_m2=_diagonal(
         (1.66e-5, 1.66e-5, 2.93e-5)
     ),  # firmware, physical_constants.c, without its products
-    rotor_position_m=_cross(0.043 * _DIAGONAL, 0.043 * _DIAGONAL, 0.02),
-    # Height of the hubs: identified; rates 0.3 s ahead are nearest with 25 to 30 mm in one flight and 30 to
-    # 40 mm in the other, within 4 % of that from 20 mm. More than the rotors are above the centre of mass: it
-    # stands for all torque that air speed in their plane gives.
+    rotor_position_m=_cross(0.043 * _DIAGONAL, 0.043 * _DIAGONAL, 0.05),
+    # Height of the hubs: identified by prediction errors; 48 and 53 mm about x and y in one flight, 44 and
+    # 58 mm in the other. Far more than the rotors are above the centre of mass: it stands for all torque that
+    # air speed in their plane gives (22 rad/s^2 for 1 m/s), such as by lift that the front rotors gain and
+    # the rear ones lose.
     rotor_direction=(1, -1, 1, -1),
     thrust_coefficient_n_s2=2.3e-8,  # Foerster (2015); Bitcraze: 14.5 g at 2500 rad/s
-    # Identified by prediction errors, which a controller in the loop does not bias: 2.5 and 1.8 mm of torque
+    # Identified by prediction errors, which a controller in the loop does not bias: 1.9 and 2.0 mm of torque
     # over thrust for speeds that change in flight. Firmware, thrustToTorque, of a load cell: 5.96 mm.
-    torque_coefficient_n_m_s2=0.0022 * 2.3e-8,
+    torque_coefficient_n_m_s2=0.0019 * 2.3e-8,
     rotor_drag_kg=10.2506e-07,  # Foerster (2015)
     rotor_inflow_kg=7.553e-07,  # Foerster (2015)
     # Identified by prediction errors as that which agrees with the inertia above, behind a delay of 9 ms in

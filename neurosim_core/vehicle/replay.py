@@ -4,7 +4,8 @@ The log is cut into windows. Each begins with the measured body rate and is flow
 commands. What differs from one specimen to the next is estimated from the flight before the window only: the
 thrust for a command, which falls with the battery, and the torque that the model misses. A Kalman filter
 takes that for the sum of two: one hardly changes, as of a battery that sits off centre, and one is forgotten,
-as of a gust; within the window the first stays and the second fades.
+as of a gust; within the window the first stays and the second fades. Nothing that was measured within a
+window is used in it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.vehicle.aerodynamics import quadratic_weights
 from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.multirotor import Multirotor, MultirotorState
 
@@ -37,16 +37,17 @@ _STEP_S = 1e-3
 _STRIDE = 50  # samples from the beginning of a window to that of the next
 _PAST_S = 0.15  # flight before a window that tells the thrust for a command
 _DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.CRAZYFLIE
+_TILT_S = 10.0  # how slowly the mean direction of the specific force corrects the integrated attitude
+_ROOM_S = 1.0  # over longer, the mean velocity of a flight in a room is nought
 _FILTER_STEP_S = 0.01
-# what the model misses, about x, y, z: maximum likelihood of what the filter predicts for its next step, over
-# two flights of 50 and 62 s together, alike about x and y; in brackets each alone, about x and z
-_FADING_RAD_S2 = np.array([8.0, 8.0, 0.88])  # (4.5 and 8.5; 0.73 and 1.11)
-_FADING_S = np.array([0.13, 0.13, 0.038])  # (0.042 and 0.124; 0.085 and 0.021)
-_NOISE_RAD_S2 = np.array([1.0, 1.0, 0.8])  # of the mean over a step (0.93 and 0.66; 0.88 and 0.57)
-_DRIFT_RAD_S2_PER_SQRT_S = np.array([1.4, 1.4, 0.0])  # of the steady part (10.4 and 1.3; 0 and 0)
+# what the model misses, about x, y, z: maximum likelihood of the rates that the filter predicts for its next
+# step, over two flights together, alike about x and y; in brackets each alone, about x and y, and about z
+_FADING_RAD_S2 = np.array([7.3, 7.3, 0.87])  # (6.9 and 7.8; 1.0 and 1.1)
+_FADING_S = np.array([0.20, 0.20, 0.028])  # (0.27 and 0.16; 0.007 and 0.018)
+_DRIFT_RAD_S2_PER_SQRT_S = np.array([1.1, 1.1, 0.06])  # of the steady part (0.9 and 1.3; 1.1 and 0)
+_KICK_RAD_S_PER_SQRT_S = np.array([0.0, 0.0, 0.078])  # too short to foresee (0; 0 and 0.055)
+_GYRO_RAD_S = np.array([0.004, 0.009, 0.001])  # noise (x 0.006 and 0.001, y 0.010 and 0.008; z 0)
 _STEADY_RAD_S2 = 20.0  # before anything is known
-_TILT_S = 3.0  # how slowly the mean direction of the specific force corrects the integrated attitude
-_FORCE_S = 0.02  # the accelerometer is averaged over this where it tells the air speed
 _FORCE_EVERY = 10
 _FLYING_PWM = 15_000.0
 _FORCE_MAX_M_S2 = 25.0  # more is a crash
@@ -113,18 +114,24 @@ def rotor_thrust_n(pwm: Array) -> Array:
 
 
 def replay(
-    log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3, delay_s: float = _DELAY_S
+    log: FlightLog,
+    config: MultirotorConfig,
+    *,
+    window_s: float = 0.3,
+    delay_s: float = _DELAY_S,
+    missing_torque: bool = True,
 ) -> Replay:
     """Fly a vehicle open loop through every window of a log in which the real one flew.
 
-    The air speed at the beginning of a window is what the accelerometer says in the plane of the rotors, by
-    the rotor drag of the vehicle; its tilt is the integral of the gyroscope.
+    The tilt at the beginning of a window is the integral of the gyroscope, and its velocity that of the tilt,
+    over about the last second.
 
     Args:
         log: Of a Crazyflie.
         config: The vehicle; rotors front left, front right, rear right, rear left, with rotor drag.
         window_s: Length of a window [s].
         delay_s: From a logged command to its effect in the log, beside the lag of the motors [s].
+        missing_torque: Whether the torque that the model missed before a window is added in it.
 
     Raises:
         ValueError: The vehicle has not these rotors or no rotor drag, or the log has no such flight.
@@ -152,7 +159,7 @@ def replay(
     calibration = _calibrate(log, config, begin, flying, first, past)
     vehicle = Multirotor(config, count=len(first))
     start = MultirotorState(*(rows[first] for rows in begin))
-    speed = _speeds(config, start.rotor_speed, calibration.lift(0.0), calibration.scale)
+    speed = _speeds(config, start.rotor_speed, calibration.scale)
     vehicle.reset(**start._replace(rotor_speed=speed)._asdict())
     rates, forces, measured_forces = [], [], []
     for sample in range(size):
@@ -162,8 +169,11 @@ def replay(
             forces.append(_specific_force(vehicle)[:, 2])
             measured_forces.append(log.specific_force[now, 2])
         command = np.sqrt(rotor_thrust_n(log.pwm[now]) / config.thrust_coefficient_n_s2)
-        lift = calibration.lift(sample * _STEP_S)
-        vehicle.step(_speeds(config, command, lift, calibration.scale), round(_STEP_S * 1e9))
+        vehicle.step(_speeds(config, command, calibration.scale), round(_STEP_S * 1e9))
+        load = _load(config, vehicle.state.rotor_speed)
+        if missing_torque:
+            turned = _STEP_S * calibration.missing((sample + 0.5) * _STEP_S, load)
+            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)  # type: ignore[no-untyped-call]
     unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
     pushed, felt = np.array(forces), np.array(measured_forces)
     return Replay(
@@ -193,21 +203,19 @@ def _lag(rows: Array, time_constant_s: float) -> Array:
 def _states(log: FlightLog, config: MultirotorConfig) -> MultirotorState:
     """Return the state at every sample as far as the log tells it; the velocity is that of still air."""
     command = np.sqrt(rotor_thrust_n(log.pwm) / config.thrust_coefficient_n_s2)
-    speed = _lag(command, config.motor_time_constant_s)
     up = _up(log)
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     turned = axis / np.maximum(sine, 1e-9) * np.arctan2(sine, up[:, 2:])
+    # thrust along z in B carries the weight, so the velocity in the plane of the rotors changes by -g up
+    velocity = -config.gravity_m_s2 * _ROOM_S * _lag(up, _ROOM_S) * [1.0, 1.0, 0.0]
     orientation = Rotation.from_rotvec(turned)
-    force = _lag(log.specific_force, _FORCE_S)
-    drag_1_s = config.rotor_drag_kg * speed.sum(axis=1) / config.mass_kg
-    air = np.where(_flying(log)[:, None], -force / np.maximum(drag_1_s, 1e-3)[:, None], 0.0) * [1.0, 1.0, 0.0]
     return MultirotorState(
-        position=np.zeros_like(air),
-        velocity=orientation.apply(air),
+        position=np.zeros_like(velocity),
+        velocity=orientation.apply(velocity),
         orientation=orientation.as_quat(),
         body_rate=log.body_rate,
-        rotor_speed=speed,
+        rotor_speed=_lag(command, config.motor_time_constant_s),
     )
 
 
@@ -243,16 +251,13 @@ class _Calibration(NamedTuple):
     scale: Array
     """Factor of the thrust for a command, shape [N]."""
     steady: Array
-    """Missing angular acceleration that stays [rad/s^2], shape [N, 3]."""
+    """Missing angular acceleration that stays, under a load of 1 [rad/s^2], shape [N, 3]."""
     fading: Array
     """Missing angular acceleration that fades, as it is when the window begins [rad/s^2], shape [N, 3]."""
-    lift_per_turning: Array
-    """Thrust of each rotor that gives an angular acceleration, and no thrust in all, shape [4, 3]."""
 
-    def lift(self, elapsed_s: float) -> Array:
-        """Return the thrust to add to each rotor [N], shape [N, 4]."""
-        missing = self.steady + self.fading * np.exp(-elapsed_s / _FADING_S)
-        return np.asarray(missing @ self.lift_per_turning.T)
+    def missing(self, elapsed_s: float, load: Array) -> Array:
+        """Return the angular acceleration to add under a load [rad/s^2], shape [N, 3]."""
+        return np.asarray(self.steady * load + self.fading * np.exp(-elapsed_s / _FADING_S))
 
 
 def _calibrate(
@@ -267,64 +272,82 @@ def _calibrate(
     vehicle.reset(**states._asdict())
     drawn = np.where(flying, _specific_force(vehicle)[:, 2], 0.0)
     measured = np.where(flying, log.specific_force[:, 2], 0.0)
-    turning = np.gradient(log.body_rate, _STEP_S, axis=0) - vehicle.acceleration.angular
 
     def over_past(rows: Array) -> Array:
         total = np.concatenate([[0.0], np.cumsum(rows)])
-        return np.asarray(total[first] - total[first - past])
+        end = np.arange(len(rows))
+        return np.asarray(total[end] - total[np.maximum(end - past, 0)])
 
-    steady, fading = _missing(turning, flying)
-    weights = quadratic_weights(
-        np.array(config.rotor_position_m),
-        np.array(config.rotor_direction),
-        thrust=config.thrust_coefficients_n_s2,
-        torque=config.torque_coefficients_n_m_s2,
-    )
-    mix = weights.T / config.thrust_coefficients_n_s2  # thrusts of rotors to thrust and torque
-    wanted = np.concatenate([np.zeros((1, 3)), np.array(config.inertia_kg_m2)])
+    scale = over_past(measured) / np.where(over_past(drawn) > 0.0, over_past(drawn), np.inf)
+    speed = _speeds(config, states.rotor_speed, scale)
+    vehicle.reset(**states._replace(rotor_speed=speed)._asdict())
+    load = _load(config, speed)
+    steady, fading = _missing(log.body_rate, vehicle.acceleration.angular, load, flying)
     step = round(_FILTER_STEP_S / _STEP_S)
-    return _Calibration(
-        scale=over_past(measured) / over_past(drawn),
-        steady=steady[first // step],
-        fading=fading[first // step],
-        lift_per_turning=np.linalg.solve(mix, wanted),
-    )
+    return _Calibration(scale=scale[first], steady=steady[first // step], fading=fading[first // step])
 
 
-def _missing(turning: Array, flying: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Split what the model misses, by a Kalman filter for each axis.
+def _missing(body_rate: Array, turning: Array, load: Array, flying: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Tell what the model misses, by a Kalman filter of rate, steady and fading part for each axis.
 
     Args:
-        turning: Measured less modelled angular acceleration at every sample [rad/s^2], shape [n, 3].
+        body_rate: Measured at every sample [rad/s], shape [n, 3].
+        turning: Angular acceleration of the model there [rad/s^2], shape [n, 3].
+        load: By which the steady part is multiplied there, shape [n, 3].
         flying: Which samples count, shape [n].
 
     Returns:
-        The steady and the fading part after 0, 1, 2, ... steps of the filter, shape [n / 10 + 1, 3] each.
+        The steady part under a load of 1 and the fading part at samples 0, 10, 20, ... [rad/s^2], shape
+        [n / 10, 3] each.
     """
     step = round(_FILTER_STEP_S / _STEP_S)
     count = len(turning) // step
-    means = turning[: count * step].reshape(count, step, 3).mean(axis=1)
+    pushed = _FILTER_STEP_S * turning[: count * step].reshape(count, step, 3).mean(axis=1)
+    loads = load[: count * step].reshape(count, step, 3).mean(axis=1)
     known = np.all(flying[: count * step].reshape(count, step), axis=1).tolist()
     keep = np.exp(-_FILTER_STEP_S / _FADING_S)
-    states = np.zeros((count + 1, 2, 3))
-    covariance = np.zeros((2, 2, 3))
-    covariance[0, 0], covariance[1, 1] = _STEADY_RAD_S2**2, _FADING_RAD_S2**2
-    transition = np.stack([np.ones(3), keep])
-    grown = np.stack([_DRIFT_RAD_S2_PER_SQRT_S**2 * _FILTER_STEP_S, (1.0 - keep**2) * _FADING_RAD_S2**2])
+    transition = np.zeros((3, 3, 3))  # [axis, to, from] of rate, steady, fading
+    transition[:, 0] = 1.0, _FILTER_STEP_S, _FILTER_STEP_S
+    transition[:, 1, 1] = 1.0
+    transition[:, 2, 2] = keep
+    grown = np.zeros((3, 3, 3))
+    grown[:, 0, 0] = _KICK_RAD_S_PER_SQRT_S**2 * _FILTER_STEP_S
+    grown[:, 1, 1] = _DRIFT_RAD_S2_PER_SQRT_S**2 * _FILTER_STEP_S
+    grown[:, 2, 2] = (1.0 - keep**2) * _FADING_RAD_S2**2
+    state = np.zeros((3, 3))  # [axis, part]
+    covariance = np.zeros((3, 3, 3))
+    covariance[:, 1, 1], covariance[:, 2, 2] = _STEADY_RAD_S2**2, _FADING_RAD_S2**2
+    parts = np.empty((count, 2, 3))
+    begun = False
     for k in range(count):
-        states[k + 1] = transition * states[k]
-        covariance *= transition[:, None] * transition[None, :]
-        covariance[[0, 1], [0, 1]] += grown
-        if known[k]:
-            shared = covariance.sum(axis=1)
-            gain = shared / (shared.sum(axis=0) + _NOISE_RAD_S2**2)
-            states[k + 1] += gain * (means[k] - states[k + 1].sum(axis=0))
-            covariance -= gain[:, None] * shared[None, :]
-    return states[:, 0], states[:, 1]
+        if known[k] and not begun:
+            state[:, 0] = body_rate[k * step]
+            covariance[:, 0, :] = covariance[:, :, 0] = 0.0
+            covariance[:, 0, 0] = _GYRO_RAD_S**2
+        elif known[k]:
+            gain = covariance[:, :, 0] / (covariance[:, 0, 0] + _GYRO_RAD_S**2)[:, None]
+            state += gain * (body_rate[k * step] - state[:, 0])[:, None]
+            covariance -= gain[:, :, None] * covariance[:, None, 0, :]
+        begun = known[k]
+        parts[k] = state[:, 1:].T
+        transition[:, 0, 1] = _FILTER_STEP_S * loads[k]
+        state = (transition @ state[:, :, None])[:, :, 0]
+        state[:, 0] += pushed[k]
+        covariance = transition @ covariance @ transition.transpose(0, 2, 1) + grown
+    return parts[:, 0], parts[:, 1]
 
 
-def _speeds(config: MultirotorConfig, speed: Array, lift_n: Array, scale: Array) -> Array:
-    """Return rotor speeds whose thrust is that of `speed` times `scale`, plus `lift_n`."""
-    thrust = scale[:, None] * config.thrust_coefficient_n_s2 * speed**2 + lift_n
-    wanted = np.sqrt(np.maximum(thrust, 0.0) / config.thrust_coefficient_n_s2)
+def _speeds(config: MultirotorConfig, speed: Array, scale: Array) -> Array:
+    """Return rotor speeds whose thrust is that of `speed` times `scale`."""
+    wanted = np.sqrt(np.maximum(scale, 0.0))[:, None] * speed
     return np.clip(wanted, config.rotor_speed_min_rad_s, config.rotor_speed_max_rad_s)
+
+
+def _load(config: MultirotorConfig, speed: Array) -> Array:
+    """Return by what the steady part is multiplied, shape [N, 3].
+
+    That about x and y grows with the thrust, as of a battery off centre: thrust over weight.
+    """
+    load = np.ones((len(speed), 3))
+    load[:, :2] = (config.thrust_coefficient_n_s2 * speed**2).sum(axis=1)[:, None] / config.hover_thrust_n
+    return load

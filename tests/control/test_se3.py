@@ -224,7 +224,7 @@ def test_flip_is_followed(device):
 
 @pytest.mark.parametrize(
     ("name", "length_9_m_s", "error_2_m_s", "error_9_m_s"),
-    [("crazyflie", 24.0, 0.010, 0.06), ("hummingbird", 10.0, 0.02, 0.06), ("racer", 10.0, 0.003, 0.04)],
+    [("crazyflie", 24.0, 0.010, 0.14), ("hummingbird", 10.0, 0.02, 0.06), ("racer", 10.0, 0.003, 0.04)],
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 500.0])
 def test_presets_track(name, length_9_m_s, error_2_m_s, error_9_m_s, rate_hz):

@@ -42,7 +42,7 @@ def push_of_ground(config: MultirotorConfig, y):
     if config.ground is None:
         return force, torque
     ground, R = config.ground, rotation_matrix(y[6:10])
-    feet = ground.foot_position_m or [(x, y, z - 0.05) for x, y, z in config.rotor_position_m]
+    feet = ground.foot_position_m or [(x, y, -0.05) for x, y, _ in config.rotor_position_m]
     for foot in feet:
         arm = R @ np.array(foot)
         depth = ground.height_m - (y[2] + arm[2])

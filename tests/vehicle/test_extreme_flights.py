@@ -51,7 +51,14 @@ def test_light_vehicles_in_a_storm(mass_kg, redone, device):
 
 def tightly(config: MultirotorConfig, device: str) -> Multirotor:
     """The same in adaptive steps alone, far below what is asked; against the oracle in `test_adaptive`."""
-    return Multirotor(config, device=device, integrator="dormand_prince", rtol=1e-12, atol=1e-14)
+    return Multirotor(
+        config,
+        device=device,
+        integrator="dormand_prince",
+        rtol=1e-12,
+        atol=1e-14,
+        evaluation_count_max=1_000_000,
+    )
 
 
 def silent_error(config: MultirotorConfig, device: str) -> tuple[float, int]:

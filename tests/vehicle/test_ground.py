@@ -40,7 +40,7 @@ def one(state: MultirotorState) -> MultirotorState:
 def energy(config: MultirotorConfig, state: MultirotorState) -> float:
     """Of motion, height, and the springs under the feet [J]."""
     R, ground = rotation_matrix(state.orientation), config.ground
-    feet = ground.foot_position_m or [(x, y, z - 0.05) for x, y, z in config.rotor_position_m]
+    feet = ground.foot_position_m or [(x, y, -0.05) for x, y, _ in config.rotor_position_m]
     depths = [max(0.0, ground.height_m - (state.position + R @ np.array(foot))[2]) for foot in feet]
     spin = state.body_rate @ np.array(config.inertia_kg_m2) @ state.body_rate
     moving = config.mass_kg * (state.velocity @ state.velocity)
