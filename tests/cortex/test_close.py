@@ -17,6 +17,7 @@ import cortex.publisher
 import cortex.subscriber
 from cortex import reliable
 from cortex.context import Closed
+from cortex.overview import subscriber_stats
 
 PATIENT = ["reliable", {"timeout_s": SOON_S}]  # as long as a machine may stand still
 
@@ -234,5 +235,5 @@ def test_a_stream_that_was_cut_off_is_counted(make_node, start_child, monkeypatc
         for _ in range(10):
             subscriber.recv(SOON_S)
         wait_for(lambda: not subscriber.sources() and not subscriber._links)
-        assert subscriber.counters.cut_off == (not orderly)
+        assert subscriber.counters.cut_off == subscriber_stats(subscriber).cut_off == (not orderly)
     assert subscriber.counters.lost == 0
