@@ -115,7 +115,7 @@ class Stack:
 
 @pytest.fixture(scope="module")
 def stack(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    """A mode's processes, the simulator last, a viewer in streaming; at the end nothing of them may be left."""
+    """The processes of a mode, a viewer in streaming only; at the end nothing of them may be left."""
     directory = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
     files = set(os.listdir("/dev/shm"))
     with pytest.MonkeyPatch.context() as patch:
