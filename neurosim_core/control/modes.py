@@ -46,6 +46,7 @@ from neurosim_core.frames import as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
+from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.command_ranges import CommandRanges, command_ranges
 
 logger = logging.getLogger(__name__)
@@ -359,6 +360,7 @@ class Controller:
             inputs=[*self._model, feedback, self.setpoint],
             outputs=[arrays.rotor_speed_command],
             device=self.device,
+            block_dim=BLOCK_DIM,
             record_cmd=True,
         )
 

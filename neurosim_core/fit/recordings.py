@@ -29,8 +29,8 @@ _SHORTEST = 5
 _BIN_US = 1000
 """Time over which the turns of light are looked for."""
 _PAUSE, _BURST = 20, 0.1
-"""What comes so many bins before a turn with so small a share of its events is no part of it: pixels fire when
-a camera is switched on."""
+"""What comes so many bins before a turn with so small a share of its events is no part of it: pixels fire
+when a camera is switched on."""
 _TRIM = 0.02
 """Share of the pixels at either end whose thresholds are not counted: noise has made them.
 

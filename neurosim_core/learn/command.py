@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 
 def add_parsers(commands: _Commands) -> None:
     """Add the commands."""
+    _add_learn(commands)
+    _add_deploy(commands)
+    _add_predict(commands)
+
+
+def _add_learn(commands: _Commands) -> None:
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
     learn.add_argument(
         "what",
@@ -108,6 +114,9 @@ def add_parsers(commands: _Commands) -> None:
         "--backbone", metavar="FILE", help="begin with the weights of another network, such as pretrain.pt"
     )
     learn.set_defaults(command=_learn)
+
+
+def _add_deploy(commands: _Commands) -> None:
     deploy = commands.add_parser(
         "deploy", help="fly a simulator or a vehicle by a trained policy, over Cortex"
     )
@@ -134,6 +143,9 @@ def add_parsers(commands: _Commands) -> None:
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
     deploy.set_defaults(command=_deploy)
+
+
+def _add_predict(commands: _Commands) -> None:
     predict = commands.add_parser(
         "predict", help="tell depth or flow from the events of a running simulator, over Cortex"
     )

@@ -296,6 +296,7 @@ def default_config(
             "learning_rate": 2e-3,
         }
         few |= {"hidden": 96, "widths": (16, 24, 32)}
+        student["iterations"] = max(few["iterations"], student.get("iterations", 0))
         small = PpoConfig(**teacher), DaggerConfig(**(few | student))
         steps: dict[str, Any] = {
             "pixels": 24,

@@ -33,7 +33,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import even_thread_count, group_kernels, make_lists
+from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,
@@ -465,7 +465,6 @@ class Antialiasing:
             )
             return
         self._lists.count.zero_()
-        even = even_thread_count(pixel_count, view.instant_count)
-        threads = self._lists.threads
-        for kernel, dim in zip(self._kernels, (even, threads // 4, threads), strict=True):
+        dims = thread_counts(self._lists, pixel_count, view.instant_count)
+        for kernel, dim in zip(self._kernels, dims, strict=True):
             launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)

@@ -46,8 +46,8 @@ _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
 _COVER_BOUNDS = (64, 12)
 """Threads of a block, and blocks of a multiprocessor."""
-_THREADS_PER_MULTIPROCESSOR = 5120
-"""Threads of the kernel of rays: far more than run at a time, since some take longer than others."""
+_RAY_THREADS = 5120
+"""Threads of a multiprocessor: far more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
@@ -65,7 +65,7 @@ class BlockLists:
     count: wp.array[int]
     """Length of the two lists, and how many entries of the first are taken."""
     threads: int
-    """Threads of the kernel that goes through the second one; a quarter as many take entries of the first."""
+    """Threads of the kernel that goes through the second one."""
 
 
 class GroupKernels(NamedTuple):
@@ -82,13 +82,17 @@ def make_lists(block_count: int, device: Any) -> BlockLists:
     lists.uneven = wp.zeros(block_count, dtype=wp.vec3i, device=device)
     lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
     lists.count = wp.zeros(3, dtype=int, device=device)
-    lists.threads = _THREADS_PER_MULTIPROCESSOR * max(1, wp.get_device(device).sm_count)
+    lists.threads = _RAY_THREADS * max(1, wp.get_device(device).sm_count)
     return lists
 
 
-def even_thread_count(pixel_count: int, instant_count: int) -> int:
-    """Return the threads of the kernel of even blocks, for so many pixels of all instants of all worlds."""
-    return pixel_count // instant_count * -(-instant_count // _INSTANTS)
+def thread_counts(lists: BlockLists, pixel_count: int, instant_count: int) -> tuple[int, int, int]:
+    """Return the threads of the three kernels, for so many pixels of all instants of all worlds."""
+    even = pixel_count // instant_count * -(-instant_count // _INSTANTS)
+    processors = lists.threads // _RAY_THREADS
+    # they run until all is done: one in 16 multiprocessors has a block less, and there the flight finds room
+    cover = _COVER_BOUNDS[0] * (_COVER_BOUNDS[1] * processors - processors // 16)
+    return even, cover, lists.threads
 
 
 @wp.func_native(read_native(__file__, "classify_block"))
@@ -458,13 +462,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             listed = lists.unresolved[begin + turn * (lists.threads // _RAYS)]
             block = listed[0]
             lane = index // RAY_COUNT
+            group = block // 4
             at = locate_pixel(
-                block // 4 // view.instant_count,
-                block // 4 % view.instant_count,
-                block % 4,
-                lane,
-                view,
-                worlds,
+                group // view.instant_count, group % view.instant_count, block % 4, lane, view, worlds
             )
             if wp.static(terms.world_scenes):
                 scene = worlds.scenes[worlds.scene[at.world]]

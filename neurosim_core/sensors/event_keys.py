@@ -39,8 +39,6 @@ _EVENTS_PER_SAMPLE = 1 / 8
 tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stands still."""
 _PINNED_BLOCKS = 3
 """What a reader holds, what it reads next, and what is copied to."""
-_REPLAYED_COUNT_MAX = 1 << 16
-"""So many keys or less are cut by a graph, which sorts up to twice as many: launches would take longer."""
 _ROOM_MIN = 1024
 _BLOCK_COUNT_MAX = 1 << 26
 """Most events in one block of memory: Warp counts its bytes in 31 bits."""
@@ -234,10 +232,9 @@ class EventKeys:
         self, blocks: BufferPool, copied: int, window_count: int, end_bit: int
     ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
-        count, shifts = self.count, [self._row_shift, self._time_shift]
-        room = count
-        if count <= _REPLAYED_COUNT_MAX:
-            room = min(max(_ROOM_MIN, 1 << (count - 1).bit_length()), self._order.shape[0] // 2)
+        # a graph sorts up to half as many more; launches, of which there are many, take the host far longer
+        room = min(max(_ROOM_MIN, size_class(self.count)), self._order.shape[0] // 2)
+        shifts = [self._row_shift, self._time_shift]
 
         def launch() -> None:
             self._told.upload()
@@ -248,13 +245,10 @@ class EventKeys:
             self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
             self._found_on_host.fetch(0, window_count)
 
-        if count <= _REPLAYED_COUNT_MAX:
-            self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
-        else:
-            launch()
+        self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         if self._labels is not None:
             t, both = self._columns[:2]
-            self._labels.launch(count, t, both, both, first_x=4 * copied, first_y=5 * copied)
+            self._labels.launch(self.count, t, both, both, first_x=4 * copied, first_y=5 * copied)
         block = blocks.acquire(_EVENT_BYTES * copied)
         wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()

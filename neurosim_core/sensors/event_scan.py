@@ -28,6 +28,8 @@ BLOCK_SIZE = wp.constant(256)
 """Threads of a block on CUDA."""
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
+SINGLY = wp.constant(wp.int32(4))
+"""Levels that are found one by one; few samples cross more, and theirs are found at once."""
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
 LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
@@ -50,7 +52,7 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
 
 @wp.func_native(read_native(__file__, "append"))
 def _append(key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
-    """Append a key and count it, on a CPU, where a thread has keys for itself."""
+    """Append a key and count it."""
     ...
 
 
@@ -68,13 +70,13 @@ def keep_crossing(
 ) -> wp.int64:
     """Keep what a pixel crosses in a frame (step PUT), for its whole block to turn into keys; only on CUDA.
 
-    Few threads cross levels, some many in each frame, and the others would wait for them. At most 2^21 - 1
-    levels are crossed in a frame, and 8 frames that begin at a multiple of 8 are kept together.
+    Few threads cross levels, some in many frames, and the others would wait for them. The frames of a round
+    are kept together.
 
     Every thread of a block comes here before with OPEN, and after with CLOSE, which counts the events and
-    returns how many crossings are kept. Then READ returns a word of one: its levels, the last bits of the
-    frame and the thread; and `last`, `up` and `down` as they were before, and the number of its first event.
-    START returns the place of event 0. On a CPU, PUT returns 0 and nothing is kept.
+    returns how many crossings are kept. Then READ returns a word of one: the frame of the round and the
+    thread; `last`, `up` and `down` as they were before; the number of its first event, and of its events.
+    START returns the place of event 0. PUT returns 0 where there is no room, as always on a CPU.
     """
     ...
 
@@ -100,7 +102,7 @@ def _count_lead(
 
 @wp.func_native(read_native(__file__, "end_of_round"))
 def _end_of_round(first: wp.int32, frame_count: wp.int32) -> wp.int32:
-    """Return where the frames end that a block scans before it writes their events; 8 on CUDA."""
+    """Return where the frames end that a block scans before it writes their events; 32 on CUDA."""
     ...
 
 
@@ -142,7 +144,7 @@ def _write_kept(
     """Write the keys of what a pixel of the block has crossed in a frame, as far as there is room."""
     word = _read_word(0, index, counters_out)
     pixel = first_pixel + (word & 255)
-    frame = first_frame + ((word >> 8) & 7)
+    frame = first_frame + (word >> 8)
     last = wp.cast(_read_word(1, index, counters_out), wp.float32)
     up = _read_word(2, index, counters_out)
     down = _read_word(3, index, counters_out)
@@ -151,7 +153,7 @@ def _write_kept(
     sample = log_radiance[frame, pixel]
     level_0 = wp.float64(base[pixel])
     place = place_of(pixel, pixel // width, width, row_shift)
-    for event in range((word >> 11) & 0x1FFFFF):
+    for event in range(_read_word(5, index, counters_out)):
         if slot + wp.int64(event) < wp.int64(keys_out.shape[0]):
             keys_out[wp.int32(slot) + event] = key_of_level(
                 event,
@@ -262,12 +264,19 @@ def scan_pixel(
                     level_0 = wp.float64(base_32)
                     up_before = up
                     down_before = down
-                    if sample >= high:
-                        up = rise(sample, level_0, up, down, threshold_on, threshold_off)
-                    elif sample <= low:
-                        down = fall(sample, level_0, up, down, threshold_on, threshold_off)
-                    low = reach_down(level_0, up, down, threshold_on, threshold_off)
-                    high = reach_up(level_0, up, down, threshold_on, threshold_off)
+                    turn = wp.int32(0)
+                    while turn <= SINGLY and (sample >= high or sample <= low):
+                        if turn == SINGLY and sample >= high:
+                            up = rise(sample, level_0, up, down, threshold_on, threshold_off)
+                        elif turn == SINGLY:
+                            down = fall(sample, level_0, up, down, threshold_on, threshold_off)
+                        elif sample >= high:
+                            up += 1
+                        else:
+                            down += 1
+                        low = reach_down(level_0, up, down, threshold_on, threshold_off)
+                        high = reach_up(level_0, up, down, threshold_on, threshold_off)
+                        turn += 1
                     found = up - up_before + down - down_before
                     if tabulate:
                         wp.atomic_add(table_out, frame, row, found)

@@ -168,7 +168,7 @@ def screen(
     )
 
 
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # blocks of a multiprocessor: fastest on an H200
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))  # blocks of a multiprocessor: fastest on an H200
 def scan(
     # Model:
     thresholds: wp.array[wp.vec2d],

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
@@ -294,6 +295,7 @@ class Trace:
                 dim=self.states.shape[1],
                 inputs=[surfaces, fleet, self._rows, slot, elapsed_ns],
                 device=self.states.device,
+                block_dim=BLOCK_DIM,
                 record_cmd=True,
             )
             self._recording = (fleet, launch)
@@ -334,6 +336,7 @@ class Trace:
                 inputs=[p_BC, q_BC, p_WC.shape[0] // world_count, self.states, self.stamps, slots],
                 outputs=[p_WC, q_WC, stamps],
                 device=self.states.device,
+                block_dim=BLOCK_DIM,
                 record_cmd=True,
             )
             if len(self._pose_launches) >= _LAUNCHES_MAX:
@@ -367,6 +370,7 @@ class Trace:
             inputs=[p_BC, q_BC, stride, offsets_ns, rows.history, rows.entries, slots],
             outputs=[p_WC, q_WC, stamps],
             device=p_WC.device,
+            block_dim=BLOCK_DIM,
         )
 
     def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
@@ -386,6 +390,7 @@ class Trace:
             inputs=[p_BC, q_BC, twist.shape[0] // world_count, self.states, self.status, slots],
             outputs=[twist],
             device=self.states.device,
+            block_dim=BLOCK_DIM,
         )
 
     @property
@@ -409,6 +414,7 @@ class Trace:
                 inputs=[first, self._rows],
                 outputs=[self._rows_on_host],
                 device=self.states.device,
+                block_dim=BLOCK_DIM,
             )
 
     def numpy(self, first: int, count: int) -> TraceRows:

@@ -12,6 +12,10 @@ _VECTORS = ("position", "velocity", "body_rate", "acceleration", "angular_accele
 _ROTORS = ("rotor_speed", "rotor_speed_command")
 _OTHERS = {"orientation": wp.quatd, "status": wp.int32}
 
+BLOCK_DIM = 32
+"""Threads of a block on CUDA where a thread is a vehicle: a few thousand vehicles then reach every
+multiprocessor, and the block of a single one fits beside those of a renderer."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MultirotorArrays:

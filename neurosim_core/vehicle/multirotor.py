@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
-from neurosim_core.vehicle.arrays import allocate_arrays
+from neurosim_core.vehicle.arrays import BLOCK_DIM, allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
 from neurosim_core.vehicle.motor import lag_constants
@@ -25,7 +25,6 @@ Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
 
 _STEP_MAX_NS = 10**12
-_BLOCK_DIM = 32  # threads per CUDA block: a few thousand vehicles then reach every multiprocessor
 _LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
 
 
@@ -304,7 +303,7 @@ class Multirotor:
                 dim=self.count,
                 inputs=[self.airframes, self._around, mask, self._batch],
                 device=self.device,
-                block_dim=_BLOCK_DIM,
+                block_dim=BLOCK_DIM,
             )
 
     def accelerate(self) -> None:
@@ -372,7 +371,7 @@ class Multirotor:
             dim=self.count,
             inputs=parameters,
             device=self.device,
-            block_dim=_BLOCK_DIM,
+            block_dim=BLOCK_DIM,
             record_cmd=True,
         )
         return launch

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import select
 import subprocess
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +12,7 @@ from typing import Any
 import numpy as np
 import zmq
 from cpp_messages import Mode, Point, Rich, Scan
-from processes import SOON_S
+from processes import SOON_S, Lines
 
 from cortex import records, wire
 from cortex.host import host_id
@@ -23,53 +20,29 @@ from cortex.node import Node
 from cortex.schema import schema_of
 
 
-class Peer:
+class Peer(Lines):
     """A running `peer` program."""
 
     def __init__(self, command: Sequence[object]) -> None:
-        self.process = subprocess.Popen(
-            [str(part) for part in command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        self._rest = b""
+        words, pipe = [str(part) for part in command], subprocess.PIPE
+        super().__init__(subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0), "C++")
         try:
             assert self.line() == "ready"
         except BaseException:
-            self.end()  # which says why, if it ended by itself
+            self.process.kill()
+            self.process.communicate()
             raise
-
-    def has_line(self, timeout_s: float = 0.0) -> bool:
-        """Whether it has printed a line that was not taken yet."""
-        assert self.process.stdout is not None
-        deadline_s = time.monotonic() + timeout_s
-        while b"\n" not in self._rest:
-            left_s = max(0.0, deadline_s - time.monotonic())
-            if not select.select([self.process.stdout], [], [], left_s)[0]:
-                return False
-            chunk = os.read(self.process.stdout.fileno(), 65536)
-            assert chunk, f"the C++ program has ended: {self.end()}"
-            self._rest += chunk
-        return True
-
-    def line(self) -> str:
-        """The next line that it prints."""
-        assert self.has_line(SOON_S), "the C++ program is silent"
-        line, self._rest = self._rest.split(b"\n", 1)
-        return line.decode()
 
     def await_complaint(self, text: str) -> None:
         """Wait until it writes this to standard error, which `end` returns no more then."""
-        assert self.process.stderr is not None
-        said = b""
-        while text.encode() not in said:
-            assert select.select([self.process.stderr], [], [], SOON_S)[0], said
-            said += os.read(self.process.stderr.fileno(), 4096)
+        said = ""
+        while text not in said:
+            more = self.errors(SOON_S)
+            assert more, said
+            said += more
 
     def close_input(self) -> None:
         """Have it say what it has counted, and end."""
-        assert self.process.stdin is not None
         self.process.stdin.close()
         self.process.stdin = None
 

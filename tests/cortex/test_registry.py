@@ -236,7 +236,7 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
             socket.send(control_frame(Heartbeat(12345, 1, 0), sequence))
             drive([one, two], lambda socket=socket: answers_unknown(socket))
             socket.close()
-        assert registry.rejected > 10_000
+        assert registry.rejected > 5_000
         drive([one, two], lambda: registry.node_count == 2)  # ghosts have no heartbeat
         drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
         assert two.id not in one.ever_lost
@@ -266,7 +266,7 @@ def test_mutated_answers_do_no_harm_to_a_directory(context, make):
         for _ in range(100):
             fake.send_multipart([identity, mutate(rng, rng.choice(seeds))])
         drive_for([node], 0.01)
-    assert node.directory.rejected > 2500
+    assert node.directory.rejected > 1000
     fake.close()
     (runtime_dir(0) / REGISTRY_SOCKET).unlink(missing_ok=True)
     with serving():

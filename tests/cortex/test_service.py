@@ -34,6 +34,34 @@ def double(request):
     return Number(request.stamp_ns, 2 * request.value)
 
 
+class Holding:
+    """A handler that answers with the request, but not before it is told to."""
+
+    def __init__(self):
+        self.entered, self.release = threading.Event(), threading.Event()
+        self.seen = []
+
+    def __call__(self, request):
+        self.seen.append(request.value)
+        self.entered.set()
+        self.release.wait(SOON_S)
+        return request
+
+
+def begin_call(client, value, outcomes):
+    """Call from a thread, which adds the answer or the error to the outcomes."""
+
+    def call():
+        try:
+            outcomes.append(client.call(Number(0, value), timeout_s=SOON_S).value)
+        except (Closed, ServiceUnavailable) as error:
+            outcomes.append(error)
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    return thread
+
+
 # Replies
 
 
@@ -55,14 +83,6 @@ def test_a_task_calls_without_blocking_the_loop(node):
 
     with node.client("/double", Number, Number) as client:
         assert asyncio.run(run(client)).value == 42
-
-
-def test_a_call_is_answered(node):
-    node.service("/double", Number, Number, double)
-    with node.client("/double", Number, Number) as client:
-        assert client.available()
-        for value in range(50):
-            assert client.call(Number(value, value), SOON_S) == Number(value, 2 * value)
 
 
 # Failures
@@ -98,6 +118,7 @@ def test_nobody_offers_it(node):
 def test_it_is_withdrawn(node):
     withdraw = node.service("/double", Number, Number, double)
     with node.client("/double", Number, Number) as client:
+        assert client.available()
         assert client.call(Number(0, 4), SOON_S).value == 8
         withdraw()
         withdraw()
@@ -167,26 +188,17 @@ def test_a_handler_that_takes_too_long(node):
 
 def test_a_request_whose_time_is_over_is_not_acted_upon(node):
     """It waited behind another one until its caller had given up."""
-    seen, release = [], threading.Event()
-
-    def handle(request):
-        seen.append(request.value)
-        release.wait(SOON_S)
-        return request
-
-    node.service("/slow", Number, Number, handle)
-    clients = [node.client("/slow", Number, Number) for _ in range(2)]
-    first = threading.Thread(target=lambda: clients[0].call(Number(0, 1), timeout_s=SOON_S))
-    first.start()
-    wait_for(lambda: seen)
-    with pytest.raises(ServiceTimeout):
-        clients[1].call(Number(0, 2), timeout_s=0.05)
-    release.set()
-    first.join()
-    assert clients[1].call(Number(0, 3), timeout_s=SOON_S).value == 3
-    assert seen == [1, 3]
-    for client in clients:
-        client.close()
+    handler, outcomes = Holding(), []
+    node.service("/slow", Number, Number, handler)
+    with node.client("/slow", Number, Number) as one, node.client("/slow", Number, Number) as other:
+        first = begin_call(one, 1, outcomes)
+        assert handler.entered.wait(SOON_S)
+        with pytest.raises(ServiceTimeout):
+            other.call(Number(0, 2), timeout_s=0.05)
+        handler.release.set()
+        first.join()
+        assert other.call(Number(0, 3), timeout_s=SOON_S).value == 3
+    assert (outcomes, handler.seen) == ([1], [1, 3])
 
 
 @pytest.mark.parametrize("local", [True, False])
@@ -216,34 +228,18 @@ def test_the_deadline_goes_along_within_a_host(runtime, local):
 
 def test_a_client_that_is_closed(make_node):
     """By itself or with its node, before or during a call: an error at once."""
-    server, caller = make_node("server"), make_node("caller")
-    entered, release = threading.Event(), threading.Event()
-
-    def handle(request):
-        entered.set()
-        release.wait(SOON_S)
-        return request
-
-    server.service("/hold", Number, Number, handle)
+    server, caller, handler, outcomes = make_node("server"), make_node("caller"), Holding(), []
+    server.service("/hold", Number, Number, handler)
     client, other = caller.client("/hold", Number, Number), caller.client("/hold", Number, Number)
     other.close()
     with pytest.raises(Closed, match="/hold"):
         other.call(Number(0, 0), SOON_S)
-    ended = []
-
-    def call():
-        try:
-            client.call(Number(0, 0), timeout_s=SOON_S)
-        except Closed:
-            ended.append(True)
-
-    thread = threading.Thread(target=call)
-    thread.start()
-    assert entered.wait(SOON_S)
+    thread = begin_call(client, 0, outcomes)
+    assert handler.entered.wait(SOON_S)
     caller.close()
     thread.join(SOON_S / 2)
-    assert ended == [True]
-    release.set()
+    assert [type(outcome) for outcome in outcomes] == [Closed]
+    handler.release.set()
     with pytest.raises(Closed, match="/hold"):
         client.call(Number(0, 0), SOON_S)
 
@@ -278,35 +274,18 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
 
 def test_too_many_requests(node):
     """Those over the number that may wait are refused at once, the others are served."""
-    release, entered = threading.Event(), threading.Event()
-
-    def handle(request):
-        entered.set()
-        release.wait(SOON_S)
-        return request
-
-    node.service("/busy", Number, Number, handle)
-    outcomes = []
-
-    def call(number):
-        with node.client("/busy", Number, Number) as client:
-            try:
-                outcomes.append(client.call(Number(0, number), timeout_s=SOON_S).value)
-            except ServiceUnavailable as error:
-                outcomes.append(str(error))
-
-    first = threading.Thread(target=call, args=(0,))
-    first.start()
-    assert entered.wait(SOON_S)
-    count = PENDING_MAX + 5
-    threads = [threading.Thread(target=call, args=(number,)) for number in range(1, count + 1)]
-    for thread in threads:
-        thread.start()
+    handler, outcomes = Holding(), []
+    node.service("/busy", Number, Number, handler)
+    clients = [node.client("/busy", Number, Number) for _ in range(PENDING_MAX + 6)]
+    threads = [begin_call(clients[0], 0, outcomes)]
+    assert handler.entered.wait(SOON_S)
+    threads += [begin_call(client, 1, outcomes) for client in clients[1:]]
     wait_for(lambda: len(outcomes) >= 5)
-    assert outcomes == [f"/busy: {PENDING_MAX} requests wait already"] * 5
-    release.set()
-    for thread in (first, *threads):
+    assert [str(outcome) for outcome in outcomes] == [f"/busy: {PENDING_MAX} requests wait already"] * 5
+    handler.release.set()
+    for thread, client in zip(threads, clients, strict=True):
         thread.join(SOON_S)
+        client.close()
     assert sum(isinstance(outcome, int) for outcome in outcomes) == PENDING_MAX + 1
 
 
@@ -365,30 +344,14 @@ def test_a_server_that_is_killed_during_a_call(make_node, start_child):
 
 
 def test_a_server_that_closes_during_a_call(make_node):
-    server, caller = make_node("server"), make_node("caller")
-    entered, release = threading.Event(), threading.Event()
-
-    def handle(request):
-        entered.set()
-        release.wait(SOON_S)
-        return request
-
-    server.service("/hold", Number, Number, handle)
-    ended = []
-
-    def call():
-        with caller.client("/hold", Number, Number) as client:
-            try:
-                client.call(Number(0, 0), timeout_s=SOON_S)
-            except ServiceUnavailable:
-                ended.append(True)
-
-    thread = threading.Thread(target=call)
-    thread.start()
-    assert entered.wait(SOON_S)
-    closing = threading.Thread(target=server.close)
-    closing.start()
-    thread.join(SOON_S / 2)
-    assert ended == [True]
-    release.set()
+    server, caller, handler, outcomes = make_node("server"), make_node("caller"), Holding(), []
+    server.service("/hold", Number, Number, handler)
+    with caller.client("/hold", Number, Number) as client:
+        thread = begin_call(client, 0, outcomes)
+        assert handler.entered.wait(SOON_S)
+        closing = threading.Thread(target=server.close)
+        closing.start()
+        thread.join(SOON_S / 2)
+        assert [type(outcome) for outcome in outcomes] == [ServiceUnavailable]
+    handler.release.set()
     closing.join(SOON_S)

@@ -44,8 +44,8 @@ def record(settings: dict[str, Any], log: Any, time_s: Any, *, seed: int, width:
     return camera.feed(frames[1:], np.rint(1e9 * np.asarray(time_s)[1:]).astype(np.int64)).numpy()
 
 
-def record_still(settings: dict[str, Any], seed: int = 77) -> EventArrays:
-    return record(settings, [0.0, 0.0], [0.0, SPAN_S], seed=seed)
+def record_still(settings: dict[str, Any], seed: int = 77, span_s: float = SPAN_S) -> EventArrays:
+    return record(settings, [0.0, 0.0], [0.0, span_s], seed=seed)
 
 
 def record_steps(settings: dict[str, Any], *, periods: int = 9, width: int = WIDTH) -> EventArrays:
@@ -111,11 +111,15 @@ def test_hot_pixels_are_told_among_pixels_of_many_rates():
 
 @pytest.mark.parametrize(("rate_hz", "refractory_s"), [(8.0, 1e-2), (20.0, 2e-3)])
 def test_a_dead_time_is_found_in_fast_noise(rate_hz, refractory_s):
-    """It is more than a tenth of the time between two events of most pixels, or of the hot ones."""
+    """It is more than a tenth of the time between two events of most pixels, or of the hot ones.
+
+    In 8 s there are 200,000 events or more.
+    """
+    span_s = 8.0
     truth = {"shot_noise.rate_hz": rate_hz, "shot_noise.bright_factor": 1.0, "refractory_s": refractory_s}
     hot = {"hot_pixels.fraction": 0.05, "hot_pixels.rate_hz": 400.0, "hot_pixels.on_fraction": 0.9}
-    still = record_still(truth | (hot if rate_hz > 10.0 else {}), seed=5)
-    fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=still, span_s=SPAN_S), repeats=2)
+    still = record_still(truth | (hot if rate_hz > 10.0 else {}), seed=5, span_s=span_s)
+    fit = fit_sensor(Stimulus(width=WIDTH, height=HEIGHT, still=still, span_s=span_s), repeats=2)
     assert fit.settings["refractory_s"] == pytest.approx(refractory_s, rel=0.01)
     assert fit.settings["shot_noise.rate_hz"] == pytest.approx(rate_hz, rel=0.03)
 

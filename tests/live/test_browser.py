@@ -26,7 +26,12 @@ from cortex import messages as msg
 from neurosim_core.view.pictures import OFF_SRGB, ON_SRGB
 
 CHROMIUM = shutil.which("chromium")
-OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+OPTIONS = [
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--js-flags=--liftoff-only",
+]
 SEEN_S = 120.0
 """Deadline of the first picture; 20 s where nothing else runs."""
 BAR_PX = 3
@@ -128,7 +133,7 @@ def test_the_page_shows_events_that_move(tmp_path):
             simulator.announce()
             with publishing(simulator), browsers.sync_playwright() as driver:
                 browser: Any = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
-                page = browser.new_page(viewport={"width": 1000, "height": 700})
+                page = browser.new_page(viewport={"width": 600, "height": 420})
                 page.goto(address[1])
 
                 def take() -> bytes:

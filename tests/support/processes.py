@@ -103,7 +103,53 @@ class _Forked:
         os.kill(self.pid, number)
 
 
-class Child:
+class Lines:
+    """A process that prints lines.
+
+    Args:
+        process: Its standard output and error are unbuffered pipes.
+        name: For errors.
+    """
+
+    def __init__(self, process: Any, name: str) -> None:
+        self.process = process
+        self.name = name
+        self._rest = b""
+
+    def has_line(self, timeout_s: float = 0.0) -> bool:
+        """Whether it has printed a line that was not taken yet."""
+        deadline_s = time.monotonic() + timeout_s
+        while b"\n" not in self._rest:
+            left_s = max(deadline_s - time.monotonic(), 0.0)
+            if not select.select([self.process.stdout], [], [], left_s)[0]:
+                return False
+            chunk = os.read(self.process.stdout.fileno(), 65536)
+            assert chunk, f"the process {self.name!r} has ended: {self.errors(SOON_S)}"
+            self._rest += chunk
+        return True
+
+    def line(self, within_s: float = SOON_S) -> str:
+        """The next line that it prints."""
+        assert self.has_line(within_s), f"the process {self.name!r} is silent"
+        line, self._rest = self._rest.split(b"\n", 1)
+        return line.decode()
+
+    def errors(self, timeout_s: float = 0.0) -> str:
+        """What it has written to its standard error since the last call; the rest once it has ended.
+
+        Args:
+            timeout_s: How long to wait for something.
+        """
+        text = b""
+        while select.select([self.process.stderr], [], [], 0.0 if text else timeout_s)[0]:
+            chunk = os.read(self.process.stderr.fileno(), 65536)
+            if not chunk:
+                break
+            text += chunk
+        return text.decode()
+
+
+class Child(Lines):
     """A process of `peer.py`.
 
     Args:
@@ -123,10 +169,7 @@ class Child:
         forked: bool = False,
         **arguments: Any,
     ):
-        self._started = time.monotonic()
-        self._rest = b""
-        self.role = role
-        self.process: Any = (
+        process: Any = (
             _Forked(role, arguments)
             if forked
             else subprocess.Popen(
@@ -138,6 +181,7 @@ class Child:
                 bufsize=0,
             )
         )
+        super().__init__(process, role)
 
     @property
     def pid(self) -> int:
@@ -151,43 +195,19 @@ class Child:
     @functools.cached_property
     def hello(self) -> dict[str, Any]:
         """The first line that it prints, once it is ready."""
-        return self._next_line(SOON_S)
+        said: dict[str, Any] = json.loads(self.line())
+        return said
 
     def hear(self, within_s: float = SOON_S) -> dict[str, Any]:
         """The next line that it prints after that."""
         assert self.hello
-        return self._next_line(within_s)
-
-    def _next_line(self, within_s: float) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        deadline = time.monotonic() + within_s
-        while b"\n" not in self._rest:
-            left_s = max(deadline - time.monotonic(), 0.0)
-            if not select.select([self.process.stdout], [], [], left_s)[0]:
-                raise AssertionError(f"the process {self.role!r} is silent")
-            chunk = os.read(self.process.stdout.fileno(), 65536)
-            if not chunk:
-                raise AssertionError(f"the process {self.role!r} has ended: {self.errors()}")
-            self._rest += chunk
-        line, self._rest = self._rest.split(b"\n", 1)
-        heard: dict[str, Any] = json.loads(line)
-        return heard
+        said: dict[str, Any] = json.loads(self.line(within_s))
+        return said
 
     def ask(self, within_s: float = SOON_S, **words: Any) -> dict[str, Any]:
         """Send it a line and wait for its answer."""
         self.say(**words)
         return self.hear(within_s)
-
-    def errors(self) -> str:
-        """What it has written to its standard error so far; all of it once it has ended."""
-        assert self.process.stderr is not None
-        text = b""
-        while select.select([self.process.stderr], [], [], 0.0)[0]:
-            chunk = os.read(self.process.stderr.fileno(), 65536)
-            if not chunk:
-                break
-            text += chunk
-        return text.decode()
 
     def kill(self) -> None:
         """SIGKILL, and wait until it is dead."""
@@ -213,7 +233,7 @@ class Child:
         assert self.process.stdin is not None
         self.process.stdin.close()
         code = self.process.wait(timeout_s)
-        assert code == 0, f"the process {self.role!r} ended with {code}: {self.errors()}"
+        assert code == 0, f"the process {self.name!r} ended with {code}: {self.errors()}"
 
     def end(self) -> None:
         """Get rid of it, whatever state it is in."""

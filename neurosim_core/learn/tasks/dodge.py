@@ -56,7 +56,7 @@ class Dodge(Task):
         for index in range(_SPHERES)
     }
     teacher: Mapping[str, Any] = {"worlds": 1024, "iterations": 200, "reward_scale": 0.1}
-    student: Mapping[str, Any] = {"disturbance": 0.1}
+    student: Mapping[str, Any] = {"iterations": 123, "disturbance": 0.1}
     hint = "threat"
     mirror: Mapping[str, Sequence[float]] = {
         "proprioception": (*(1, -1, 1, 1, -1, 1), *MIRROR_ACTION, *(1, -1, 1, -1, 1, -1)),

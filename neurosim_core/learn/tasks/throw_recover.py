@@ -31,7 +31,7 @@ class ThrowRecover(HoverBase):
     rate_max_rad_s = (8.0, 8.0, 3.0)
     thrust_span = 1.0
     teacher: Mapping[str, Any] = {"worlds": 1024, "iterations": 150, "reward_scale": 0.1}
-    student: Mapping[str, Any] = {"disturbance": 0.1}
+    student: Mapping[str, Any] = {"iterations": 164, "disturbance": 0.1}
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
         """Return settings of eight halls to train in, or of four others."""

@@ -113,12 +113,16 @@ for (int turn = 0; turn < 3; ++turn) {
     add(face, part);
 }
 bool full = count > (alone ? room : room / 2); // there are more than have room, or so many that more are going to be found
-count = full ? 0 : count;
 sky = (__ballot_sync(ALL, sky) & ours) != 0;
 Entries reaching; // those that reach the pixel
 int looked = 0, edges = 0; // edges that cross pixels: how many are looked at, and how many there are
 bool more = true;
 for (int begin = 0; more;) {
+    if (alone ? full : __any_sync(ALL, full)) { // the instants are taken one by one, or the pixels rendered by rays
+        result[0] = alone ? 0 : -1;
+        result[3] = -1;
+        return result;
+    }
     more = __any_sync(ALL, begin < count); // if not, the last edges are looked at
     const int number = wp::max(wp::min(count - begin, members), 0), most = wp::max(number, __shfl_xor_sync(ALL, number, 16));
     const int entry = begin + member;
@@ -219,11 +223,6 @@ for (int begin = 0; more;) {
         full |= count > room;
     }
     begin += number;
-    if (full) count = begin = 0;
-}
-if (!alone && __any_sync(ALL, full)) {
-    result[0] = -1;
-    return result;
 }
 if (alone) { // the first threads go on with what the others have found
     const unsigned low = __shfl_xor_sync(ALL, reaching.low, 16), high = __shfl_xor_sync(ALL, reaching.high, 16);
@@ -270,7 +269,7 @@ for (Entries rest = holding; rest.any();) { // faces of one surface are taken to
     surfaces.add(first);
 }
 const int bare = SAMPLES - __popc(taken);
-const bool resolved = !full && (sky || 2 * bare <= SAMPLES);
+const bool resolved = sky || 2 * bare <= SAMPLES;
 if (outside || !resolved) surfaces = Entries();
 const int pairs = __popc(surfaces.low) + __popc(surfaces.high);
 int before = pairs;

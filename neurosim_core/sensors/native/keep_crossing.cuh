@@ -1,15 +1,17 @@
 #if defined(__CUDA_ARCH__)
-constexpr int SIZE = 2048; // a crossing for each thread and each of 8 frames
-__shared__ int words[5][SIZE];
+constexpr int SIZE = 1024;
+__shared__ int words[6][SIZE];
 __shared__ unsigned kept_count, total; // of 64 bits together they would be added in a loop
 __shared__ unsigned long long start;
 if (step == 1) {
     const unsigned index = atomicAdd(&kept_count, 1u);
-    words[0][index] = (event_count << 11) | ((frame & 7) << 8) | threadIdx.x;
+    if (index >= SIZE) return 0;
+    words[0][index] = ((frame & 31) << 8) | threadIdx.x;
     words[1][index] = __float_as_int(last);
     words[2][index] = up;
     words[3][index] = down;
     words[4][index] = (int)atomicAdd(&total, (unsigned)event_count);
+    words[5][index] = event_count;
     return 1;
 }
 if (step == 3) return words[place][index];
@@ -21,7 +23,7 @@ if (step == 0) {
     start = atomicAdd((unsigned long long*)counters.data, (unsigned long long)total);
 }
 __syncthreads();
-return (int64_t)kept_count;
+return (int64_t)(kept_count < SIZE ? kept_count : SIZE);
 #else
 return 0;
 #endif

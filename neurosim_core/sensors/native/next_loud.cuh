@@ -1,22 +1,23 @@
 const float* sample = log_radiance.data + pixel;
 const size_t stride = log_radiance.shape[1];
 #if defined(__CUDA_ARCH__)
-// the loads of all frames of a round are under way together; beyond the end the last frame stands in
+// the loads of eight frames are under way together; beyond the end the last frame stands in
 constexpr int SIZE = 8;
-if (first >= end) return end;
-const int begin = first / SIZE * SIZE;
-float value[SIZE];
-const float* at = sample + begin * stride;
+for (int begin = first / SIZE * SIZE; begin < end; begin += SIZE) {
+    float value[SIZE];
+    const float* at = sample + begin * stride;
 #pragma unroll
-for (int i = 0; i < SIZE; ++i) {
-    value[i] = *at;
-    if (begin + i + 1 < end) at += stride;
+    for (int i = 0; i < SIZE; ++i) {
+        value[i] = *at;
+        if (begin + i + 1 < end) at += stride;
+    }
+    unsigned loud = 0;
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
+    if (begin < first) loud &= ~0u << (first - begin);
+    if (loud != 0) return wp::min(begin + __ffs(loud) - 1, end);
 }
-unsigned loud = 0;
-#pragma unroll
-for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
-loud &= ~0u << (first - begin);
-return loud != 0 && begin + __ffs(loud) - 1 < end ? begin + __ffs(loud) - 1 : end;
+return end;
 #else
 int frame = first;
 while (frame < end && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
