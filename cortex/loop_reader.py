@@ -7,6 +7,7 @@ costs less than 1 us.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, Generic, TypeVar
@@ -65,8 +66,9 @@ class LoopReader:
         if len(self._fds) < len(self._wanted):
             for fd in self._wanted:
                 if fd not in self._fds:
-                    self.loop.add_reader(fd, self._wake, fd)
-                    self._fds.add(fd)
+                    with contextlib.suppress(OSError):  # its publisher has left since: another number follows
+                        self.loop.add_reader(fd, self._wake, fd)
+                        self._fds.add(fd)
 
     def _set_timer(self, when_s: float) -> None:
         """Wake all at that time or earlier: one timer serves a stream that waits thousands of times."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import compileall
 import gc
 import os
 import signal
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -48,7 +50,13 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep the order of the files; pytest-xdist would begin with those of the most tests."""
+    """Keep the order of the files; pytest-xdist would begin with those of the most tests.
+
+    Packages are compiled before the workers start, each of which would compile them all.
+    """
+    if not (hasattr(config, "workerinput") or sys.dont_write_bytecode):
+        for package in ("cortex", "cortex_ros2_bridge", "neurosim_core"):
+            compileall.compile_dir(Path(__file__).parents[1] / package, quiet=2)
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
 

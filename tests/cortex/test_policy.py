@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import time
 
 import numpy as np
@@ -216,9 +215,7 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
     steady.ask(do="close", topic="/numbers")  # it reads no more
     stopped.say(do="receive", topic="/numbers", until=count)
     sent = count
-    while not select.select([stopped.process.stdout], [], [], 1e-3)[
-        0
-    ]:  # it hears of new ones when it has read old ones
+    while not stopped.has_line(1e-3):  # it hears of new ones when it has read old ones
         assert publisher.publish(Number(sent, sent))
         sent += 1
         assert sent < count + 60_000

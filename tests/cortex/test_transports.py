@@ -20,21 +20,6 @@ SIZES = [0, 10, 4000, 16_384, 16_500, 100_000, 1_000_000, 30]
 """Bytes of content, on both sides of what goes inline."""
 
 
-def exchange(publisher, subscriber, count=3):
-    """Every size arrives as it was sent, in order."""
-    number = 0
-    for _ in range(count):
-        for size in SIZES:
-            assert publisher.publish(make_block(number, size))
-            block, info = subscriber.recv_with_info(SOON_S)
-            assert (block.number, len(block.data)) == (number, size)
-            assert is_whole(block)
-            assert -1e9 < info.latency_ns < SOON_S * 1e9
-            number += 1
-    assert subscriber.counters.lost == 0
-    assert subscriber.counters.rejected == 0
-
-
 def keys_of(base, names):
     """Directories of keys that trust each other."""
     made = {name: new_keys(base / name) for name in names}
@@ -249,6 +234,3 @@ def test_frames_have_a_limit(runtime):
     for kind, least in ((zmq.SUB, BODY_LIMIT), (zmq.DEALER, CONTROL_LIMIT), (zmq.ROUTER, CONTROL_LIMIT)):
         with new_socket(kind) as socket:
             assert least + HEADER_SIZE < socket.maxmsgsize < least + HEADER_SIZE + 10_000
-
-
-# Two hosts
