@@ -107,5 +107,6 @@ def subscriber_stats(subscriber: Subscriber[Any]) -> SubscriberStats:
         counters.lost,
         counters.rejected,
         counters.overtaken,
+        counters.cut_off,
         array_of(counters.latency),
     )

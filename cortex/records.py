@@ -178,6 +178,7 @@ class SubscriberStats:
     lost: UInt64
     rejected: UInt64
     overtaken: UInt64
+    cut_off: UInt64
     latency_counts: Array[np.uint64, 40]
 
 

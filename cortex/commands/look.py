@@ -132,7 +132,8 @@ def _top_lines(counts: _Counts, before: _Counts) -> Iterator[str]:
     last = {(record.node, index): stats for record, index, stats in before.subscribers}
     by_topic: dict[str, dict[str, int]] = {}
     delays: dict[str, np.ndarray] = {}
-    names = ("publishers", "published", "bytes", "subscribers", "lost", "overtaken", "rejected", "timeouts")
+    losses = ("lost", "overtaken", "rejected", "cut_off", "timeouts")
+    names = ("publishers", "published", "bytes", "subscribers", *losses)
 
     def add(topic: str, **values: int) -> None:
         row = by_topic.setdefault(topic, dict.fromkeys(names, 0))
@@ -144,7 +145,7 @@ def _top_lines(counts: _Counts, before: _Counts) -> Iterator[str]:
         published, size = (pub.published - was.published, pub.bytes - was.bytes) if was else (0, 0)
         add(pub.topic, publishers=1, published=published, bytes=size, timeouts=pub.timeouts)
     for record, index, sub in counts.subscribers:
-        add(sub.topic, subscribers=1, lost=sub.lost, overtaken=sub.overtaken, rejected=sub.rejected)
+        add(sub.topic, subscribers=1, **{name: getattr(sub, name) for name in losses[:-1]})
         old = last.get((record.node, index))
         if old is not None and old.topic == sub.topic:
             delays[sub.topic] = delays.get(sub.topic, 0) + (sub.latency_counts - old.latency_counts)
@@ -158,12 +159,13 @@ def _top_lines(counts: _Counts, before: _Counts) -> Iterator[str]:
                 rate(row["published"] / elapsed_s),
                 f"{bytes_of(row['bytes'] / elapsed_s)}/s",
                 str(row["subscribers"]),
-                *(f"{row[name]:,}" for name in ("lost", "overtaken", "rejected", "timeouts")),
+                *(f"{row[name]:,}" for name in losses),
                 seconds(quantile_ns(latency, 0.5) * 1e-9),
                 seconds(quantile_ns(latency, 0.99) * 1e-9),
             )
         )
-    head = ("topic", "publishers", "rate", "bandwidth", "subscribers", *names[4:], "delay p50", "p99")
+    lost = [name.replace("_", " ") for name in losses]
+    head = ("topic", "publishers", "rate", "bandwidth", "subscribers", *lost, "delay p50", "p99")
     yield from table(head, rows) if rows else ("nothing is published or subscribed",)
     for name in counts.silent:
         yield f"node {plain(name)} did not answer"
@@ -271,11 +273,12 @@ def _subscriber_table(counts: _Counts, before: _Counts | None, told: bool) -> It
             f"{stats.lost:,}",
             f"{stats.overtaken:,}",
             f"{stats.rejected:,}",
+            f"{stats.cut_off:,}",
             seconds(quantile_ns(latency, 0.5) * 1e-9),
             seconds(quantile_ns(latency, 0.99) * 1e-9),
         )
         rows.append(("  ".join(facts), cells))
-    head = ("received", "rate", "lost", "overtaken", "rejected", "delay p50", "p99")
+    head = ("received", "rate", "lost", "overtaken", "rejected", "cut off", "delay p50", "p99")
     yield from entries("subscribers", head, rows) if rows else ("no subscriber",)
 
 

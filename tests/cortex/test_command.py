@@ -255,8 +255,8 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
     assert lines[4] == "robot  latched"
     assert lines[5].split() == ["1,234", "0", "Hz", "0", "B/s", "2", "0", "0"]
     assert lines[9] == "viewer  reliable(depth=8, timeout_s=1)"
-    assert lines[10].split()[:6] == ["1,234", "0", "Hz", "0", "0", "0"]
-    assert lines[10].split()[7] in ("us", "ms")  # the delay
+    assert lines[10].split()[:7] == ["1,234", "0", "Hz", "0", "0", "0", "0"]
+    assert lines[10].split()[8] in ("us", "ms")  # the delay
     assert lines[11] == "viewer  keep_last(2)"
     assert "  ranges    float32[n]" in lines
     status, output, errors = cortex("info", "/nothing", "--once")

@@ -379,7 +379,9 @@ def test_cpp_reader_counts_a_stream_that_was_cut_off(
         assert child.ask(do="await_subscribers", topic="/scan")["ok"]
         child.say(do="leave", topic="/scan", count=10, orderly=orderly)
     assert select.select([reader.process.stderr], [], [], SOON_S)[0]
-    last = make_node().publisher("/scan", Scan)
+    node = make_node()
+    wait_for(lambda: [found.cut_off for found in subscribers_in_cpp(node)] == [1])
+    last = node.publisher("/scan", Scan)
     assert last.wait_for_subscribers(1, SOON_S)
     last.publish(scan(-1, 0))
     result = result_of(reader)

@@ -25,6 +25,7 @@ from cortex import records, reliable, wire
 from cortex.codec import codec_of
 from cortex.host import host_id
 from cortex.node import Node
+from cortex.overview import subscriber_stats
 from cortex.schema import schema_of
 
 __all__ = ["programs"]
@@ -133,6 +134,7 @@ def test_python_reports_what_it_has_not_heard_the_end_of(
                     reader.recv(0.0)
             counted = {name: getattr(reader.counters, name) for name in COUNTERS}
             assert counted == expected(number), number
+            assert subscriber_stats(reader).cut_off == reader.counters.cut_off
 
 
 @needs_compiler

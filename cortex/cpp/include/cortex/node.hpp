@@ -397,7 +397,7 @@ class Node {
     for (const auto& core : subscriptions()) {
       const auto counters = core->counters();
       reply.subscribers.push_back({core->record.topic, core->record.policy, counters.received, counters.lost,
-                                   counters.rejected, counters.overtaken, counters.latency});
+                                   counters.rejected, counters.overtaken, counters.cut_off, counters.latency});
     }
     return reply;
   }
