@@ -17,6 +17,7 @@ from neurosim_core.control.config import (
     PathController,
     Se3ControllerConfig,
 )
+from neurosim_core.control.modes import Controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
@@ -75,9 +76,8 @@ class PathFollower:
             settings = controller or Se3ControllerConfig(gains=self._gains)
             context = ControllerContext(airframe=airframe, paths=[path], device="cpu")
             self._controller = settings.make(context)
-            self._feedback.host_orientation[0, 3] = 1.0
-            self._controller.update(self._feedback)  # compiled here rather than at the first command
-            self._controller.begin(self._all)
+            if isinstance(self._controller, Controller):
+                self._controller.update(self._feedback)  # compiled here rather than at the first command
 
     def command(
         self,

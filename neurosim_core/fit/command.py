@@ -24,9 +24,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "fit-sensor",
         help="find the settings of your event camera from recordings of it",
         description="Estimate leak, shot noise, hot pixels and dead time of an event camera from a recording "
-        "of a still, evenly lit surface, and thresholds, their spread and the readout from one of light that "
-        "is switched between two levels. Writes settings with their standard errors, and a picture of the "
-        "recording beside a simulation with them. Any format that `neurosim convert` reads.",
+        "of a still, evenly lit surface, and thresholds, their spread and jitter and the readout from one of "
+        "light that is switched between two levels. Writes settings with their standard errors, and a "
+        "picture of the recording beside a simulation with them. Any format that `neurosim convert` reads.",
     )
     parser.add_argument("still", type=Path, help="events of a still, evenly lit surface, 30 s or more")
     parser.add_argument("steps", type=Path, nargs="?", help="events of light that is switched up and down")

@@ -28,6 +28,9 @@ _SHORTEST = 5
 """Which of the shortest intervals tells the refractory time: some glitches are survived."""
 _BIN_US = 1000
 """Time over which the turns of light are looked for."""
+_PAUSE, _BURST = 20, 0.1
+"""What comes so many bins before a turn with so small a share of its events is no part of it: pixels fire
+when a camera is switched on."""
 _TRIM = 0.02
 """Share of the pixels at either end whose thresholds are not counted: noise has made them.
 
@@ -195,7 +198,8 @@ def find_steps(events: EventArrays) -> tuple[Counts, Counts]:
     level = max(0.2 * float(np.quantile(np.abs(signed), 1.0 - 1e-2)), chance)
     sign = np.where(np.abs(signed) > level, np.sign(signed), 0.0)
     busy = np.flatnonzero(sign)
-    turns = busy[np.flatnonzero(np.diff(sign[busy], prepend=0.0) != 0)]
+    alike = np.split(busy, np.flatnonzero(np.diff(sign[busy])) + 1)
+    turns = np.array([_begin_of(bins_alike, np.abs(signed)) for bins_alike in alike if len(bins_alike)])
     if len(turns) and sign[turns[0]] < 0:
         turns = turns[1:]
     turns = turns[: len(turns) // 2 * 2]
@@ -209,25 +213,37 @@ def find_steps(events: EventArrays) -> tuple[Counts, Counts]:
     return times[::2], times[1::2]
 
 
+def _begin_of(bins: Counts, weight: Floats) -> int:
+    """Return the first of the bins of a turn, without a burst long before it."""
+    parts = np.split(bins, np.flatnonzero(np.diff(bins) > _PAUSE) + 1)
+    seen = np.cumsum([weight[part].sum() for part in parts])
+    return int(parts[int(np.argmax(seen > _BURST * seen[-1]))][0])
+
+
 def measure_steps(
     events: EventArrays, width: int, height: int, height_log: float, hot: NDArray[np.bool_] | None = None
 ) -> dict[str, float]:
-    """Return thresholds and their spread, from how many events a step of log radiance has.
+    """Return thresholds, their spread and jitter, from how many events a step of log radiance has.
 
     Where the levels lie is random, so a pixel with thresholds C_on and C_off, a ON events in a rise and b OFF
-    events in a fall has a C_on = b C_off = height - (C_on + C_off) / 2.
+    events in a fall has a C_on = b C_off = height - (C_on + C_off) / 2. Thresholds that are drawn anew for
+    each event make the events of a step a renewal process: their number varies by height sigma^2 / C^3.
     """
     rises, falls = find_steps(events)
     pixel = events.y.astype(np.int64) * width + events.x
     half_us = min(int(np.diff(rises).min()), 2 * int((falls - rises).min())) // 2
-    counts = []
+    counts, changes = [], []
     for polarity, starts in ((1, rises), (0, falls)):
         mine = events.polarity == polarity
         t, where = events.t[mine], pixel[mine]
-        inside = np.zeros(len(t), dtype=bool)
+        total, squares = np.zeros(width * height), np.zeros(width * height)
         for start in starts:
-            inside[np.searchsorted(t, start) : np.searchsorted(t, start + half_us)] = True
-        counts.append(np.bincount(where[inside], minlength=width * height) / len(starts))
+            inside = slice(np.searchsorted(t, start), np.searchsorted(t, start + half_us))
+            count = np.bincount(where[inside], minlength=width * height)
+            total += count
+            squares += count**2
+        counts.append(total / len(starts))
+        changes.append((squares - total**2 / len(starts)) / (len(starts) - 1))
     on, off = counts
     use = (on > 0.5) & (off > 0.5)
     if hot is not None:
@@ -240,11 +256,15 @@ def measure_steps(
     threshold_on = height_log / (on + 0.5 + 0.5 * on / off)
     threshold_off = threshold_on * on / off
     found: dict[str, float] = {}
-    for name, values in (("on", threshold_on), ("off", threshold_off)):
+    for name, values, change in (("on", threshold_on, changes[0]), ("off", threshold_off, changes[1])):
         low, high = np.quantile(values, [_TRIM, 1.0 - _TRIM])
         middle = values[(values >= low) & (values <= high)]
         found |= {f"threshold_{name}": float(middle.mean())}
         found |= {f"threshold_spread.sigma_{name}": float(middle.std())}
+        change = change[use]
+        usual = change[change <= np.quantile(change, 1.0 - _TRIM)].mean()
+        jitter = math.sqrt(float(np.median(values) ** 3 / height_log * usual))
+        found |= {f"threshold_jitter.sigma_{name}": jitter}
     return found | {
         "ON events a rise": float(on.mean()),
         "OFF events a fall": float(off.mean()),

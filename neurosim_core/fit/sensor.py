@@ -43,6 +43,8 @@ _SIMULATED_EVENTS = 2_000_000
 _PERIODS_MAX = 12
 _ALIKE = 0.25
 """Pixels are alike whose thresholds spread by less than this share of what one event more or less makes."""
+_JITTER = 1.15
+"""Thresholds change from event to event where counts of a step vary by so much more than without."""
 _DEFAULT_THRESHOLD = 0.2
 
 Numbers = dict[str, float]
@@ -148,6 +150,9 @@ def fit_sensor(
 
     progress(f"simulate, {_ROUNDS} rounds")
     settings = approach(settings, real.numbers, _ROUNDS)
+    if jitter := _find_jitter(real, observe(simulate(stimulus, settings, real, seed))):
+        progress(f"simulate with thresholds that change, {_ROUNDS} rounds")
+        settings = approach(settings | jitter, real.numbers, _ROUNDS)
     twins, refits = [], []
     for number in range(repeats):
         progress(f"simulate for the errors, {number + 1} of {repeats}")
@@ -171,6 +176,20 @@ def fit_sensor(
         if key in settings and all(key in twin.numbers for twin in twins):
             errors[key] = float(np.std([twin.numbers[key] for twin in twins], ddof=1))
     return SensorFit(settings=centred, errors=errors, real=real, simulated=twins[0], notes=notes)
+
+
+def _find_jitter(real: Observation, simulated: Observation) -> Numbers:
+    """Return the jitter of thresholds that a recording shows beyond a simulation without it, if any."""
+    keys = ("threshold_jitter.sigma_on", "threshold_jitter.sigma_off")
+    if not all(key in one.numbers for key in keys for one in (real, simulated)):
+        return {}
+    squares = [(real.numbers[key] ** 2, simulated.numbers[key] ** 2) for key in keys]
+    if not any(shown > _JITTER * expected for shown, expected in squares):
+        return {}
+    return {
+        key: math.sqrt(max(shown - expected, 0.0))
+        for key, (shown, expected) in zip(keys, squares, strict=True)
+    }
 
 
 def _tell_alike(
@@ -337,7 +356,7 @@ def _corrected(
         if _is_rate(key):
             if goal > 0.0 and now > 0.0:
                 moved[key] = value * min(max((goal / now) ** _GAIN, 0.2), 5.0)
-        elif key.startswith("threshold_spread"):
+        elif key.startswith(("threshold_spread", "threshold_jitter")):
             moved[key] = math.sqrt(max(value**2 + _GAIN * (goal**2 - now**2), 0.0))
         else:
             moved[key] = min(max(value + _GAIN * (goal - now), 0.0), 1.0)

@@ -47,10 +47,11 @@ class NoisyPixel:
 
 @wp.func
 def jittered(model: PixelModel, index: wp.int32, state: NoisyPixel) -> NoisyPixel:
-    """Draw the thresholds until the next event."""
-    normal = normal2(random_bits(model.seed, model.jitter_stream, wp.int64(state.event_count), index))
-    state.on = wp.max(state.steady[0] + model.jitter[0] * normal[0], model.jitter_least)
-    state.off = wp.max(state.steady[1] + model.jitter[1] * normal[1], model.jitter_least)
+    """Draw the thresholds until the next event; the first are those of the pixel: it may have leaked."""
+    if state.event_count > 0:
+        normal = normal2(random_bits(model.seed, model.jitter_stream, wp.int64(state.event_count), index))
+        state.on = wp.max(state.steady[0] + model.jitter[0] * normal[0], model.jitter_least)
+        state.off = wp.max(state.steady[1] + model.jitter[1] * normal[1], model.jitter_least)
     return state
 
 

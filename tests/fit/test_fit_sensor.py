@@ -153,6 +153,37 @@ def test_thresholds_of_pixels_that_are_alike_are_told_less_exactly():
     assert "all pixels have the same whole number of events" in " ".join(fit.notes)
 
 
+@pytest.mark.parametrize("bandwidth_hz", [None, 1e5])
+def test_jitter_of_thresholds_is_told_from_their_spread(bandwidth_hz):
+    """Counts of one pixel differ from step to step; also with a readout that is late by half a step."""
+    jitter = {"threshold_jitter.sigma_on": 0.03, "threshold_jitter.sigma_off": 0.04}
+    readout = {} if bandwidth_hz is None else READOUT | {"readout.bandwidth_hz": bandwidth_hz}
+    stimulus = Stimulus(
+        width=WIDTH, height=HEIGHT, still=record_still(TRUTH | jitter), span_s=SPAN_S,
+        steps=record_steps(TRUTH | jitter | readout), contrast=CONTRAST, rise_s=RISE_S,
+    )  # fmt: skip
+    fit = fit_sensor(stimulus, repeats=2)
+    for key in ("threshold_on", "threshold_off"):
+        assert fit.settings[key] == pytest.approx(TRUTH[key], rel=0.015), key
+    for key, true in jitter.items():
+        assert fit.settings[key] == pytest.approx(true, rel=0.12), key
+    for key in ("threshold_spread.sigma_on", "threshold_spread.sigma_off"):
+        assert fit.settings[key] == pytest.approx(TRUTH[key], rel=0.08), key
+
+
+def test_a_burst_at_the_start_is_no_rise(recordings):
+    """Pixels fire when a camera is switched on: the first rise is not taken to begin there."""
+    steps = recordings[1]
+    place = np.arange(400)
+    burst = EventArrays(
+        t=np.concatenate([np.zeros(400, np.int64), steps.t]),
+        x=np.concatenate([(place % WIDTH).astype(np.uint16), steps.x]),
+        y=np.concatenate([(place // WIDTH).astype(np.uint16), steps.y]),
+        polarity=np.concatenate([np.ones(400, np.uint8), steps.polarity]),
+    )
+    assert np.abs(find_steps(burst)[0] - find_steps(steps)[0]).max() <= 2000
+
+
 def test_a_readout_by_rows_is_told_from_one_by_events():
     """A window of w rows and n events takes w row_s + n / bandwidth."""
     rows = {"readout.kind": "row", "readout.bandwidth_hz": 4e5, "readout.row_s": 2e-6}

@@ -22,7 +22,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 SETTINGS: dict[str, Any] = {
     "duration_s": 1.5,
     "device": "cpu",
-    "scene": {"kind": "apartment", "rooms": 2},
+    "scene": {"kind": "apartment", "rooms": 1},
     "render": {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1},
     "vehicle": {"on_collision": "report"},
     "path": {"kind": "hover"},
