@@ -19,10 +19,7 @@ if TYPE_CHECKING:  # isort: off
         Env as Env,
         make_env as make_env,
     )
-    from neurosim_core.learn.episodes import (
-        Randomisation as Randomisation,
-        StartConfig as StartConfig,
-    )
+    from neurosim_core.learn.episodes import StartConfig as StartConfig
     from neurosim_core.learn.evaluate import (
         evaluate_policy as evaluate_policy,
         teacher_actor as teacher_actor,
@@ -31,6 +28,7 @@ if TYPE_CHECKING:  # isort: off
         Ppo as Ppo,
         PpoConfig as PpoConfig,
     )
+    from neurosim_core.learn.randomisation import Randomisation as Randomisation
     from neurosim_core.learn.surfaces import (
         Counts as Counts,
         LeakySurface as LeakySurface,

@@ -12,7 +12,8 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from neurosim_core.learn.episodes import EPISODE, Randomisation, signed, within
+from neurosim_core.learn.episodes import EPISODE, signed, within
+from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.random import random_bits, uniform4
 from neurosim_core.render.lenses import AnyLens
 from neurosim_core.sim.simulation import Simulation
@@ -31,7 +32,7 @@ def draw_lenses(settings: Mapping[str, Any], drawn: Randomisation) -> tuple[list
         drawn: What to draw.
 
     Returns:
-        `LENS_COUNT` lenses, none where all have that of the settings; and factor of the focal length, shifts
+        `LENS_COUNT` lenses, none where all are as the settings say; and factor of the focal length, shifts
         of the optical axis along rows and columns (share of the width), and k1 of each, shape [lens, 4].
 
     Raises:
@@ -44,8 +45,9 @@ def draw_lenses(settings: Mapping[str, Any], drawn: Randomisation) -> tuple[list
             drawn.distortion,
         ]
     )
-    if (bounds[:, 0] == bounds[:, 1]).all():
-        return [], np.array([bounds[:, 0]], dtype=np.float32)
+    nominal = np.array([[1.0, 0.0, 0.0, 0.0]])
+    if (bounds == nominal.T).all():
+        return [], nominal.astype(np.float32)
     lens = TypeAdapter(AnyLens).validate_python(dict(settings))
     kinds = ("pinhole", "radtan") if drawn.distortion != (0.0, 0.0) else ("pinhole", "radtan", "rational")
     if lens.kind not in kinds:

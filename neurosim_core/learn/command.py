@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import signal
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,7 +114,7 @@ def _add_learn(commands: _Commands) -> None:
     dense.add_argument(
         "--backbone", metavar="FILE", help="begin with the weights of another network, such as pretrain.pt"
     )
-    learn.set_defaults(command=_learn)
+    learn.set_defaults(command=partial(_learn, learn))
 
 
 def _add_deploy(commands: _Commands) -> None:
@@ -166,8 +167,46 @@ def _predict(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _learn(arguments: argparse.Namespace) -> int:
+_DENSE = {
+    "out", "device", "worlds", "seed", "ray", "data", "live", "fly_device", "test", "minutes", "size",
+    "backbone",
+}  # fmt: skip
+_USED = {
+    "eval": {"run", "device", "worlds", "scenes", "speed", "blind", "transfer", "test"},
+    "rate": {"run", "device", "worlds", "pixels", "algorithm"},
+    **dict.fromkeys(("depth", "flow", "pretrain"), _DENSE),
+}
+_TRAIN = {
+    "run", "out", "device", "worlds", "seed", "ray", "pixels", "surface", "seeds", "workers", "wandb",
+    "algorithm", "teacher_iterations", "student_iterations", "resume", "randomise",
+}  # fmt: skip
+"""Options of `neurosim learn TASK`; those of what is no task are above."""
+
+
+def _refuse_unused(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Refuse options that would have no effect.
+
+    Raises:
+        ValueError: There are some.
+    """
+    options = {action.dest for action in parser._actions if action.dest in vars(arguments)} - {"what"}
+    given = {name for name in options if getattr(arguments, name) != parser.get_default(name)}
+    what, run = arguments.what, arguments.run
+    unused = given - _USED.get(what, _TRAIN)
+    if what == "eval" and run is not None and run.suffix == ".pt":
+        unused = given - {"run", "test"}
+    elif what == "eval":
+        unused |= given & ({"test", "speed", "blind"} if arguments.transfer else {"test"})
+    elif arguments.algorithm == "ppo":
+        unused |= given & {"teacher_iterations"}
+    if unused:
+        names = ("RUN" if name == "run" else f"--{name.replace('_', '-')}" for name in sorted(unused))
+        raise ValueError(f"neurosim learn {what} makes no use of {', '.join(names)} here")
+
+
+def _learn(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     need("torch")
+    _refuse_unused(parser, arguments)
     if arguments.what == "eval":
         return _evaluate(arguments)
     if arguments.what == "rate":
@@ -195,6 +234,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     )
     changes = ("worlds", "pixels", "surface", "teacher_iterations", "student_iterations", "randomise")
     changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
+    changed += ["algorithm"] * (arguments.algorithm != parser.get_default("algorithm"))
     if arguments.resume and changed:
         raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what

@@ -15,14 +15,13 @@ from neurosim_core.learn.cameras import CameraDraws, draw_lenses
 from neurosim_core.learn.episodes import (
     COLUMN_COUNT,
     COLUMNS,
-    NO_RANDOMISATION,
     PARAMETERS,
     Episodes,
-    Randomisation,
     look_at_vehicles,
     make_routes,
     probe,
 )
+from neurosim_core.learn.randomisation import NO_RANDOMISATION, Randomisation
 from neurosim_core.learn.snapshot import put_state, state_of
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
 from neurosim_core.learn.task import Observations, Task, View
@@ -153,6 +152,7 @@ class Env:
         self._thresholds: torch.Tensor | None = None
         if sees and self.randomisation.threshold_factor != (1.0, 1.0):
             self._thresholds = wp.to_torch(self.sim.thresholds(CAMERA))
+            self._nominal_thresholds = self._thresholds.clone()
         self._cameras: CameraDraws | None = None
         if sees and self.randomisation.cameras_differ:
             self._cameras = CameraDraws(self.sim, CAMERA, self.randomisation, lens_table)
@@ -203,9 +203,8 @@ class Env:
         found["thrust_factor"] = low + (high - low) * self.view.draws[:, -1]
         found["latency_steps"] = self._latency()
         found["lag_s"] = self._lag_s()
-        if self._surface is not None:
-            thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
-            found["threshold_factor"] = thresholds / self.task.threshold
+        if self._thresholds is not None:
+            found["threshold_factor"] = (self._thresholds / self._nominal_thresholds).float()
         if self._cameras is not None:
             found |= self._cameras.parameters()
         return found
@@ -245,10 +244,21 @@ class Env:
             seed: New seed of world 0 (of world i: seed + i), from which all episodes follow; None: go on.
             spread: Let these first episodes be cut at different times, so that worlds do not end together.
             episodes: Play these again, what `step` returned as `seed`, int64, [N]; others follow from them.
+
+        Returns:
+            Observations, and a dictionary: `seed`, as of `step`.
+
+        Raises:
+            ValueError: The seed is negative, or the episodes are not of N worlds.
         """
         if seed is not None or not self._started:
             self._episodes.seed(self._seed if seed is None else seed)
         if episodes is not None:
+            if episodes.dtype != torch.int64 or episodes.shape != self._seeds.shape:
+                raise ValueError(
+                    f"episodes must be int64 of shape {tuple(self._seeds.shape)}, "
+                    f"got {episodes.dtype} of {tuple(episodes.shape)}"
+                )
             self._seeds.copy_(episodes)
         self._started = True
         self._mask.fill_(True)
@@ -256,7 +266,7 @@ class Env:
         self._begin(everywhere=True, again=episodes is not None)
         if spread:
             self.episode_length.copy_(self.view.draws[:, 0] * self.episode_steps)
-        return self._observations(), {}
+        return self._observations(), {"seed": self._seeds.clone()}
 
     def step(self, actions: torch.Tensor) -> StepResult:
         """Act in all worlds for one step.
@@ -269,8 +279,15 @@ class Env:
             and a dictionary: `final_obs` (what was seen last where an episode ended), `metrics` of all
             worlds, which count there, `seed`, from which each episode can be played again, and `dropped`,
             the events that there was no room for.
+
+        Raises:
+            ValueError: The actions have another shape.
         """
         view = self.view
+        if actions.shape != view.action.shape:
+            raise ValueError(
+                f"actions must have shape {tuple(view.action.shape)}, got {tuple(actions.shape)}"
+            )
         view.last_action.copy_(view.action)
         torch.clamp(actions.detach(), -1.0, 1.0, out=view.action)
         observation = self.sim.step(self._delayed(self.task.command(view)), mode=self.task.mode)
@@ -337,7 +354,7 @@ class Env:
         drawn, mask = self.randomisation, self._mask[:, None]
         if self._thresholds is not None:
             low, high = drawn.threshold_factor
-            chosen = self.task.threshold * (low + (high - low) * view.draws[:, -5:-3].double())
+            chosen = self._nominal_thresholds * (low + (high - low) * view.draws[:, -5:-3].double())
             self._thresholds.copy_(torch.where(mask, chosen, self._thresholds))
         if drawn.airframes_differ:
             episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)

@@ -46,24 +46,48 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
     def reset(  # type: ignore[override]
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Arrays, dict[str, Any]]:
-        """Begin an episode in all worlds; world i has seed + i."""
-        observations, _ = self._env.reset(seed=seed)
-        return self._arrays(observations), {}
+        """Begin an episode in all worlds.
+
+        Args:
+            seed: Of world 0; world i has seed + i. None: go on.
+            options: `spread` and `episodes` of `Env.reset`, the latter as an array.
+
+        Returns:
+            Observations, and a dictionary: `seed`, from which each episode can be played again.
+
+        Raises:
+            ValueError: There is no such option, or its value is not for these worlds.
+        """
+        given = dict(options or {})
+        episodes = given.pop("episodes", None)
+        if episodes is not None:
+            episodes = torch.as_tensor(episodes, device=self._env.device)
+        spread = given.pop("spread", False)
+        if given:
+            raise ValueError(f"unknown options {sorted(given)}, known: ['episodes', 'spread']")
+        observations, info = self._env.reset(seed=seed, spread=spread, episodes=episodes)
+        return self._arrays(observations), _of_all("seed", info)
 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Act in all worlds; `final_obs` and `metrics` are in the last, for all worlds."""
+        """Act in all worlds.
+
+        Returns:
+            Observations, rewards, terminated, truncated, and a dictionary: `seed` of each episode, `dropped`
+            (events that there was no room for), and where some ended `final_obs` and `final_info` (the
+            task's metrics), which count in the worlds of `_final_obs`.
+        """
         given = torch.as_tensor(actions, dtype=torch.float32, device=self._env.device)
         observations, reward, terminated, truncated, info = self._env.step(given)
         ended = (terminated | truncated).cpu().numpy()
-        extra: dict[str, Any] = {}
+        extra = _of_all("seed", info) | _of_all("dropped", info)
         if ended.any():
             final = self._arrays(info["final_obs"])
             rows = np.empty(self.num_envs, dtype=object)
             for world in np.flatnonzero(ended):
                 rows[world] = {name: value[world] for name, value in final.items()}
-            extra = {
+            extra |= {
                 "final_obs": rows,
                 "_final_obs": ended,
                 "final_info": {name: value.cpu().numpy() for name, value in info["metrics"].items()},
@@ -87,6 +111,14 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
             for name, value in observations.items()
             if self._names is None or name in self._names
         }
+
+
+def _of_all(name: str, info: dict[str, Any]) -> dict[str, Any]:
+    """Return what all worlds tell under a name, if they do, as vector environments of Gymnasium tell it."""
+    if name not in info:
+        return {}
+    values = np.array(info[name].cpu().numpy())
+    return {name: values, f"_{name}": np.ones(len(values), dtype=bool)}
 
 
 def observation_space(observations: Observations, names: Collection[str] | None) -> Dict:

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 
 from neurosim_core.learn.actions import COMMANDS, ActionMode
-from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
+from neurosim_core.learn.episodes import Routes, StartConfig
+from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.learn.surfaces import LeakySurface, SurfaceConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.vehicle import MultirotorConfig

@@ -36,9 +36,11 @@ Reference: DSEC, Gehrig et al. (2021), https://dsec.ifi.uzh.ch/data-format, for 
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any
@@ -63,6 +65,7 @@ _FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never 
 _ROW_CHUNK = 1024
 _FIRST_FLUSH_BYTES = 65536
 _ATTRIBUTE_MAX_BYTES = 60000
+_DEFLATE_THREADS = 8
 
 
 class RecordingWriter:
@@ -101,6 +104,7 @@ class RecordingWriter:
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, _Stream] = {}
+        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS, os.cpu_count() or 1), "deflate")
         self._order = 0
         self._newest_ns = 0
         self.kept_ns = 0
@@ -155,6 +159,8 @@ class RecordingWriter:
             OSError: The disk is full or gone.
         """
         for stream in self._streams.values():
+            stream.begin_rows(self._pool)
+        for stream in self._streams.values():
             stream.write_rows()
         self._file.flush()
         self._disk.seal()
@@ -187,6 +193,7 @@ class RecordingWriter:
                 self._file.flush()
                 self._disk.seal()
         finally:
+            self._pool.shutdown()
             self._file.close()
             self._disk.close()
 
@@ -232,6 +239,7 @@ class _Column:
         self._rows: list[NDArray[Any]] = []
         self._deflates = compressed and self._dtype.kind != "O"
         self._last_chunk = np.empty((0, *shape), self._dtype)  # as far as it is filled, if that deflates
+        self._deflated: list[tuple[tuple[int, ...], Future[bytes]]] = []
 
     def append(self, rows: Any) -> int:
         count = len(rows) if 0 in self._shape else -1
@@ -241,31 +249,33 @@ class _Column:
         self._rows.append(block)
         return block.nbytes
 
-    def write_rows(self) -> None:
+    def begin_rows(self, pool: ThreadPoolExecutor) -> None:
+        """Make room for the rows that came since the last flush, and let the pool compress them."""
         if not self._rows:
             return
-        rows = np.concatenate(self._rows) if len(self._rows) > 1 else self._rows[0]
-        self._rows = []
         begin = self._dataset.shape[0]
-        self._dataset.resize(begin + rows.shape[0], axis=0)
-        if rows.size and self._deflates:
-            self._write_chunks(rows, begin)
-        elif rows.size:
-            self._dataset[begin:] = rows
+        rows = (
+            np.concatenate([self._last_chunk, *self._rows]) if self._deflates else np.concatenate(self._rows)
+        )
+        self._rows = []
+        begin_of_chunk = begin - len(self._last_chunk)
+        self._dataset.resize(begin_of_chunk + rows.shape[0], axis=0)
+        if not self._deflates:
+            if rows.size:
+                self._dataset[begin:] = rows
+            return
+        length, *room = self._dataset.chunks
+        filled = len(rows) % length
+        self._last_chunk = rows[len(rows) - filled :].copy()  # it may grow later
+        for first in range(0, len(rows) if rows.size else 0, length):
+            place = (begin_of_chunk + first, *[0] * len(room))
+            self._deflated.append((place, pool.submit(_deflate, rows[first : first + length], length)))
 
-    def _write_chunks(self, rows: NDArray[Any], begin: int) -> None:
-        """Write what HDF5's filters shuffle and gzip would, faster; the last chunk may grow later."""
-        deflate = _import_deflate()
-        length, *_ = shape = self._dataset.chunks
-        begin -= len(self._last_chunk)
-        rest = np.zeros((-(len(self._last_chunk) + len(rows)) % length, *self._shape), self._dtype)
-        rows = np.concatenate([self._last_chunk, rows, rest])
-        for first in range(0, len(rows), length):
-            shuffled = rows[first : first + length].reshape(-1, 1).view(np.uint8).T.tobytes()
-            place = (begin + first, *[0] * (len(shape) - 1))
-            self._dataset.id.write_direct_chunk(place, deflate(shuffled, 1))
-        filled = (length - len(rest)) % length
-        self._last_chunk = rows[len(rows) - length :][:filled].copy()
+    def write_rows(self) -> None:
+        """Write what the pool has compressed."""
+        for place, chunk in self._deflated:
+            self._dataset.id.write_direct_chunk(place, chunk.result())
+        self._deflated = []
 
 
 class _Stream:
@@ -332,6 +342,10 @@ class _Stream:
         self._last_ns = packet.stamp_ns
         self._written += 1
         return size
+
+    def begin_rows(self, pool: ThreadPoolExecutor) -> None:
+        for column in self._columns.values():
+            column.begin_rows(pool)
 
     def write_rows(self) -> None:
         for column in self._columns.values():
@@ -459,6 +473,13 @@ def import_h5py() -> ModuleType:
     except ImportError as error:
         raise ImportError(f"recordings need h5py: {install_hint('record')}") from error
     return h5py  # type: ignore[no-any-return]
+
+
+def _deflate(rows: NDArray[Any], length: int) -> bytes:
+    """Return what HDF5's filters shuffle and gzip would make of a chunk of so many rows, faster."""
+    if len(rows) < length:
+        rows = np.concatenate([rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)])
+    return _import_deflate()(rows.reshape(-1, 1).view(np.uint8).T.tobytes(), 1)
 
 
 def _import_deflate() -> Callable[[bytes, int], bytes]:

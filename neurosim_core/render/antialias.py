@@ -33,7 +33,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
+from neurosim_core.render.antialias_groups import group_kernels
+from neurosim_core.render.block_lists import make_lists, thread_counts
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,
@@ -180,7 +181,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
                         q, wp.normalize(center + point[0] * across + point[1] * down)
                     )
                 cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origin, toward, FAR_M, part, t, u, v, front
+                    scene.embree_intersect, scene.embree_quick, origin, toward, FAR_M, part, t, u, v, front
                 )
             for sample in range(RAY_COUNT):
                 point = ray_point(sample)
@@ -302,7 +303,7 @@ def _write_log(
 def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
-    write_radiance = allocated_radiance_writer()
+    write_images = allocated_radiance_writer(tuple(name for name in RADIANCE if name != "log_radiance"))
     shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
     cast_pixels = _pixel_caster(terms)
 
@@ -364,12 +365,12 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
                 unresolved,
                 radiance,
             )
-        if place.slot < 0:
+        if out.log_radiance.shape[0] > 0:
             _write_log(scene, radiance, instant, top, left, rows, columns, out.log_radiance)
-            return
-        for y in range(rows):
-            for x in range(columns):
-                write_radiance(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)
+        if place.slot >= 0 and (out.rgb.shape[0] > 0 or out.radiance.shape[0] > 0):
+            for y in range(rows):
+                for x in range(columns):
+                    write_images(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)
 
     return average_blocks
 

@@ -190,7 +190,7 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
 
 
 @cache
-def allocated_radiance_writer() -> wp.Function:
+def allocated_radiance_writer(outputs: tuple[str, ...] = RADIANCE) -> wp.Function:
     """Return the function that writes the light of a pixel to those of its outputs that are allocated."""
     write_log, write_rgb, write_linear = (radiance_writer((name,), supersampled=False) for name in RADIANCE)
 
@@ -198,12 +198,15 @@ def allocated_radiance_writer() -> wp.Function:
     def write_allocated_radiance(
         scene: SceneData, radiance: wp.vec3, instant: int, slot: int, row: int, col: int, out: RenderOutputs
     ) -> None:
-        if out.log_radiance.shape[0] > 0:
-            write_log(scene, radiance, 1, instant, slot, row, col, out)
-        if out.rgb.shape[0] > 0:
-            write_rgb(scene, radiance, 1, instant, slot, row, col, out)
-        if out.radiance.shape[0] > 0:
-            write_linear(scene, radiance, 1, instant, slot, row, col, out)
+        if wp.static("log_radiance" in outputs):
+            if out.log_radiance.shape[0] > 0:
+                write_log(scene, radiance, 1, instant, slot, row, col, out)
+        if wp.static("rgb" in outputs):
+            if out.rgb.shape[0] > 0:
+                write_rgb(scene, radiance, 1, instant, slot, row, col, out)
+        if wp.static("radiance" in outputs):
+            if out.radiance.shape[0] > 0:
+                write_linear(scene, radiance, 1, instant, slot, row, col, out)
 
     return write_allocated_radiance
 

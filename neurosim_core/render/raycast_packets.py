@@ -164,14 +164,19 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     ray,
                     face,
                 )
-            elif wp.static(terms.timed):
-                cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
-                )
             else:
-                cast_packet(
-                    scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
-                )
+                embree_scene = scene.embree_scene
+                if wp.static(requested.faces):
+                    if layer == layers - 1:
+                        embree_scene = scene.embree_quick
+                if wp.static(terms.timed):
+                    cast_packet(
+                        scene.embree_intersect, embree_scene, origins, ray, FAR_M, face, t, u, v, normal
+                    )
+                else:
+                    cast_packet(
+                        scene.embree_intersect, embree_scene, origin, ray, FAR_M, face, t, u, v, normal
+                    )
             if wp.static(each_lane):
                 for y in range(rows):
                     for x in range(columns):

@@ -89,7 +89,9 @@ def upload_scene(
         connecting = aside.submit(connect_faces, scene) if config.samples_per_pixel == "adaptive" else None
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
-        building = aside.submit(_build_trees, mesh, device, embree=bool(embree_width))
+        building = aside.submit(
+            _build_trees, mesh, device, embree=bool(embree_width), quick=connecting is not None
+        )
 
         def cover() -> tuple[PackedTextures, RenderTerms, NDArray[np.float64]]:
             packed, area_m2 = packing.result(), areas_m2(mesh)
@@ -112,6 +114,7 @@ def upload_scene(
     data.mesh = tree.id
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
+        data.embree_quick = wp.uint64(embree.quick)
         data.embree_intersect = wp.uint64(embree.intersect)
     else:
         data.tree = make_ray_tree(tree)
@@ -146,7 +149,9 @@ def upload_scene(
     )
 
 
-def _build_trees(mesh: RefinedMesh, device: str, *, embree: bool) -> tuple[wp.Mesh, EmbreeTree | None]:
+def _build_trees(
+    mesh: RefinedMesh, device: str, *, embree: bool, quick: bool
+) -> tuple[wp.Mesh, EmbreeTree | None]:
     """Return the tree of a mesh as Warp has it, and as Embree has it if that casts rays."""
     tree = wp.Mesh(
         wp.array(mesh.vertices, dtype=wp.vec3, device=device),
@@ -154,7 +159,7 @@ def _build_trees(mesh: RefinedMesh, device: str, *, embree: bool) -> tuple[wp.Me
         bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
         bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
     )
-    return tree, EmbreeTree(mesh.vertices, mesh.faces) if embree else None
+    return tree, EmbreeTree(mesh.vertices, mesh.faces, quick=quick) if embree else None
 
 
 def _terms_of(

@@ -19,6 +19,8 @@ class SceneData:
     """The hierarchy that rays traverse; not filled if Embree intersects them."""
     embree_scene: wp.uint64
     """`EmbreeTree.scene`; 0 if Warp intersects rays."""
+    embree_quick: wp.uint64
+    """`EmbreeTree.quick`, likewise; also 0 without antialiasing."""
     embree_intersect: wp.uint64
     """`EmbreeTree.intersect`, likewise."""
     face_material: wp.array[int]

@@ -10,6 +10,7 @@ from neurosim_core.bench.dynamics import RKMK4
 from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, short_flight
 from neurosim_core.bench.dynamics_oracle import Equations, compare, make_reference, solve
 from neurosim_core.bench.engine import Multirotor, preset
+from neurosim_core.bench.options import Options
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,7 @@ def test_a_fall_is_a_parabola():
 def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
     """Steps that are longer than they say miss the precision of an extreme flight."""
     cases = {"light": EXTREMES["mass 30 g, 100 m/s wind, quadratic drag"]}
-    right = dynamics._hard(cases, True, lambda _: None)
+    right = dynamics._hard(cases, Options(quick=True), lambda _: None)
     limit_m = 2.0 * next(row["position [m]"] for row in right if row["method"] == RKMK4)
     assert dynamics._hard_claim("light", right, limit_m).met
 
@@ -56,7 +57,7 @@ def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
             super().__init__(config, **{**options, "max_step_ns": HOLD_NS})
 
     monkeypatch.setattr(dynamics, "Multirotor", Coarse)
-    wrong = dynamics._hard(cases, True, lambda _: None)
+    wrong = dynamics._hard(cases, Options(quick=True), lambda _: None)
     assert not dynamics._hard_claim("light", wrong, limit_m).met
 
 
@@ -65,7 +66,7 @@ def test_stiff_flights_are_judged_and_refusals_kept():
         "1e-6 s": (lambda: short_flight("hummingbird", motor_time_constant_s=1e-6), False),
         "slender": EXTREMES["inertia 1:10:100, 200 rad/s"],
     }
-    rows = dynamics._hard(cases, True, lambda _: None)
+    rows = dynamics._hard(cases, Options(quick=True), lambda _: None)
     outcome = {(row["flight"], row["method"]): row["outcome"] for row in rows}
     assert outcome["1e-6 s", RKMK4] == "flown"
     assert outcome["slender", RKMK4].startswith("refused: Value error")

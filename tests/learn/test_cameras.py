@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 from neurosim_core.frames import Mount  # noqa: E402
 from neurosim_core.learn.cameras import draw_lenses  # noqa: E402
 from neurosim_core.learn.env import CAMERA  # noqa: E402
-from neurosim_core.learn.episodes import NO_RANDOMISATION  # noqa: E402
+from neurosim_core.learn.randomisation import NO_RANDOMISATION  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 from neurosim_core.render.camera import PinholeConfig  # noqa: E402
 
@@ -168,6 +168,16 @@ def test_without_draws_nothing_is_made_for_them(make):
     assert "light_factor" not in env.parameters
     with pytest.raises(ValueError, match="make them with own_light=True"):
         env.sim.light("exposure")
+
+
+def test_a_range_of_one_value_is_drawn_too(make):
+    env = make(drawn=dataclasses.replace(NO_RANDOMISATION, focal_factor=(1.2, 1.2), light_factor=(0.1, 0.1)))
+    env.reset(seed=1)
+    assert (env.parameters["focal_factor"] == np.float32(1.2)).all()
+    found = draw_lenses(env.task.camera, env.randomisation)[0][0]
+    assert found.intrinsics().fx == pytest.approx(1.2 * 8.0 / np.tan(0.75))
+    assert env.sim._state.groups[0].lens_of_world.numpy().any()
+    np.testing.assert_allclose(env.sim.light("dark_floor").numpy(), 1e-2, rtol=1e-5)
 
 
 def test_lenses_that_cannot_be_drawn_are_said(make):

@@ -11,7 +11,7 @@ import neurosim_core as ns
 
 torch = pytest.importorskip("torch", reason="needs the extra learn")
 
-from neurosim_core.learn.episodes import Randomisation  # noqa: E402
+from neurosim_core.learn.randomisation import Randomisation  # noqa: E402
 from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
 
 torch.set_num_threads(1)
@@ -239,6 +239,76 @@ def test_gymnasium(hall):
     assert observations["state"].shape == (2, 17)
     assert {each.shape for each in (reward, terminated, truncated)} == {(2,)}
     env.close()
+
+
+def test_gymnasium_plays_episodes_again(make):
+    """With the seeds that a step told; what a reset cannot do is said."""
+    pytest.importorskip("gymnasium")
+    from neurosim_core.learn.gym import NumpyEnv
+
+    env = NumpyEnv(make())
+    _, begun = env.reset(seed=2)
+    actions = actions_of(20, 3).numpy()
+    for action in actions:
+        *_, info = env.step(action)
+    assert (info["seed"] != begun["seed"]).all()  # episodes of `Brief` are shorter
+    assert not info["dropped"].any()
+    first, _ = env.reset(seed=7)
+    again, told = env.reset(options={"episodes": info["seed"]})
+    np.testing.assert_array_equal(told["seed"], info["seed"])
+    same, _ = NumpyEnv(make()).reset(options={"episodes": info["seed"]})
+    for name, value in again.items():
+        np.testing.assert_array_equal(same[name], value)
+    assert not np.array_equal(first["state"], again["state"])
+    with pytest.raises(ValueError, match=r"unknown options \['low'\], known: \['episodes', 'spread'\]"):
+        env.reset(options={"low": 1})
+
+
+def test_wrong_arguments_are_said(make):
+    env = make(observe=["state"])
+    env.reset()
+    for shape in ((4,), (3, 3), (1, 4)):
+        with pytest.raises(ValueError, match=r"actions must have shape \(3, 4\), got"):
+            env.step(torch.zeros(shape))
+    with pytest.raises(ValueError, match="seed must be 0 at least, got -1"):
+        env.reset(seed=-1)
+    with pytest.raises(TypeError):
+        env.reset(seed=[1, 2, 3])
+    for episodes in (torch.ones(3), torch.tensor(1)):
+        with pytest.raises(ValueError, match=r"episodes must be int64 of shape \(3,\), got"):
+            env.reset(episodes=episodes)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "message"),
+    [
+        ({"light_factor": (0.0, 1.0)}, r"light_factor must be above 0, got \(0.0, 1.0\)"),
+        ({"focal_factor": (1.1, 0.9)}, "focal_factor must be finite, not negative, and in order"),
+        ({"mount_rad": -0.1}, "mount_rad must be finite, not negative, and in order, got -0.1"),
+        ({"lag_s": (-0.1, 0.1)}, "lag_s must be"),
+        ({"wind_m_s": float("nan")}, "wind_m_s must be"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said(drawn, message):
+    ns.learn.Randomisation(drag_factor=(0.0, 1.0), distortion=(-0.2, -0.1))
+    with pytest.raises(ValueError, match=message):
+        ns.learn.Randomisation(**drawn)
+
+
+def test_thresholds_are_drawn_about_those_of_the_pixels(make):
+    """A task may set its pixels, ideal ones or with noise, which have no thresholds to draw."""
+    task = Brief()
+    task.pixel = {"threshold_on": 0.2, "threshold_off": 0.3}
+    env = make(64, task, randomise=ns.learn.Randomisation(threshold_factor=(0.5, 0.9)))
+    env.reset(seed=1)
+    factor = env.parameters["threshold_factor"]
+    assert 0.5 <= factor.min() < 0.6 < 0.8 < factor.max() <= 0.9
+    expected = factor.double().numpy() * [0.2, 0.3]
+    np.testing.assert_allclose(env.sim.thresholds("front").numpy(), expected, rtol=1e-6)
+    task.pixel = {"preset": "davis346", "readout": None}
+    env = make(1, task, randomise=still(mass_factor=(0.9, 1.1)))
+    env.reset()
+    assert env.parameters["mass_factor"] != 1.0
 
 
 def still(**ranges):

@@ -27,6 +27,23 @@ from neurosim_core.cli import main
             ["learn", "hover", "--out", "{folder}", "--resume", "--worlds", "4", "--student-iterations", "9"],
             "--resume goes on as the run was configured: leave out --worlds, --student-iterations",
         ),
+        (["learn", "hover", "--scenes", "house.glb"], "learn hover makes no use of --scenes here"),
+        (
+            ["learn", "eval", "r", "--seed", "1", "--test", "x"],
+            "learn eval makes no use of --seed, --test here",
+        ),
+        (["learn", "eval", "r", "--transfer", "--blind"], "learn eval makes no use of --blind here"),
+        (["learn", "eval", "r.pt", "--worlds", "4"], "learn eval makes no use of --worlds here"),
+        (["learn", "rate", "hover", "--surface", "time"], "learn rate makes no use of --surface here"),
+        (["learn", "depth", "hover", "--fly-device", "cpu"], "learn depth makes no use of RUN here"),
+        (
+            ["learn", "hover", "--algorithm", "ppo", "--teacher-iterations", "3"],
+            "learn hover makes no use of --teacher-iterations here",
+        ),
+        (
+            ["learn", "hover", "--out", "{folder}", "--resume", "--algorithm", "ppo"],
+            "--resume goes on as the run was configured: leave out --algorithm",
+        ),
         (["deploy", "nobody"], "unknown policy 'nobody', known: "),
     ],
 )

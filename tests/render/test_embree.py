@@ -89,7 +89,7 @@ def outputs(count):
     return [wp.empty((count, 16), dtype=dtype, device="cpu") for dtype in (int, float, float, float, wp.vec3)]
 
 
-def cast(tree, origins, rays, width):
+def cast(tree, origins, rays, width, scene=None):
     """Cast 16 rays from each origin; return face, t, u, v, normal."""
     got = outputs(len(origins))
     wp.launch(
@@ -97,7 +97,7 @@ def cast(tree, origins, rays, width):
         dim=len(origins),
         inputs=[
             tree.intersect,
-            tree.scene,
+            scene or tree.scene,
             wp.array(origins, dtype=wp.vec3, device="cpu"),
             wp.array(rays, dtype=wp.vec3, device="cpu"),
         ],
@@ -180,6 +180,19 @@ def views(mesh, count):
 def test_agrees_with_warp_in_the_apartment(width):
     mesh = refine(make_apartment(ApartmentConfig()), 0.5)
     assert_agree(mesh.vertices, mesh.faces, *views(mesh, 5000), width)
+
+
+def test_the_quick_tree_sees_what_the_other_sees(width):
+    """All but the rays by an edge, which one of them takes and the other not."""
+    mesh = refine(make_apartment(ApartmentConfig()), 0.5)
+    tree = EmbreeTree(mesh.vertices, mesh.faces, quick=True)
+    origins, rays = views(mesh, 5000)
+    face, t, *_ = cast(tree, origins, rays, width)
+    quick_face, quick_t, *_ = cast(tree, origins, rays, width, tree.quick)
+    assert (face >= 0).mean() > 0.9
+    other = (face != quick_face) & ~np.isclose(t, quick_t, rtol=1e-5)
+    assert other.sum() <= 1e-4 * face.size
+    assert EmbreeTree(mesh.vertices, mesh.faces).quick == 0
 
 
 def test_agrees_with_warp_in_the_house(width, house):

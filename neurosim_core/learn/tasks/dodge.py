@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurosim_core.learn.episodes import Randomisation, Routes, StartConfig
+from neurosim_core.learn.episodes import Routes, StartConfig
+from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View, turn
 from neurosim_core.learn.tasks.hall import hall_settings

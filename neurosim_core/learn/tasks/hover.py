@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import Randomisation, StartConfig
+from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import MIRROR_ACTION, Observations, Task, View
 from neurosim_core.registry import register

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from neurosim_core.learn.episodes import NO_RANDOMISATION, StartConfig
+from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.randomisation import NO_RANDOMISATION
 from neurosim_core.learn.surfaces import LeakySurface
 from neurosim_core.learn.task import Observations, View
 from neurosim_core.learn.tasks.hover import HoverBase

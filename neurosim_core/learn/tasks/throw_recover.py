@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurosim_core.learn.episodes import Randomisation, StartConfig
+from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.learn.task import View
 from neurosim_core.learn.tasks.hall import hall_settings
 from neurosim_core.learn.tasks.hover import HoverBase

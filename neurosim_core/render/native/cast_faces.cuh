@@ -1,6 +1,6 @@
 #include "pixel_poses.cuh"
 auto origin_of = [&](int axis, int lane) { return position[axis][TIMED ? lane : 0]; };
-const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
+const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_quick;
 #include "aim_rays.cuh"
 alignas(64) float ray[4][N];
 const wp::vec4* const aimed = wp::address(view.rays, view.rays.shape[0] - 1, first_pixel);

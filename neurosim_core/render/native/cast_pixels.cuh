@@ -34,7 +34,7 @@ for (int quarter = 0; quarter < 4; ++quarter) {
             const wp::vec3 turned = turn(place_of(lane), aimed[0] / divisor, aimed[1] / divisor, aimed[2] / divisor);
             for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = turned[axis];
         }
-        const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
+        const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_quick;
 #include "embree_packet.cuh"
         constexpr float slope[2][N] = {};
 #include "shade_lanes.cuh"
