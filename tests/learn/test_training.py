@@ -325,6 +325,16 @@ def test_a_run_sees_events_as_it_is_told(tmp_path, hall):
         small(surface="voxel")
 
 
+def test_a_policy_sees_voxels_of_both_signs():
+    torch.manual_seed(0)
+    policy = EventPolicy(channels=5, height=8, width=8, vector_size=3)
+    voxels, vector = torch.full((2, 5, 8, 8), 3.0), torch.zeros(2, 3)
+    voxels[1] = -3.0  # as many events, but darker
+    seen = policy.see(voxels, vector)
+    assert seen.isfinite().all()
+    assert not torch.allclose(seen[0], seen[1])
+
+
 def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
     """The recording that a film is made of begins where the first world does, and goes the same way."""
     run(tmp_path, hall)
