@@ -130,7 +130,7 @@ class Link:
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
         self._begins_again = False
-        """Whether the first answer told of a ring that we cannot read: the latched message is still to come."""
+        """Whether the first answer told of a ring that we cannot read: another one follows."""
         self._marks_end = True
         self._ended = -1
         """The sequence at which the publisher said that the stream ends."""
