@@ -88,7 +88,7 @@ def fly(
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
         OSError: The folder cannot be written to, or the disk is full.
-        Exception: What a controller, sensor or sink of another package raises; the files hold all up to there.
+        Exception: What a controller, sensor or sink of another package raises; the files hold all before.
     """
     console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()

@@ -33,7 +33,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
+from neurosim_core.render.antialias_groups import group_kernels
+from neurosim_core.render.block_lists import make_lists, thread_counts
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neurosim_core.native_code import read_native
+from neurosim_core.render.block_lists import COVER_BOUNDS, INSTANTS, BlockLists, leaves_room, next_entry
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,
@@ -40,32 +41,11 @@ from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, til
 
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
-_INSTANTS = wp.constant(4)
-"""Instants of a pixel in a block that shows one surface, of a thread."""
 _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
-_COVER_BOUNDS = (64, 12)
-"""Threads of a block, and blocks of a multiprocessor."""
-_RAY_THREADS = 5120
-"""Threads of a multiprocessor: far more than run at a time, since some take longer than others."""
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
-
-
-@wp.struct
-class BlockLists:
-    """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
-
-    uneven: wp.array[wp.vec3i]
-    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
-    its blocks; the first instant; a bit for each of the two."""
-    unresolved: wp.array[wp.vec2i]
-    """Those with pixels that have to be rendered by rays, and a bit for each of these."""
-    count: wp.array[int]
-    """Length of the two lists, and how many entries of the first are taken."""
-    threads: int
-    """Threads of the kernel that goes through the second one."""
 
 
 class GroupKernels(NamedTuple):
@@ -74,25 +54,6 @@ class GroupKernels(NamedTuple):
     even: wp.Kernel
     uneven: wp.Kernel
     unresolved: wp.Kernel
-
-
-def make_lists(block_count: int, device: Any) -> BlockLists:
-    """Return empty lists for at most so many blocks."""
-    lists = BlockLists()
-    lists.uneven = wp.zeros(block_count, dtype=wp.vec3i, device=device)
-    lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
-    lists.count = wp.zeros(3, dtype=int, device=device)
-    lists.threads = _RAY_THREADS * max(1, wp.get_device(device).sm_count)
-    return lists
-
-
-def thread_counts(lists: BlockLists, pixel_count: int, instant_count: int) -> tuple[int, int, int]:
-    """Return the threads of the three kernels, for so many pixels of all instants of all worlds."""
-    even = pixel_count // instant_count * -(-instant_count // _INSTANTS)
-    processors = lists.threads // _RAY_THREADS
-    # they run until all is done: one in 16 multiprocessors has a block less, and there the flight finds room
-    cover = _COVER_BOUNDS[0] * (_COVER_BOUNDS[1] * processors - processors // 16)
-    return even, cover, lists.threads
 
 
 @wp.func_native(read_native(__file__, "classify_block"))
@@ -159,12 +120,6 @@ def _store_pair(place: int, pair: int, light: wp.vec3):
 @wp.func_native(read_native(__file__, "sum_pairs", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _sum_pairs(place: int, first: int, count: int, step: int, total: wp.vec3) -> wp.vec3:
     """Return `total` and the light of those of consecutive pairs that are among the 32 of a step."""
-    ...
-
-
-@wp.func_native(read_native(__file__, "next_entry"))
-def _next_entry(count: wp.array[int], counter: int) -> int:
-    """Return the next number that a counter gives to a warp."""
     ...
 
 
@@ -298,10 +253,10 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
         group = (first + wp.tid()) // 64
         quarter = (first + wp.tid()) % 64 // 16
         lane = (first + wp.tid()) % 16
-        group_count = (view.instant_count + _INSTANTS - 1) // _INSTANTS
+        group_count = (view.instant_count + INSTANTS - 1) // INSTANTS
         tile = group // group_count
-        begin = group % group_count * _INSTANTS
-        end = wp.min(begin + _INSTANTS, view.instant_count)
+        begin = group % group_count * INSTANTS
+        end = wp.min(begin + INSTANTS, view.instant_count)
         at = locate_pixel(tile, begin, quarter, lane, view, worlds)
         if wp.static(terms.world_scenes):
             scene = worlds.scenes[worlds.scene[at.world]]
@@ -341,14 +296,14 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                     SHARPNESS * ray_C[3],
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
-        for pair in range(_INSTANTS // 2):
+        for pair in range(INSTANTS // 2):
             bits = (uneven >> (2 * pair)) & 3
             if lane == 0 and in_picture and bits != 0:
                 lists.uneven[wp.atomic_add(lists.count, 0, 1)] = wp.vec3i(
                     4 * tile + quarter, begin + 2 * pair, bits
                 )
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=_COVER_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, module_options=_FAST, launch_bounds=COVER_BOUNDS)
     def cover_uneven_blocks(
         first: int,
         # In:
@@ -363,7 +318,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
     ) -> None:
         # The threads of a warp reach the functions that they call together.
         lane = (first + wp.tid()) % 32
-        entry = _next_entry(lists.count, 2)
+        entry = next_entry(lists.count, 2)
         waiting = int(0)  # bits of the instants of an entry that are taken one by one
         while entry < lists.count[0]:
             listed = lists.uneven[entry]
@@ -441,7 +396,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 lists.unresolved[wp.atomic_add(lists.count, 1, 1)] = wp.vec2i(block, unresolved)
             waiting = waiting & ~bits
             if waiting == 0:
-                entry = _next_entry(lists.count, 2)
+                if wp.static(not terms.worlds) and leaves_room():
+                    break
+                entry = next_entry(lists.count, 2)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
     def cast_unresolved_pixels(

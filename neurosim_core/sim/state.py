@@ -39,7 +39,7 @@ from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.config import VehicleContext
 from neurosim_core.vehicle.host_vehicle import Vehicle
 
-_IN_FLIGHT_ON_CUDA = 4
+_IN_FLIGHT_ON_CUDA = 5
 """With three, one batch is flown and one rendered while the host reads a third."""
 _FLEET_ARRAYS = (
     "position", "velocity", "orientation", "body_rate", "rotor_speed", "rotor_speed_command", "stamp_ns",
@@ -195,7 +195,7 @@ def make_state(
 
     Args:
         model: What does not change.
-        in_flight: How many batches `run_model` keeps in flight. By default 4 on a CUDA device, and 1 where a
+        in_flight: How many batches `run_model` keeps in flight. By default 5 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
         render_backlog: How many batches of `integrate_period` may wait for `render_batch`; by default
             `in_flight`.
