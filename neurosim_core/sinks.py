@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.install import install_hint
@@ -180,9 +180,9 @@ def check_files(sinks: Mapping[str, SinkConfig]) -> Mapping[str, SinkConfig]:
     """Return sinks of which no two write the same file.
 
     Raises:
-        ValueError: Two do, or one writes what the flight itself leaves.
+        ValueError: Two do.
     """
-    writers = {"config.yaml": "the settings"}
+    writers: dict[str, str] = {}
     for name, sink in sinks.items():
         file = sink.file("flight")
         if file and writers.setdefault(file, name) is not name:
@@ -199,6 +199,15 @@ class EventFileSinkConfig(SinkConfig):
     """Its name; the suffix says the format, as for `neurosim convert`: events.raw, events.aedat4, a.mcap."""
     sensor: str = ""
     """Which event camera; empty: the first."""
+
+    @field_validator("name")
+    @classmethod
+    def _can_be_written(cls, name: str) -> str:
+        from neurosim_core.io.formats import FORMATS, format_of
+
+        if not FORMATS[format_of(Path(name))].sink:
+            raise ValueError(f"{name}: this format is only read")
+        return name
 
     def file(self, stem: str) -> str:
         """Return the name of the file."""
