@@ -129,6 +129,8 @@ class Link:
         """What comes through the socket while there is no ring."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
+        self._begins_again = False
+        """Whether the first answer told of a ring that we cannot read: another one follows."""
         self._marks_end = True
         self._ended = -1
         """The sequence at which the publisher said that the stream ends."""
@@ -304,22 +306,24 @@ class Link:
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
         self._marks_end = answer.marks_end
-        known = self.expected >= 0
+        is_new = self.expected < 0 or self._begins_again
+        if self.expected < 0:  # what is lost counts from here on, also in a ring that we cannot read
+            self.expected = answer.sequence
         if first:
             try:
                 self._use_ring()
             except OSError as error:
                 reason = f"it is of another version of cortex, or has too many readers ({error})"
-                known = self.address in _warned_of  # a node has it once for all its publishers
-                self._do_without_shared_memory(reason, logging.INFO if known else logging.WARNING)
-                _warned_of.append(self.address)
-                self.attached = False
+                is_warned = self.address in _warned_of  # a node has it once for all its publishers
+                self._do_without_shared_memory(reason, logging.INFO if is_warned else logging.WARNING)
+                if not is_warned:
+                    _warned_of.append(self.address)
+                self.attached, self._begins_again = False, is_new
                 return []  # it is asked again
-        if not known:
-            self.expected = answer.sequence
+        self._begins_again = False
         if self._policy.reliable and self._ring is None:
             self._confirm(self.expected)
-        return self._latched(answer.latched) if answer.latched and not known else []
+        return self._latched(answer.latched) if answer.latched and is_new else []
 
     def _use_ring(self) -> None:
         """If the publisher has taken us in, its ring has all that follows; OSError if we cannot read it."""
@@ -371,6 +375,8 @@ class Link:
         self._check(fingerprint, size)
         if len(frame) != HEADER_SIZE + size:
             raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
+        if sequence >= self.expected and not self.advance(sequence):
+            return []
         return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)]
 
     def _do_without_shared_memory(self, reason: str, level: int = logging.INFO) -> None:

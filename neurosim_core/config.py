@@ -39,7 +39,7 @@ from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
 from neurosim_core.settings import Settings, documentation
-from neurosim_core.sinks import SinkConfig, default_sinks
+from neurosim_core.sinks import SinkConfig, check_files, default_sinks
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
@@ -184,6 +184,8 @@ class SimulationConfig(Settings):
     links: Links = Field(default_factory=dict)
     """Simulated links of `neurosim serve` by what travels on them: the name of a sensor, odometry,
     rotor_speeds or command, such as {command: {latency_s: 0.008}}."""
+
+    _no_file_twice = field_validator("sinks")(check_files)
 
     @model_validator(mode="after")
     def _path_keeps_off_the_scene(self) -> SimulationConfig:

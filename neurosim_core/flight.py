@@ -32,7 +32,6 @@ from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.rollout import run_model, warm_flight
 from neurosim_core.sim.state import make_state
 from neurosim_core.sinks import SinkConfig, Sinks
-from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.film import SUFFIXES as FILMS
 from neurosim_core.view.film import save_film
 from neurosim_core.view.rerun_log import RerunLogger
@@ -89,6 +88,7 @@ def fly(
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
         OSError: The folder cannot be written to, or the disk is full.
+        Exception: What a controller, sensor or sink of another package raises; the files hold all before.
     """
     console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()
@@ -124,8 +124,12 @@ def fly(
     def say(text: str) -> None:
         console.print(text, style="yellow", markup=False, soft_wrap=True)
 
+    on_stop: list[Callable[[], object]] = []
     context = {"folder": folder, "stem": "flight", "model": model, "header": header_of(model)}
-    with stop_at_signals(stop), Sinks(sinks, say=say, **context) as files:
+    with (
+        stop_at_signals(stop, on_stop=lambda: [stop_waiting() for stop_waiting in on_stop]),
+        Sinks(sinks, say=say, on_stop=on_stop, **context) as files,
+    ):
         try:
             with _progress(console) as progress:
                 task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")
@@ -146,14 +150,12 @@ def fly(
                             else "",
                             factor=f"{report.real_time_factor:.2f} x real time",
                         )
-        except DynamicsError as error:
-            report.failure = error
-        except OSError as error:
+        except Exception as error:  # raised again; it may be that of an outside controller or sink
             report.failure = error
         report.flight_s = time.perf_counter() - begin
         try:
             files.close()
-        except OSError as error:
+        except Exception as error:
             report.failure = report.failure or error
     report.closing_s = time.perf_counter() - begin - report.flight_s
     print_report(console, model, state, report, folder)

@@ -20,7 +20,6 @@ from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import render_terms
 from neurosim_core.sim.state import State
-from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.config import MultirotorVehicleConfig
 
 
@@ -48,7 +47,7 @@ class FlightReport:
     positions: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
     """Stamp [ns] and p_WB [m] of every odometry packet."""
     interrupted: bool = False
-    failure: DynamicsError | OSError | None = None
+    failure: Exception | None = None
     """What ended the flight early."""
 
     @property

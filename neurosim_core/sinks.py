@@ -8,7 +8,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
@@ -64,6 +64,9 @@ class SinkContext:
     """What is flown."""
     header: RecordingHeader
     """Settings, sensors and path, as a recording has them."""
+    on_stop: list[Callable[[], object]] = field(default_factory=list)
+    """Called when the flight is asked to end, by a signal handler: a sink that waits for others adds how
+    it stops waiting."""
 
 
 class SinkConfig(Settings):
@@ -173,6 +176,20 @@ def default_sinks() -> dict[str, SinkConfig]:
     return {"recording": Hdf5SinkConfig(), "rerun": RerunSinkConfig(), "overview": OverviewSinkConfig()}
 
 
+def check_files(sinks: Mapping[str, SinkConfig]) -> Mapping[str, SinkConfig]:
+    """Return sinks of which no two write the same file.
+
+    Raises:
+        ValueError: Two do, or one writes what the flight itself leaves.
+    """
+    writers = {"config.yaml": "the settings"}
+    for name, sink in sinks.items():
+        file = sink.file("flight")
+        if file and writers.setdefault(file, name) is not name:
+            raise ValueError(f"{name} would write {file}, which is that of {writers[file]}")
+    return sinks
+
+
 @register("sink", "event_file")
 class EventFileSinkConfig(SinkConfig):
     """The events of one camera in a format of other tools, such as events.raw; a bag has all sensors."""
@@ -235,7 +252,7 @@ class Sinks:
         Args:
             settings: By name.
             say: Told what is left out or given up.
-            context: `folder`, `stem`, `model` and `header` of `SinkContext`.
+            context: `folder`, `stem`, `model`, `header` and, where there is one, `on_stop` of `SinkContext`.
 
         Raises:
             OSError, ValueError: One cannot be opened.
@@ -282,10 +299,10 @@ class Sinks:
         self._abandon()
 
     def _abandon(self) -> None:
-        """Close what is open; what fails has been told."""
+        """Close what is open, after an error that will be told."""
         for sink in self._open.values():
-            with contextlib.suppress(OSError):
-                sink.close()
+            with contextlib.suppress(Exception):  # each of them, whatever another one raises
+                sink.close(complete=False)
         self._open.clear()
 
     def _try(self, name: str, act: Callable[[Sink], None]) -> None:
@@ -298,14 +315,14 @@ class Sinks:
                 return
             kept_ns: int | None = getattr(sink, "kept_ns", None)
             if kept_ns is None:
-                raise
+                raise OSError(f"sinks.{name}: {error}") from error
             kept = f"{self._title(name)} is kept up to {kept_ns / NS_PER_S:.3f} s"
             raise OSError(f"{error}; {kept}") from error
 
     def _make_room(self) -> None:
         """Give up files that give way before they take the last room of the disk from others."""
         self._checked_s = time.monotonic()
-        giving = [name for name in self._open if self._settings[name].gives_way and self._path(name).exists()]
+        giving = [name for name in self._open if self._settings[name].gives_way and self._has_file(name)]
         if not giving or len(giving) == len(self._open):
             return
         if shutil.disk_usage(self._context["folder"]).free < _ROOM_BYTES:
@@ -315,9 +332,13 @@ class Sinks:
     def _give_up(self, name: str, why: str) -> None:
         with contextlib.suppress(OSError):
             self._open.pop(name).close(complete=False)
-        self._path(name).unlink(missing_ok=True)
+        if self._has_file(name):
+            self._path(name).unlink()
         again = self._settings[name].again.format(folder=self._context["folder"])
         self._say(f"{self._title(name)} is given up: {why}" + (f"; {again}" if again else ""))
+
+    def _has_file(self, name: str) -> bool:
+        return self._settings[name].file(self._context["stem"]) != "" and self._path(name).is_file()
 
     def _path(self, name: str) -> Path:
         folder: Path = self._context["folder"]

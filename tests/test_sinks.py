@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -25,6 +27,7 @@ class ListSinkConfig(SinkConfig):
 
     kind: Literal["test_list"] = "test_list"
     fails_at: int = -1
+    error: Literal["OSError", "KeyError"] = "OSError"
     gives_way = False
 
     def open(self, context: SinkContext) -> ListSink:
@@ -50,7 +53,7 @@ class ListSink:
 
     def write(self, packet: ns.Packet) -> None:
         if len(self.packets) == self.config.fails_at:
-            raise OSError("the line is dead")
+            raise {"OSError": OSError, "KeyError": KeyError}[self.config.error]("the line is dead")
         self.packets.append(packet)
 
     def close(self, *, complete: bool = True) -> None:
@@ -107,10 +110,52 @@ def test_an_outside_sink_gets_what_the_recording_gets(scene, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "flight.h5"}
 
 
-def test_one_that_fails_ends_the_flight_and_the_others_are_whole(scene, tmp_path):
-    with pytest.raises(OSError, match="the line is dead"):
-        ns.fly(settings(scene, mine={"kind": "test_list", "fails_at": 5}), tmp_path)
+@pytest.mark.parametrize(
+    ("error", "raised", "said"),
+    [("OSError", OSError, "sinks.mine: the line is dead"), ("KeyError", KeyError, "the line is dead")],
+)
+def test_one_that_fails_ends_the_flight_and_the_others_are_whole(
+    scene, tmp_path, capsys, error, raised, said
+):
+    mine = {"kind": "test_list", "fails_at": 5, "error": error}
+    with pytest.raises(raised, match=said):
+        ns.fly(settings(scene, mine=mine, overview={"kind": "overview"}), tmp_path)
     assert len(recorded(tmp_path)) == 6  # the recording comes before it
+    assert (tmp_path / "overview.png").exists()
+    assert "overview.png" in capsys.readouterr().out  # the report is printed all the same
+
+
+def test_one_that_cannot_be_opened_leaves_no_flight_that_seems_complete(scene, tmp_path):
+    mine = {"kind": "event_file", "name": "events.raw", "sensor": "left"}
+    with pytest.raises(ValueError, match="no event camera 'left'"):
+        ns.fly(settings(scene, overview={"kind": "overview"}, mine=mine), tmp_path)
+    assert not (tmp_path / "overview.png").exists()
+    with ns.Recording(tmp_path / "flight.h5") as recording:
+        assert not recording.clean
+
+
+@pytest.mark.parametrize("error", ["OSError", "KeyError"])
+def test_one_that_fails_live_is_told_and_the_recording_says_that_it_is_not_complete(scene, tmp_path, error):
+    config = settings(scene, mine={"kind": "test_list", "fails_at": 5, "error": error})
+    model = ns.make_model(config)
+    recorder = Recorder({"drone": tmp_path}, {"drone": model})
+    recorder.begin({"drone": 0}, replace=False)
+
+    def record() -> None:
+        for packet in ns.run_model(model, ns.make_state(model)):
+            recorder.write("drone", packet)
+        recorder.close()
+
+    with pytest.raises((OSError, KeyError), match="the line is dead"):
+        record()
+    with ns.Recording(tmp_path / "flight.h5") as recording:
+        assert (len(list(recording.packets())), recording.clean) == (6, False)
+
+
+def test_a_live_run_that_would_record_nothing_is_refused(scene, tmp_path):
+    config = settings(scene, recording={"kind": "cortex"})
+    with pytest.raises(ValueError, match="none of `sinks` records a live run"):
+        Recorder({"drone": tmp_path}, {"drone": ns.make_model(config)})
 
 
 def test_one_that_gives_way_does_not(scene, tmp_path, capsys):
@@ -184,6 +229,24 @@ def test_a_flight_is_published(scene, tmp_path, monkeypatch):
     assert (found["odometry"][-1].position == kept[-1].position).all()
 
 
+def test_a_flight_that_waits_for_its_readers_waits_once_and_can_be_stopped(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path))
+    waits_s: list[float] = []
+    monkeypatch.setattr(
+        cortex.Publisher, "wait_for_subscribers", lambda self, timeout_s: waits_s.append(time.monotonic())
+    )
+    ns.fly(settings(scene, out={"kind": "cortex", "wait_s": 0.3}), tmp_path / "alone")
+    assert waits_s[-1] - waits_s[0] < 0.3  # for three sensors
+
+    def interrupt(*_: Any, **__: Any) -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    monkeypatch.setattr(cortex.Publisher, "wait_for_subscribers", interrupt)
+    report = ns.fly(settings(scene, out={"kind": "cortex", "wait_s": 3600.0}), tmp_path / "flight")
+    assert (report.interrupted, report.simulated_ns) == (True, 0)
+
+
 def test_settings_change_the_default_set_or_replace_it():
     kinds = {"recording": "hdf5", "rerun": "rerun", "overview": "overview"}
 
@@ -203,11 +266,18 @@ def test_settings_change_the_default_set_or_replace_it():
     assert loaded(**{"sinks.overview": None}) == {"recording": "hdf5", "rerun": "rerun"}
     with pytest.raises(ns.ConfigError, match=r"give `sinks`, which replace the default set, or `sinks\+`"):
         loaded({"sinks": mine, "sinks+": mine})
+    with pytest.raises(
+        ns.ConfigError, match=r"sinks: mine would write flight.h5, which is that of recording"
+    ):
+        loaded({"sinks+": {"mine": {"kind": "hdf5"}}})
+    with pytest.raises(ns.ConfigError, match=r"would write config.yaml, which is that of the settings"):
+        loaded({"sinks": {"mine": {"kind": "event_file", "name": "config.yaml"}}})
     with pytest.raises(ns.ConfigError, match=r"sinks.mine.kind: must be one of .*'test_list'"):
         loaded({"sinks": {"mine": {"kind": "test_lis"}}})
 
 
 def test_a_nearly_full_disk_makes_only_files_give_way_that_are_there(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1_000))
+    (tmp_path / "mine").mkdir()  # as the sink is called
     ns.fly(settings(scene, mine={"kind": "test_weak"}), tmp_path)
     assert OPENED[0].closed == [True]  # it has no file

@@ -63,6 +63,7 @@ class HostController:
 
         Raises:
             ValueError: A setpoint is not finite, or of another mode than the first.
+            TypeError: `command` returns no setpoint.
         """
         stamps_ns = arrays.stamp_ns.numpy()
         fields = [getattr(arrays, name).numpy() for name in MultirotorState._fields]
@@ -71,6 +72,8 @@ class HostController:
             stamp_ns = int(stamps_ns[world])
             state = MultirotorState(*(field[world].copy() for field in fields))
             setpoint = self.command(state, cursor.at(stamp_ns), stamp_ns=stamp_ns, world=world)
+            if not isinstance(setpoint, Setpoint):
+                raise TypeError(f"{type(self).__name__}.command must return a setpoint, got {setpoint!r}")
             if self._lower is None:
                 self._lower = make_controller(
                     setpoint.mode, self.airframe, self._gains, count=len(self._cursors)

@@ -206,7 +206,8 @@ def find_steps(events: EventArrays) -> tuple[Counts, Counts]:
     if len(turns) < 8:
         raise ValueError(
             f"found {len(turns) // 2} rises of light with a fall after each, need 4 or more: the "
-            "recording of steps must show light that is switched between two levels, in all pixels"
+            "recording of steps must show light that is switched between two levels, in all pixels, each for "
+            "longer than the readout takes to send the events of a step"
         )
     turns = turns[:-2]
     times = begin_us + turns * _BIN_US - _BIN_US

@@ -305,7 +305,8 @@ class Env:
         truncated = (self.episode_length >= self.episode_steps) & ~terminated
         torch.logical_or(terminated, truncated, out=self._mask)
         final = self._observations()
-        info = {"final_obs": final, "metrics": task.metrics(view), "seed": self._seeds.clone()}
+        metrics = Task.metrics(task, view) | task.metrics(view)
+        info = {"final_obs": final, "metrics": metrics, "seed": self._seeds.clone()}
         if self._surface is not None:
             info["dropped"] = wp.to_torch(observation.events[CAMERA].dropped)
         if self.device.type == "cpu" and not self._mask.any():

@@ -32,7 +32,8 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
     onnx = need("onnx")
     shape, graph = policy.shape, _Graph(onnx)
     hidden, size = policy.hidden, policy.memory_size
-    seen = graph.add("Log", [graph.add("Add", ["events", graph.constant(np.float32(1.0))])])
+    grown = graph.add("Add", [graph.add("Abs", ["events"]), graph.constant(np.float32(1.0))])
+    seen = graph.add("Mul", [graph.add("Log", [grown]), graph.add("Sign", ["events"])])
     for layer in policy.eyes:
         seen = graph.layer(layer, seen)
     features = graph.add("Concat", [seen, "vector"], axis=1)

@@ -142,7 +142,7 @@ class EventPolicy(nn.Module):
 
     def see(self, surfaces: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         """Return features of a step, [n, 96]; on CUDA bfloat16 does for surfaces in half precision."""
-        seen = torch.log1p(surfaces)
+        seen = torch.log1p(surfaces.abs()) * surfaces.sign()  # voxel grids have both signs
         halved = seen.is_cuda and seen.dtype == torch.float16
         with torch.autocast("cuda", torch.bfloat16, enabled=halved, cache_enabled=False):
             seen = self.eyes(seen if halved else seen.float()).float()

@@ -186,8 +186,12 @@ class Task:
         return view.crashed
 
     def metrics(self, view: View) -> dict[str, torch.Tensor]:
-        """Return what tells how an episode goes, [N] each; read at its end. `success` is 1 or 0."""
-        return {}
+        """Return what tells how an episode goes, [N] each; read at its end.
+
+        `success` and `crash` are 1 or 0; where they are not returned, success is not to have crashed.
+        """
+        crash = view.crashed.float()
+        return {"success": 1.0 - crash, "crash": crash}
 
 
 def turn(q: torch.Tensor, vectors: torch.Tensor, *, back: bool = False) -> torch.Tensor:

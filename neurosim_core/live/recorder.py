@@ -79,7 +79,10 @@ class Recorder:
         Raises:
             OSError: A folder cannot be written to.
             ImportError: h5py, or what another sink needs, is not installed.
+            ValueError: No sink of the settings takes part in live runs: nothing would be recorded.
         """
+        if not any(_live_sinks(model) for model in models.values()):
+            raise ValueError("none of `sinks` records a live run: add one, such as {recording: {kind: hdf5}}")
         for sink in (sink for model in models.values() for sink in _live_sinks(model).values()):
             if sink.library is not None and importlib.util.find_spec(sink.library[0]) is None:
                 raise ImportError(f"{sink.library[0]} is not installed: {install_hint(sink.library[1])}")

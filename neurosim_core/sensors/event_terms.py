@@ -43,6 +43,7 @@ class NoiseTermConfig(Settings):
     """Device function (`wp.func`): from a `SignalTerm`, the seed of numbers that change with time (uint64),
     the index of the pixel, row by row (int32), the time since the reset [ns] (int64) and log radiance
     (float64) to what the pixel sees at that time (float64). Between two frames that is linear in time.
+    A number that meets a float64 is written `wp.float64(0.5)`: Warp converts none.
     Random numbers are addressed: `random_bits(seed, term.stream, since_reset_ns, pixel)` for what changes
     with every frame, `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
 

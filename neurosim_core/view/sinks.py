@@ -95,7 +95,7 @@ class OverviewSink:
         self._has_pose |= isinstance(packet, Odometry)
 
     def close(self, *, complete: bool = True) -> None:
-        """Draw what was flown.
+        """Draw what was flown, if that is complete.
 
         Raises:
             OSError: The picture cannot be written.
@@ -103,6 +103,8 @@ class OverviewSink:
         if self._closed:
             return
         self._closed = True
+        if not complete:
+            return
         factor = self._stamp_ns / NS_PER_S / (time.perf_counter() - self._begun_s)
         self._loading.join()
         save_overview(

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from processes import ROOT, Child
+from processes import ROOT, Child, Lines
 
 _PEER = Path(__file__).with_name("dds_peer.py")
 
@@ -16,10 +16,10 @@ _PEER = Path(__file__).with_name("dds_peer.py")
 class Foreigner(Child):
     """A process of `dds_peer.py`: what it can do is there."""
 
+    hello: Any = "it says none"
+
     def __init__(self, domain: int, **environment: str) -> None:
-        self.role = "dds_peer"
-        self._rest = b""
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, str(_PEER), str(domain)],
             env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
             stdin=subprocess.PIPE,
@@ -27,6 +27,7 @@ class Foreigner(Child):
             stderr=subprocess.PIPE,
             bufsize=0,
         )
+        Lines.__init__(self, process, "dds_peer")
 
     def do(self, what: str, **arguments: Any) -> Any:
         """Let it do something, and return what came of it."""

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from bridge_process import BridgeProcess
 from bridge_rig import imu, odometry
-from processes import ROOT, SOON_S, Child, wait_for
+from processes import ROOT, SOON_S, Child, Lines, wait_for
 from runtime_directory import own_directory
 
 from cortex import Node
@@ -49,10 +49,10 @@ THIS_HOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY":
 class RosNode(Child):
     """A process of `ros_peer.py`: what it can do is there."""
 
+    hello: Any = "it says none"
+
     def __init__(self) -> None:
-        self.role = "ros_peer"
-        self._rest = b""
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [ROS_PYTHON, str(Path(__file__).with_name("ros_peer.py"))],
             env={**os.environ, "PYTHONPATH": ROS_PATH},
             stdin=subprocess.PIPE,
@@ -60,6 +60,7 @@ class RosNode(Child):
             stderr=subprocess.PIPE,
             bufsize=0,
         )
+        Lines.__init__(self, process, "ros_peer")
 
     def do(self, what: str, **arguments: Any) -> Any:
         """Let it do something, and return what came of it."""

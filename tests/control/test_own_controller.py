@@ -26,6 +26,8 @@ class CountingController(HostController):
     def command(self, state: Any, target: Any, *, stamp_ns: int, world: int) -> Any:
         """Return a velocity, or what was asked for instead."""
         self._calls[world] += 1
+        if self._config.wrong == "none":
+            return None
         if self._config.wrong == "mode" and self._calls[world] > 3:
             return ns.Position(position_m=target["position"])
         factor = np.nan if self._config.wrong == "nan" else 1.0 / self._calls[world]
@@ -100,10 +102,15 @@ def test_another_process_commands_the_same_bits(flown):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"), [("nan", "finite"), ("mode", "commands velocity: it cannot go over to position")]
+    ("wrong", "error", "said"),
+    [
+        ("nan", ValueError, "finite"),
+        ("mode", ValueError, "commands velocity: it cannot go over to position"),
+        ("none", TypeError, "CountingController.command must return a setpoint, got None"),
+    ],
 )
-def test_what_it_does_wrong_is_said(wrong, said):
-    with pytest.raises(ValueError, match=said):
+def test_what_it_does_wrong_is_said(wrong, error, said):
+    with pytest.raises(error, match=said):
         list(ns.run(settings(wrong=wrong)))
 
 

@@ -102,7 +102,7 @@ def programs() -> Path:
             _build(build)
         others = sorted(folder.glob("*/built"), key=lambda path: path.stat().st_mtime)
         for old in others[:-_KEPT]:
-            shutil.rmtree(old.parent)
+            shutil.rmtree(old.parent, ignore_errors=True)
     return build
 
 

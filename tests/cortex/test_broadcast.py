@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 import zmq
-from peer import Block, is_whole, make_block
+from peer import Block, Number, is_whole, make_block
 from processes import SOON_S, wait_for
 from rings import RING_BYTES, WIDE_BYTES, fill, frame, number_of, read_all, ring, takes
 
@@ -283,28 +283,32 @@ def test_what_came_before_the_answer_was_read_counts(make_node, start_child, mon
     assert subscriber.counters.lost > 0
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """The ends of readers that are welcome, and cannot map what they are given."""
+    ends = []
+
+    class Refusing:
+        def __init__(self, *arguments):
+            ends.append(native.RingReader(*arguments))
+
+        def welcomed(self):
+            if ends[-1].welcomed() is not None:
+                raise OSError("not here")
+
+        def __getattr__(self, name):
+            return getattr(ends[-1], name)
+
+    monkeypatch.setattr(cortex.link, "native", SimpleNamespace(RingReader=Refusing))
+    return ends
+
+
 @pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
-def test_a_reader_that_cannot_map_the_ring(make_node, start_child, monkeypatch, policy):
+def test_a_reader_that_cannot_map_the_ring(make_node, start_child, asked, policy):
     """It attaches anew, through the socket: the latched message comes all the same."""
     child = start_child("peer")
     child.ask(do="publisher", topic="/blocks", type="Block", latch=True)
     child.ask(do="publish", topic="/blocks", count=1, start=7, size=100_000)
-    asked = []
-
-    class Refusing:
-        """A reader's end that is welcome, and cannot map what it is given."""
-
-        def __init__(self, *arguments):
-            asked.append(native.RingReader(*arguments))
-
-        def welcomed(self):
-            if asked[-1].welcomed() is not None:
-                raise OSError("not here")
-
-        def __getattr__(self, name):
-            return getattr(asked[-1], name)
-
-    monkeypatch.setattr(cortex.link, "native", SimpleNamespace(RingReader=Refusing))
     subscriber = make_node().subscriber("/blocks", Block, policy=policy)
     block = subscriber.recv(SOON_S)
     assert (block.number, is_whole(block)) == (7, True)
@@ -313,4 +317,29 @@ def test_a_reader_that_cannot_map_the_ring(make_node, start_child, monkeypatch, 
     child.ask(do="publish", topic="/blocks", count=2, start=8, size=100_000)
     assert [subscriber.recv(SOON_S).number for _ in range(2)] == [8, 9]
     assert subscriber.counters.lost == subscriber.counters.rejected == 0
+    child.finish()
+
+
+@pytest.mark.parametrize("latch", [False, True], ids=["", "latched"])
+def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_child, asked, monkeypatch, latch):
+    """It was published to a reader that was attached, and had not looked yet."""
+    monkeypatch.setattr(cortex.subscriber, "TOP_UP_NS", 10**15)  # the node looks not either
+    child = start_child("peer")
+    child.ask(do="publisher", topic="/numbers", type="Number", latch=latch)
+    subscriber = make_node().subscriber("/numbers", Number, policy=reliable(8, 60.0))
+    child.ask(do="await_subscribers", topic="/numbers")
+    child.ask(do="publish", topic="/numbers", count=5)
+    values = []
+
+    def has_read(count: int) -> bool:
+        with contextlib.suppress(TimeoutError):
+            values.append(subscriber.recv(0.05).value)
+        return subscriber.publisher_count == 1 and len(values) >= count
+
+    wait_for(lambda: has_read(int(latch)))
+    child.ask(do="publish", topic="/numbers", count=3, start=5)
+    wait_for(lambda: has_read(3 + latch))
+    assert values == [4, 5, 6, 7][1 - latch :]
+    assert asked
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (5 - latch, 0)
     child.finish()

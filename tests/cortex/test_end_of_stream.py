@@ -18,7 +18,7 @@ import pytest
 from cpp_client import Impostor, Peer, make_frame
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 import cortex
 from cortex import records, reliable, wire
@@ -152,3 +152,29 @@ def test_cpp_reports_what_it_has_not_heard_the_end_of(
         counted = json.loads(peer.line())
         assert {name: counted[name] for name in COUNTERS} == expected(number), number
         peer.end()
+
+
+@pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
+def test_a_lossy_reader_confirms_the_end(
+    request: pytest.FixtureRequest, leavers: Leavers, monkeypatch: pytest.MonkeyPatch, language: str
+) -> None:
+    """Else it is said once, and what the queue had no room for before it is counted by nobody."""
+    with contextlib.ExitStack() as ends:
+        if language == "C++":
+            monkeypatch.setenv("CORTEX_TEST_REGISTRY", leavers.registry)
+            program = request.getfixturevalue("programs") / "peer"
+            peer = Peer([program, "count", "/cut0", 8, 0, 0])
+            ends.callback(peer.end)
+        else:
+            node = ends.enter_context(Node("reader", registry=leavers.tcp_registry))
+            node.subscriber("/cut0", Scan, policy=cortex.keep_last(8))
+        key = leavers.await_key()
+        assert key[24] & 0b1110 == 0b0100
+        source, reader = (int.from_bytes(key[at : at + 8], "little") for at in (8, 16))
+        leavers._say("answer 0", key, source)
+        leavers._say("end 3", key, source)
+        said = b""
+        while said[:5] != b"\x01CTXR":
+            assert leavers.xpub.poll(1e3 * SOON_S)
+            said = leavers.xpub.recv()
+        assert wire.parse_resume_key(said[1:]) == (source, reader, 4)

@@ -17,11 +17,14 @@ import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block
 from processes import ROOT, SOON_S
+from test_end_of_stream import Leavers, expected, leavers
 from wire_vectors import message_to_plain
 
 from cortex import keep_last, reliable
 from cortex.registry import ensure_registry
 from cortex.schema import schema_of
+
+__all__ = ["leavers"]
 
 CRATE = ROOT / "cortex" / "examples" / "rust"
 TARGET = ROOT / "build" / "rust"
@@ -260,3 +263,25 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     publishing.publish(Number(1, 2))
     assert first.recv(SOON_S) == second.recv(SOON_S) == Number(1, 2)
     assert publishing.close() == {"published": 1, "timeouts": 0}
+
+
+def test_rust_reports_what_it_has_not_heard_the_end_of(runtime: Path, leavers: Leavers):
+    (runtime / "0").mkdir(mode=0o700)
+    leavers.router.bind(f"ipc://{runtime}/0/registry")
+    program, pipe = TARGET / "debug" / "cortex-sub", subprocess.PIPE
+    readers = [
+        subprocess.Popen([program, f"/cut{number}", "--reliable", "--once"], stdout=pipe, stderr=pipe)
+        for number in (0, 1)
+    ]
+    try:
+        leavers.speak()
+        leavers.leave()
+        for number, reader in enumerate(readers):
+            _, errors = reader.communicate(timeout=SOON_S)
+            counted = expected(number)
+            counted["cut_off"] -= counted["rejected"]  # to it a message that is none has no number
+            assert json.loads(errors.splitlines()[-1]) == counted
+    finally:
+        for reader in readers:
+            reader.kill()
+            reader.communicate()

@@ -64,7 +64,7 @@ def events_of(observation, world: int) -> np.ndarray:
     return rows[np.lexsort(rows.T)]
 
 
-def alone(env, hall, world: int):
+def alone(env, hall, world: int, **pictures):
     """Return a simulator of one world whose settings are what a world of an environment drew."""
     task, drawn = env.task, {name: value[world].numpy() for name, value in env.parameters.items()}
     lens = draw_lenses(task.camera, env.randomisation)[0][int(env.sim.optics(CAMERA)[2].numpy()[world])]
@@ -73,26 +73,34 @@ def alone(env, hall, world: int):
     assert lens.distortion[0] == pytest.approx(drawn["distortion"])
     mount = Mount(**task.mount)
     turned = Rotation.from_rotvec(drawn["mount_rad"].astype(float)) * mount.rotation()
+    placed = {
+        "lens": lens.model_dump(),
+        "mount": {
+            "position_m": np.add(mount.position_m, drawn["mount_m"].astype(float)),
+            "rpy_rad": turned.as_euler("ZYX")[::-1],
+        },
+    }
     return ns.Simulation(
         {
             "device": "cpu",
             "control": {"rate_hz": task.rate_hz},
-            "render": {"samples_per_pixel": 4, "dark_floor": 1e-3 / float(drawn["light_factor"])},
+            "render": {
+                "samples_per_pixel": 4,
+                "dark_floor": 1e-3 / float(drawn["light_factor"]),
+                "exposure": env.sim.model.scene_on_device.exposure * float(drawn["light_factor"]),
+            },
             "scene": hall.config.scene.model_dump(),
             "path": {"kind": "hover"},
             "vehicle": {"max_step_s": 0.004, **task.vehicle},
             "sensors": {
+                **{name: {**picture, **placed} for name, picture in pictures.items()},
                 CAMERA: {
                     "kind": "event_camera",
-                    "lens": lens.model_dump(),
-                    "mount": {
-                        "position_m": np.add(mount.position_m, drawn["mount_m"].astype(float)),
-                        "rpy_rad": turned.as_euler("ZYX")[::-1],
-                    },
+                    **placed,
                     "sampling_rate_hz": task.rate_hz,
                     "packet_rate_hz": task.rate_hz,
                     "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},
-                }
+                },
             },
         },
         event_capacity=8 * 16 * 16,
@@ -124,6 +132,26 @@ def test_an_episode_sees_what_a_simulator_with_its_parameters_sees(make, hall):
             env.step(action)
         second = env.parameters
         assert all((second[name] != first[name]).any() for name in NAMES)
+
+
+def test_pictures_that_share_its_rays_have_its_lens_mount_and_light(make, hall):
+    kinds = ("depth", "optical_flow", "rgb")
+    pictures = {kind: {"kind": kind, "rate_hz": 50.0} for kind in kinds}
+    placed = {"lens": Brief.camera, "mount": Brief.mount}
+    env = make(sensors={name: {**picture, **placed} for name, picture in pictures.items()})
+    env.reset(seed=1)
+    state = env.observation.state
+    start = {n: getattr(state, n).numpy() for n in ("position", "velocity", "orientation", "body_rate")}
+    sim = alone(env, hall, 2, **pictures)
+    sim.reset(**{name: rows[2] for name, rows in start.items()})
+    for action in actions_of(3, 3):
+        env.step(action)
+        observation = sim.step(env.task.commands[2:].numpy())
+        for kind in kinds:
+            seen, expected = (each.images[kind].numpy() for each in (env.observation, observation))
+            assert np.ptp(seen[2]) > 0.1
+            tolerance = 1.0 if kind == "rgb" else 1e-5  # a level; factors in float32
+            np.testing.assert_allclose(seen[2].astype(float), expected[0], rtol=0.0, atol=tolerance)
 
 
 def roll(env, steps: int = 20, **begin):

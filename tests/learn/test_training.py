@@ -173,7 +173,7 @@ def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):
     memories = [np.zeros((1, policy.memory_size), np.float32) for _ in range(2)]
     actions = []
     for _ in range(50):
-        seen = rng.exponential(2.0, (1, 6, 8, 8)).astype(np.float32)
+        seen = rng.laplace(scale=2.0, size=(1, 6, 8, 8)).astype(np.float32)  # voxel grids have both signs
         vector = rng.normal(size=(1, 10)).astype(np.float32)
         inputs = {"events": seen, "vector": vector, "memory": memories[0]}
         action, memories[0] = session.run(None, inputs)
@@ -269,6 +269,29 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     del training
 
 
+def test_a_task_that_measures_nothing_is_trained_and_evaluated(hall):
+    """What it tells is who crashed."""
+
+    class Fall(ns.learn.Task):
+        episode_s = 2.0
+        groups = dict.fromkeys(("actor", "critic", "teacher"), ("state",))
+
+        def observe(self, view):
+            return {"state": view.velocity}
+
+        def reward(self, view):
+            return -view.velocity[:, 2]
+
+    env = ns.learn.make_env(Fall(), worlds=16, device="cpu", observe=["state"], models=[hall])
+    ppo = Ppo(env, PpoConfig(worlds=16, iterations=1), torch.Generator().manual_seed(0))
+    ppo.begin(seed=1)
+    ppo.iterate(0.0)
+    down = torch.tensor([-1.0, 0.0, 0.0, 0.0]).repeat(16, 1)
+    found = evaluate_policy(env, lambda observations, begun: down)
+    assert found.metrics == {"success": 0.0, "crash": 1.0}
+    assert str(found).startswith("0 % success (0 to 19), 100 % crash (81 to 100) in 16")
+
+
 def test_a_run_is_evaluated_in_the_file_of_a_scene(tmp_path, hall):
     run(tmp_path, hall)
     file = hall.config.scene.file
@@ -300,6 +323,16 @@ def test_a_run_sees_events_as_it_is_told(tmp_path, hall):
     assert next(evaluate_run(tmp_path, scenes=str(hall.config.scene.file), worlds=1))[0] == "events"
     with pytest.raises(ValueError, match="unknown surface 'voxel', known: leaky, time, counts, voxels"):
         small(surface="voxel")
+
+
+def test_a_policy_sees_voxels_of_both_signs():
+    torch.manual_seed(0)
+    policy = EventPolicy(channels=5, height=8, width=8, vector_size=3)
+    voxels, vector = torch.full((2, 5, 8, 8), 3.0), torch.zeros(2, 3)
+    voxels[1] = -3.0  # as many events, but darker
+    seen = policy.see(voxels, vector)
+    assert seen.isfinite().all()
+    assert not torch.allclose(seen[0], seen[1])
 
 
 def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):

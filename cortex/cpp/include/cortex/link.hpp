@@ -155,7 +155,8 @@ class Link {
     key.reader = reader_ = random_number();
     key.shared_memory = shared_memory;
     key.strict = policy_.is_reliable;
-    key.confirms = key.confirms_end = policy_.is_reliable;
+    key.confirms = true;
+    key.confirms_end = policy_.is_reliable;
     key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
     key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
     key_ = wire::pack_key(key, flags());
@@ -273,7 +274,7 @@ class Link {
     if (!advance(header.sequence, 0)) return;
     const std::uint64_t last = header.aux & wire::last;
     if (last != 0 || !marks_end_) ended_ = header.sequence + 1;
-    if (policy_.is_reliable && !in_ring_) confirm(header.sequence + last);
+    if (!in_ring_) confirm(header.sequence + last);
   }
 
   void on_slot(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
@@ -295,15 +296,15 @@ class Link {
     attached_ = true;
     reached_ = std::max(reached_, answer.sequence);
     marks_end_ = answer.marks_end;
-    const bool known = known_;
+    const bool is_new = !known_ || std::exchange(begins_again_, false);
+    if (!std::exchange(known_, true)) expected_ = answer.sequence;  // what is lost counts, also in a ring that we cannot read
     if (first && !use_ring()) {
       attached_ = false;
+      begins_again_ = is_new;
       return;  // it is asked again
     }
-    known_ = true;
-    if (!known) expected_ = answer.sequence;
     if (policy_.is_reliable && !in_ring_) confirm(expected_);
-    if (!known && !answer.latched.empty()) latched(answer.latched, queue);
+    if (is_new && !answer.latched.empty()) latched(answer.latched, queue);
   }
 
   void subscribe(char kind, bool wanted) {
@@ -335,6 +336,7 @@ class Link {
       throw MalformedMessage("a latched message of another publisher or type");
     }
     const auto body = wire::body_of(header, frame, wire::body_limit);
+    if (header.sequence >= expected_) advance(header.sequence, 1);
     auto copy = std::make_shared<std::vector<std::uint8_t>>(body.begin(), body.end());
     Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
     item.body = {copy->data(), copy->size()};
@@ -367,6 +369,7 @@ class Link {
   std::uint64_t reader_ = 0;
   bool attached_ = false;
   bool known_ = false;  // whether `expected_` is
+  bool begins_again_ = false;  // the first answer told of a ring that we cannot read: the next brings the latched message
   bool marks_end_ = true;
   std::uint64_t ended_ = 0;  // one more than the number at which the publisher said that the stream ends
   std::uint64_t expected_ = 0;

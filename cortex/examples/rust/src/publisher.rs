@@ -173,9 +173,13 @@ impl Publisher {
             }
             (b'A', _) => drop(self.readers.remove(key)),
             (b'R', 1) => {
-                let who = self.readers.iter_mut().find(|(key, _)| number(key, 16) == reader);
-                who.into_iter().for_each(|(_, found)| found.confirmed = found.confirmed.max(Some(last)));
-                self.late = self.late.filter(|late| last < *late);
+                let Some((_, found)) = self.readers.iter_mut().find(|(key, _)| number(key, 16) == reader) else {
+                    return Ok(());
+                };
+                if found.confirmed.is_some() {
+                    self.late = self.late.filter(|late| last < *late);
+                } // else it confirms its answer, and was not the one that was late [E4]
+                found.confirmed = found.confirmed.max(Some(last));
             }
             _ => {}
         }

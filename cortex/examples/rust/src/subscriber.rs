@@ -40,6 +40,8 @@ pub struct Link {
     expected: Option<u64>,
     /// The publisher has given away all sequences below this.
     reached: u64,
+    /// Whether the publisher will mark the end; an older one only says which sequence comes next [E6].
+    marks_end: bool,
     /// The sequence at which the publisher said that the stream ends.
     end: Option<u64>,
     /// When the publisher was seen to have left.
@@ -61,7 +63,8 @@ impl Link {
         for wanted in [head.prefix(b'M'), head.prefix(b'N'), head.prefix(b'L'), key.clone()] {
             socket.set_subscribe(&wanted)?;
         }
-        Ok(Link { socket, schema, head, reliable, key, expected: None, reached: 0, end: None, left: None })
+        let (expected, reached, marks_end, end, left) = (None, 0, true, None, None);
+        Ok(Link { socket, schema, head, reliable, key, expected, reached, marks_end, end, left })
     }
 
     /// Account for messages from a sequence on; false if they were seen before [K2, K3, E3].
@@ -93,7 +96,8 @@ impl Link {
     pub fn take(&mut self, frames: &[Vec<u8>], counters: &mut Counters) -> Result<Option<Vec<u8>>> {
         let frame = &frames[0];
         if frame.starts_with(&self.key) {
-            let (next, latched) = parse_answer(frame)?;
+            let (next, marks_end, latched) = parse_answer(frame)?;
+            self.marks_end = marks_end;
             self.reached = self.reached.max(next);
             let known = self.expected.replace(self.expected.unwrap_or(next));
             self.confirm(known.unwrap_or(next))?;
@@ -119,7 +123,7 @@ impl Link {
         };
         let is_new = self.advance(header.sequence, count, counters)?;
         if is_new && count == 0 {
-            self.end = (header.aux & LAST != 0).then_some(header.sequence).or(self.end);
+            self.end = (header.aux & LAST != 0 || !self.marks_end).then_some(header.sequence).or(self.end);
             self.confirm(header.sequence + (header.aux & LAST))?;
         }
         Ok((is_new && count == 1).then(|| body.to_vec()))

@@ -64,12 +64,12 @@ impl Header {
     }
 }
 
-/// Sequence and latched message of an answer [A4].
-pub fn parse_answer(frame: &[u8]) -> Result<(u64, &[u8])> {
+/// Sequence of an answer, whether its publisher marks the end of its stream, and the latched message [A4].
+pub fn parse_answer(frame: &[u8]) -> Result<(u64, bool, &[u8])> {
     ensure!(frame.len() >= 64, "an answer of {} bytes", frame.len());
     let (sequence, latched) = (number(frame, 32), number(frame, 48));
     ensure!(frame.len() as u64 == 64 + latched.min(BODY_MAX), "an answer that says it has {latched} more bytes");
-    Ok((sequence, &frame[64..]))
+    Ok((sequence, number(frame, 40) & MARKS_END != 0, &frame[64..]))
 }
 
 /// Fingerprints and schemas of the control messages.
