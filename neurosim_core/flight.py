@@ -124,8 +124,12 @@ def fly(
     def say(text: str) -> None:
         console.print(text, style="yellow", markup=False, soft_wrap=True)
 
+    on_stop: list[Callable[[], object]] = []
     context = {"folder": folder, "stem": "flight", "model": model, "header": header_of(model)}
-    with stop_at_signals(stop), Sinks(sinks, say=say, **context) as files:
+    with (
+        stop_at_signals(stop, on_stop=lambda: [stop_waiting() for stop_waiting in on_stop]),
+        Sinks(sinks, say=say, on_stop=on_stop, **context) as files,
+    ):
         try:
             with _progress(console) as progress:
                 task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")

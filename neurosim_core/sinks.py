@@ -8,7 +8,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
@@ -64,6 +64,9 @@ class SinkContext:
     """What is flown."""
     header: RecordingHeader
     """Settings, sensors and path, as a recording has them."""
+    on_stop: list[Callable[[], object]] = field(default_factory=list)
+    """Called when the flight is asked to end, by a signal handler: a sink that waits for others adds how
+    it stops waiting."""
 
 
 class SinkConfig(Settings):
@@ -249,7 +252,7 @@ class Sinks:
         Args:
             settings: By name.
             say: Told what is left out or given up.
-            context: `folder`, `stem`, `model` and `header` of `SinkContext`.
+            context: `folder`, `stem`, `model`, `header` and, where there is one, `on_stop` of `SinkContext`.
 
         Raises:
             OSError, ValueError: One cannot be opened.

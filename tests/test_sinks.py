@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -225,6 +227,24 @@ def test_a_flight_is_published(scene, tmp_path, monkeypatch):
         kept = [packet for packet in recorded(tmp_path / "flight") if packet.sensor == name]
         assert [message.stamp_ns for message in messages] == [packet.stamp_ns for packet in kept]
     assert (found["odometry"][-1].position == kept[-1].position).all()
+
+
+def test_a_flight_that_waits_for_its_readers_waits_once_and_can_be_stopped(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path))
+    waits_s: list[float] = []
+    monkeypatch.setattr(
+        cortex.Publisher, "wait_for_subscribers", lambda self, timeout_s: waits_s.append(time.monotonic())
+    )
+    ns.fly(settings(scene, out={"kind": "cortex", "wait_s": 0.3}), tmp_path / "alone")
+    assert waits_s[-1] - waits_s[0] < 0.3  # for three sensors
+
+    def interrupt(*_: Any, **__: Any) -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    monkeypatch.setattr(cortex.Publisher, "wait_for_subscribers", interrupt)
+    report = ns.fly(settings(scene, out={"kind": "cortex", "wait_s": 3600.0}), tmp_path / "flight")
+    assert (report.interrupted, report.simulated_ns) == (True, 0)
 
 
 def test_settings_change_the_default_set_or_replace_it():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
@@ -48,10 +49,18 @@ class CortexSink:
         collisions = self._node.publisher(
             topics.stream_topic(self._vehicle, "collision"), messages.message_type(Collision)
         )
-        if config.wait_s:
-            for publisher, _ in self._publishers.values():
-                publisher.wait_for_subscribers(timeout_s=config.wait_s)
+        self._stopped = False
+        context.on_stop.append(self._stop_waiting)
+        deadline_s = time.monotonic() + config.wait_s
+        for publisher, _ in self._publishers.values():
+            while time.monotonic() < deadline_s and not self._stopped:
+                if publisher.wait_for_subscribers(timeout_s=0.02):
+                    break
         self._publishers["collision"] = collisions, topics.WORLD_FRAME
+
+    def _stop_waiting(self) -> None:
+        self._stopped = True
+        self._node.stop_waiting()
 
     def write(self, packet: Packet) -> None:
         """Publish a packet if its sensor has a topic."""
