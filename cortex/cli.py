@@ -50,8 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format=f"cortex {options.command}: %(message)s")
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGINT, _leave)  # imports may swallow an exception, or make another of it
+    signal.signal(signal.SIGTERM, _leave)
     try:
         status = _call(options)
         sys.stdout.flush()
@@ -70,7 +70,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _call(options: argparse.Namespace) -> int:
     module, name = options.run
     try:
-        return int(getattr(importlib.import_module(f"cortex.commands.{module}"), name)(options))
+        run = getattr(importlib.import_module(f"cortex.commands.{module}"), name)
+        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGTERM, _terminate)
+        return int(run(options))
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -91,17 +94,17 @@ def _run_module(name: str, arguments: Sequence[str]) -> int:
 
 
 def _interrupt(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGINT, _give_up)
+    signal.signal(signal.SIGINT, _leave)
     raise KeyboardInterrupt
 
 
-def _give_up(number: int, frame: object) -> NoReturn:
-    """Leave at once: taking leave took too long for somebody. No file is worse for it than after SIGKILL."""
-    os._exit(INTERRUPTED)
+def _leave(number: int, frame: object) -> NoReturn:
+    """Leave at once: nothing is open yet, or closing takes too long. No file is worse than after SIGKILL."""
+    os._exit(128 + number)
 
 
 def _terminate(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGTERM, _give_up)
+    signal.signal(signal.SIGTERM, _leave)
     raise _Terminated
 
 
@@ -267,6 +270,7 @@ def _add_files(commands: Any) -> None:
             "cortex record -o run.mcap /scan /cmd",
             "cortex record -o run.mcap --all --duration 60",
         ],
+        interrupted=INTERRUPTED,
     )
     record.add_argument("topic", nargs="*", type=_topic)
     record.add_argument("-o", "--output", type=Path, required=True, metavar="FILE")

@@ -92,7 +92,7 @@ class Bridge:
                 self.update()
             except Exception as error:  # streams and commands of others must not end with one mistake
                 self._tell_failure(error)
-            stop.wait(LOOK_INTERVAL_S)
+            time.sleep(LOOK_INTERVAL_S)  # not `stop.wait`: a handler of signals may set it, in this thread
 
     def update(self) -> None:
         """Look at both sides once, and connect and disconnect accordingly."""

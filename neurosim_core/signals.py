@@ -35,7 +35,8 @@ def stop_at_signals(stop: threading.Event, *, on_stop: Callable[[], object] | No
     """Turn signals into an event: they must not break into the writing of a file. A second may.
 
     Args:
-        stop: Is set.
+        stop: Is set. The main thread must not `wait` for it but sleep and look: a signal that came while the
+            wait holds the event's lock would hang.
         on_stop: Called then, wherever the main thread is: it must take no lock.
     """
 

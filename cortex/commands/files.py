@@ -28,7 +28,11 @@ def record(options: argparse.Namespace) -> int:
         raise UsageError(f"--all records every topic: leave out {' '.join(options.topic)}")
     if options.output.exists() and not options.force:
         raise FileExistsError(f"{options.output} exists: choose another name, or --force to overwrite it")
-    stop = threading.Event()
+    told_to_stop: list[int] = []
+    # Before there is a file, so that no signal breaks into its making. Nor may a handler set an event that
+    # this thread waits for: it could come while the wait holds the event's lock, and hang.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: told_to_stop.append(number))
     with open_node(options) as node:
         recorder = Recorder(
             node,
@@ -38,11 +42,9 @@ def record(options: argparse.Namespace) -> int:
             overwrite=options.force,
             compression=options.compression,
         )
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
         hint(f"recording into {options.output}; Ctrl-C ends it")
         missing = {topic: Patience(node, topic) for topic in options.topic}
-        _wait_for_end(recorder, stop, options.duration, missing)
+        _wait_for_end(recorder, told_to_stop, options.duration, missing)
         stats = recorder.close()
     _report(options.output, stats)
     if stats.written:
@@ -56,11 +58,12 @@ def _any_of(topics: list[str]) -> str:
 
 
 def _wait_for_end(
-    recorder: Recorder, stop: threading.Event, duration_s: float | None, missing: dict[str, Patience]
+    recorder: Recorder, told_to_stop: list[int], duration_s: float | None, missing: dict[str, Patience]
 ) -> None:
     began_s = report_s = time.monotonic()
     warned = False
-    while recorder.running and not stop.wait(_TICK_S):
+    while recorder.running and not told_to_stop:
+        time.sleep(_TICK_S)
         now_s = time.monotonic()
         if duration_s is not None and now_s - began_s >= duration_s:
             break

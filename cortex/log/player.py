@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 SUBSCRIBERS_WAIT_S = 2.0
 _SPAN_MIN_NS = 1_000_000
+_LOOK_S = 0.02
 
 
 class Player:
@@ -148,8 +149,8 @@ class Player:
         while not self._stopped.is_set():
             now_ns = time.monotonic_ns()
             if not self._resumed.is_set():
-                while not self._resumed.wait(0.1) and not self._stopped.is_set():
-                    pass
+                while not self._resumed.is_set() and not self._stopped.is_set():
+                    time.sleep(_LOOK_S)
                 origin_ns += time.monotonic_ns() - now_ns
                 continue
             left_ns = origin_ns + after_ns - now_ns
@@ -157,7 +158,7 @@ class Player:
                 if after_ns:
                     self.late_ns = max(self.late_ns, -left_ns)
                 break
-            self._stopped.wait(min(left_ns * 1e-9, 0.1))
+            time.sleep(min(left_ns * 1e-9, 0.1))  # an interrupted `wait` could keep the event's lock
         return origin_ns
 
     def pause(self) -> None:

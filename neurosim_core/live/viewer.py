@@ -145,7 +145,8 @@ def watch(
     session: LiveSession | None = None
     say("waiting for a simulator (neurosim serve)")
     with contextlib.ExitStack() as stack:
-        while not stop.wait(POLL_S):
+        while not stop.is_set():
+            time.sleep(POLL_S)
             now_s = time.monotonic()
             if not target.check():
                 return 0

@@ -200,8 +200,8 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
             print(f"open {viewer.page_url}", flush=True)
             if open_browser and has_display():
                 webbrowser.open(viewer.page_url)
-        while not stop.wait(_POLL_S) and not viewer.ended:
-            pass
+        while not stop.is_set() and not viewer.ended:
+            time.sleep(_POLL_S)
         viewer.check()
     return 130 if stop.is_set() else 0
 

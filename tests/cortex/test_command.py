@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ from processes import ROOT, SOON_S, wait_for
 from cortex import Array, Node, Publisher, Unit, keep_last, reliable
 from cortex.cli import main
 from cortex.commands.text import bytes_of, message_lines, number_of, plain, rate, seconds, to_plain
-from cortex.log import open_log
+from cortex.log import Recorder, open_log
 from cortex.message import message
 from cortex.schema import schema_of
 
@@ -419,12 +419,31 @@ def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path
         assert (log.cut, log.message_count) == ("", 50)
     publisher.close()
     subscriber = robot.subscriber("/again", Number, policy=reliable(100))
+    wait_for(lambda: "/again" in cortex("topics")[1])  # play waits for the subscribers that it is told of
     status, output, errors = cortex("play", path, "--remap", "/number:=/again", "--rate", "max")
     assert (status, output, errors) == (0, "", "50 messages played\n")
     assert [subscriber.recv(SOON_S) for _ in range(50)] == [Number(i, i) for i in range(50)]
     status, output, _ = cortex("play", path, "--info")
     assert status == 0
     assert output.splitlines()[1].split() == ["/number", "Number", "50", "robot"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_recording_has_begun_leaves_a_whole_file(
+    runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> Recorder:
+        recorder = Recorder(*arguments, **options)
+        signal.raise_signal(number)
+        return recorder
+
+    monkeypatch.setattr("cortex.commands.files.Recorder", interrupted)
+    path = tmp_path / "run.mcap"
+    status, output, errors = cortex("record", "-o", path, "--all")
+    assert (status, output.count("0 messages in")) == (1, 1)
+    assert errors.endswith("\ncortex record: nothing was recorded: no message of any topic has come\n")
+    with open_log(path) as log:
+        assert (log.cut, log.message_count) == ("", 0)
 
 
 def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,6 +64,13 @@ CASES = [
 ]
 
 
+def message(number: int, source: int) -> bytes:
+    """A message of a publisher as a frame."""
+    body = codec_of(Scan).encode(Scan(number, np.full(2, number, np.float32)), 1000)
+    assert body is not None
+    return make_frame(b"M", number, body, source=source)
+
+
 class Leavers(Impostor):
     """A publisher for each case, on the topic `/cut0` or `/cut1`, as its stream is cut off or not."""
 
@@ -69,7 +78,8 @@ class Leavers(Impostor):
         super().__init__(directory)
         self.router.bind("tcp://127.0.0.1:*")
         self.tcp_registry = self.router.last_endpoint.decode()
-        schema, data = schema_of(Scan), f"ipc://{directory}/data"
+        schema, data = schema_of(Scan), f"ipc://{directory}/data.strict"
+        self.xpub.bind(data)
         publishers = [
             records.PublisherRecord(
                 f"/cut{case.cut_off}", 100 + index, schema.name, schema.fingerprint, schema.to_json(), False
@@ -95,9 +105,7 @@ class Leavers(Impostor):
         if what.endswith("answer"):
             self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(number, b"", what == "answer")))
         elif what == "message":
-            body = codec_of(Scan).encode(Scan(number, np.full(2, number, np.float32)), 1000)
-            assert body is not None
-            self.xpub.send(make_frame(b"M", number, body, source=source))
+            self.xpub.send(message(number, source))
         elif what == "bad":
             self.xpub.send_multipart([make_frame(b"L", number, b"", size=9, source=source), b"short"])
         else:
@@ -170,11 +178,65 @@ def test_a_lossy_reader_confirms_the_end(
             node.subscriber("/cut0", Scan, policy=cortex.keep_last(8))
         key = leavers.await_key()
         assert key[24] & 0b1110 == 0b0100
-        source, reader = (int.from_bytes(key[at : at + 8], "little") for at in (8, 16))
+        source = int.from_bytes(key[8:16], "little")
         leavers._say("answer 0", key, source)
         leavers._say("end 3", key, source)
-        said = b""
-        while said[:5] != b"\x01CTXR":
-            assert leavers.xpub.poll(1e3 * SOON_S)
-            said = leavers.xpub.recv()
-        assert wire.parse_resume_key(said[1:]) == (source, reader, 4)
+        await_confirmed(leavers, source, 4)
+
+
+def await_confirmed(leavers: Leavers, source: int, sequence: int) -> None:
+    """Wait until a reader has accounted for all below a sequence."""
+    confirmed: tuple[int, ...] | None = None
+    while confirmed is None or (confirmed[0], confirmed[2]) != (source, sequence):
+        assert leavers.xpub.poll(1e3 * SOON_S)
+        confirmed = wire.parse_resume_key(leavers.xpub.recv()[1:])
+
+
+@pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
+def test_what_went_through_a_ring_that_cannot_be_mapped_is_lost(
+    request: pytest.FixtureRequest,
+    runtime: Path,
+    leavers: Leavers,
+    monkeypatch: pytest.MonkeyPatch,
+    language: str,
+) -> None:
+    """Messages 5 to 8 did; the last of them is latched, and comes with the second answer."""
+    with contextlib.ExitStack() as ends:
+        listener = ends.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        listener.bind(str(runtime / "data.ring"))
+        listener.listen(len(CASES))
+        listener.settimeout(SOON_S)
+        if language == "C++":
+            monkeypatch.setenv("CORTEX_TEST_REGISTRY", leavers.registry)
+            peer = Peer([request.getfixturevalue("programs") / "peer", "count", "/cut0", "reliable", 0, 0])
+        else:
+            node = ends.enter_context(Node("reader", registry=leavers.tcp_registry))
+            subscriber = node.subscriber("/cut0", Scan, policy=reliable(64, SOON_S))
+        key, hello = leavers.await_key(), b""
+        source = int.from_bytes(key[8:16], "little")
+        while hello[8:] != key[8:24]:
+            connection = ends.enter_context(listener.accept()[0])
+            hello, fds, *_ = socket.recv_fds(connection, 100, 2)
+            for fd in fds:
+                os.close(fd)
+        memory = os.memfd_create("no ring")
+        socket.send_fds(connection, [bytes(56)], [memory])
+        os.close(memory)
+        leavers._say("answer 5", key, source)
+        first = key
+        while key[8:16] != first[8:16] or key[24] & 1:
+            key = leavers.await_key()
+        leavers.xpub.send(wire.answer_frame(key, wire.AttachAnswer(9, message(8, source))))
+        leavers._say("message 9", key, source)
+        leavers._say("end 10", key, source)
+        if language == "C++":
+            await_confirmed(leavers, source, 11)
+            time.sleep(0.2)
+            peer.close_input()
+            counted = json.loads(peer.line())
+            peer.end()
+        else:
+            assert [subscriber.recv(SOON_S).stamp_ns for _ in range(2)] == [8, 9]
+            wait_for(lambda: subscriber.sources()[source] == 10)
+            counted = {name: getattr(subscriber.counters, name) for name in COUNTERS}
+    assert {name: counted[name] for name in COUNTERS} == dict(zip(COUNTERS, (2, 3, 0, 0), strict=True))
