@@ -389,6 +389,20 @@ def test_cpp_reader_counts_a_stream_that_was_cut_off(
     assert "ended without saying how much it had sent" in reader.end()
 
 
+def test_cpp_reader_takes_leave_of_a_publisher_while_another_is_busy(
+    start: Callable[..., Peer], start_child: Callable[..., Child], make_node: Callable[..., Node]
+) -> None:
+    reader = start("count", "/scan", "reliable", 0, 0)
+    child = start_child("peer")
+    child.ask(do="publisher", topic="/scan", type="Scan")
+    assert child.ask(do="await_subscribers", topic="/scan")["ok"]
+    start("publish", "/scan", -1, 10)  # without a pause, for ever
+    child.say(do="leave", topic="/scan", count=10, orderly=False)
+    node = make_node()
+    wait_for(lambda: [found.cut_off for found in subscribers_in_cpp(node)] == [1])
+    assert reader.process.poll() is None
+
+
 class RingImpostor(Impostor):
     """A publisher that takes its subscriber into a ring, and writes there what it likes."""
 

@@ -109,6 +109,7 @@ class SubscriptionCore {
       if (!there && link->leaving_ns == 0) link->leave();
       link->leaving_ns = there ? 0 : link->leaving_ns != 0 ? link->leaving_ns : monotonic_ns();
     }
+    note_leaving();
     for (const auto& source : sources) {
       if (std::any_of(links_.begin(), links_.end(),
                       [&](const auto& link) { return link->source() == source.source; })) {
@@ -129,19 +130,21 @@ class SubscriptionCore {
   }
 
   // Reads the sockets of a subscription that nobody reads at the moment, so that the queue keeps the last messages
-  // and not the first that filled the sockets; closes the links of publishers that left.
+  // and not the first that filled the sockets; closes the links of publishers that left, whether others are busy or not.
   void tend(std::int64_t now_ns) {
-    if (now_ns - drained_ns_.load(std::memory_order_relaxed) < tend_ns) return;
+    const bool is_read = now_ns - drained_ns_.load(std::memory_order_relaxed) < tend_ns;
+    if (is_read && !is_leaving_.load(std::memory_order_relaxed)) return;
     const std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
     if (!lock.owns_lock() || closed_) return;
     const bool waiting = !queue_.empty();
-    drain();
+    if (!is_read) drain();
     const auto stays = [&](const auto& link) {
       return link->leaving_ns == 0 || (!link->has_ended() && now_ns - link->leaving_ns <= leaving_ns);
     };
     const auto gone = std::stable_partition(links_.begin(), links_.end(), stays);
     std::for_each(gone, links_.end(), [](const auto& link) { link->end(); });
     links_.erase(gone, links_.end());
+    note_leaving();
     if (!waiting && !queue_.empty()) waker_.set();
   }
 
@@ -294,6 +297,10 @@ class SubscriptionCore {
     ++counters_->overtaken;
   }
 
+  void note_leaving() {
+    is_leaving_ = std::any_of(links_.begin(), links_.end(), [](const auto& link) { return link->leaving_ns != 0; });
+  }
+
   void complain(const Source& source) {
     if (std::find(mismatched_.begin(), mismatched_.end(), source.source) != mismatched_.end()) return;
     if (mismatched_.size() >= 256) mismatched_.pop_front();
@@ -316,6 +323,7 @@ class SubscriptionCore {
   std::deque<std::uint64_t> mismatched_;
   std::size_t first_ = 0;  // the link that was read first the last time
   std::atomic<std::int64_t> drained_ns_{0};
+  std::atomic<bool> is_leaving_{false};  // a publisher has left whose link is still there
   std::atomic<bool> in_rush_{false};  // messages follow one another within `spin_ns`
   bool exhausted_ = true;
   bool closed_ = false;
