@@ -19,7 +19,7 @@ def read_rows(column: Any, begin: int, end: int) -> NDArray[Any]:
     Raises:
         OSError: The file is damaged.
     """
-    isal = _import_isal()
+    isal = import_isal()
     end = min(end, len(column))
     if isal is None or begin >= end or not _is_shuffled_gzip(column):
         return np.asarray(column[begin:end])
@@ -49,7 +49,8 @@ def _is_shuffled_gzip(column: Any) -> bool:
 
 
 @functools.cache
-def _import_isal() -> ModuleType | None:
+def import_isal() -> ModuleType | None:
+    """Return ISA-L's zlib, or None where it is not installed."""
     try:
         from isal import isal_zlib
     except ImportError:

@@ -39,7 +39,6 @@ import contextlib
 import os
 import time
 import zlib
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType, TracebackType
@@ -50,6 +49,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.install import install_hint
 from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, schema_of
+from neurosim_core.record.chunks import import_isal
 from neurosim_core.record.disk import Disk
 from neurosim_core.record.header import RecordingHeader
 
@@ -479,13 +479,6 @@ def _deflate(rows: NDArray[Any], length: int) -> bytes:
     """Return what HDF5's filters shuffle and gzip would make of a chunk of so many rows, faster."""
     if len(rows) < length:
         rows = np.concatenate([rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)])
-    return _import_deflate()(rows.reshape(-1, 1).view(np.uint8).T.tobytes(), 1)
-
-
-def _import_deflate() -> Callable[[bytes, int], bytes]:
-    """Return the fastest gzip that is installed."""
-    try:
-        from isal import isal_zlib
-    except ImportError:
-        return zlib.compress
-    return isal_zlib.compress
+    shuffled = rows.reshape(-1, 1).view(np.uint8).T.tobytes()
+    deflated: bytes = (import_isal() or zlib).compress(shuffled, 1)
+    return deflated

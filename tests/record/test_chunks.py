@@ -20,15 +20,15 @@ def inflated(monkeypatch):
     sizes = []
 
     class Isal:
-        error = chunks._import_isal().error
+        error = chunks.import_isal().error
 
         @staticmethod
         def decompress(data, bufsize):
             sizes.append(bufsize)
             return true.decompress(data, bufsize=bufsize)
 
-    true = chunks._import_isal()
-    monkeypatch.setattr(chunks, "_import_isal", lambda: Isal)
+    true = chunks.import_isal()
+    monkeypatch.setattr(chunks, "import_isal", lambda: Isal)
     return sizes
 
 
