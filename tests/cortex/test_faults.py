@@ -240,18 +240,6 @@ def test_registries_are_killed(make_node, start_child, runtime):
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
 
 
-def test_files_of_the_dead_are_removed(make_node, start_child, runtime):
-    """The registry sweeps what a killed node has left."""
-    node = make_node()
-    child = start_child("peer", listen="127.0.0.1")
-    stem = f"{child.hello['node']:016x}"
-    wait_for(lambda: len(node.nodes()) == 2)  # what dies before anybody knew it is swept by the next node
-    assert len(list(runtime.glob(f"*/{stem}.*"))) == 5
-    child.kill()
-    wait_for(lambda: not list(runtime.glob(f"*/{stem}.*")))
-    wait_for(lambda: [record.name for record in node.nodes()] == ["node"])
-
-
 # SIGSTOP
 
 
@@ -314,34 +302,20 @@ def test_a_publisher_is_stopped(make_node, start_child, runtime):
 # Other faults
 
 
-@pytest.mark.parametrize("policy", [keep_last(8), reliable(8, 60.0)], ids=str)
-def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
-    """A limit on the size of files stands for a full memory: the messages go through the socket."""
-    child = start_child("peer", limit_file_bytes=100_000)
-    child.ask(do="publisher", topic="/blocks", type="Block")
-    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
-    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
-    for number, size in enumerate((100, 300_000, 20_000, 100, 1_000_000, 300_000)):
-        assert child.ask(do="publish", topic="/blocks", count=1, start=number, size=size)["delivered"] == 1
-        block = subscriber.recv(SOON_S)
-        assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
-    assert subscriber.counters.lost == 0
-    child.finish()
-    assert "no shared memory" in child.errors()
-
-
-def test_no_memory_for_slots(make_node, start_child, runtime):
-    """Readers of a ring go on through their sockets, in order: who is reliable and reads loses nothing."""
-    child = start_child("peer", limit_file_bytes=1_000_000)
+@pytest.mark.parametrize(("limit", "shared"), [(100_000, 0), (1_000_000, 2)], ids=["a ring", "slots"])
+@pytest.mark.parametrize("policy", [keep_last(8), reliable(8, SOON_S)], ids=str)
+def test_no_memory(make_node, start_child, runtime, policy, limit, shared):
+    """A limit on the size of files stands for a full memory: messages go through the socket, in order."""
+    child = start_child("peer", limit_file_bytes=limit)
     child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
-    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(8, SOON_S))
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
     for number, size in enumerate((100, 100, 1_000_000, 100, 20_000, 300_000)):
         child.say(do="publish", topic="/blocks", count=1, start=number, size=size)
         block = subscriber.recv(SOON_S)
         assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
         assert child.hear()["delivered"] == 1
-        assert ("shared memory" in subscriber.carriers[0]) == (number < 2)
+        assert ("shared memory" in subscriber.carriers[0]) == (number < shared)
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
     child.finish()
     assert "no shared memory" in child.errors()

@@ -18,7 +18,7 @@ import cortex.back_pressure
 import cortex.broadcast
 import cortex.large
 import cortex.link
-from cortex import keep_last, latest, reliable
+from cortex import Closed, keep_last, latest, reliable
 from cortex.pub_socket import Backoff
 
 LARGE = 100_000
@@ -582,3 +582,135 @@ def test_too_many_loans(node):
     message, info = subscriber.recv_with_info(SOON_S)
     assert message.stamp_ns == 9
     assert info.sequence == subscriber.counters.lost  # a loan that was refused may count as skipped
+
+
+EXPECTED = 400_000
+
+
+def slots_of(publisher):
+    """Number and size of a publisher's slots; None if there is no ring."""
+    with publisher._pub_sockets.lock:
+        ring = publisher._fanout.ring._ring
+        return None if ring is None else (ring.slots, ring.slot_bytes)
+
+
+@pytest.mark.parametrize("policy", [latest(), keep_last(), keep_last(256), reliable()])
+def test_messages_find_the_memory_that_was_made_before_them(node, policy):
+    publisher = node.publisher("/large", Scan, expected_bytes=EXPECTED)
+    assert slots_of(publisher) is None  # nobody listens
+    subscriber = node.subscriber("/large", Scan, policy=policy)
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    made = slots_of(publisher)
+    assert made[1] >= EXPECTED
+    for number, size in enumerate((20_000, 100_000, 30_000, 300_000, EXPECTED - 4096)):
+        publisher.publish(scan(number, size // 4))
+        message = subscriber.recv(SOON_S)
+        assert (message.stamp_ns, message.ranges.nbytes) == (number, size)
+        del message
+    assert slots_of(publisher) == made
+
+
+def test_a_larger_message_than_expected_makes_memory_of_its_own(node):
+    publisher, subscriber = connect(node, "/large", Scan, latest(), expected_bytes=EXPECTED)
+    publisher.publish(scan(1, 3 * EXPECTED // 4))
+    message = subscriber.recv(SOON_S)
+    assert (message.stamp_ns, message.ranges.nbytes) == (1, 3 * EXPECTED)
+    assert slots_of(publisher)[1] >= 3 * EXPECTED
+
+
+def test_one_reader_more_is_given_its_share_when_it_comes(node):
+    """A share is two slots: more readers need more, and who is there already is told of the new ring."""
+    publisher = node.publisher("/large", Scan, expected_bytes=3_000_000)
+    subscribers = []
+    for count in range(1, 4):
+        subscribers.append(node.subscriber("/large", Scan, policy=reliable()))
+        assert publisher.wait_for_subscribers(count, timeout_s=SOON_S)
+        made = slots_of(publisher)
+        assert made[0] >= 2 * count + 2
+        publisher.publish(scan(count, 2_900_000 // 4))
+        for subscriber in subscribers:
+            message = subscriber.recv(SOON_S)
+            assert (message.stamp_ns, message.ranges.nbytes) == (count, 2_900_000)
+            del message
+        assert slots_of(publisher) == made
+
+
+def test_small_messages_need_no_memory(node):
+    publisher, subscriber = connect(node, "/large", Scan, latest(), expected_bytes=1000)
+    publisher.publish(scan(1, 400 // 4))
+    assert subscriber.recv(SOON_S).stamp_ns == 1
+    assert slots_of(publisher) == (0, 0)
+
+
+def test_what_is_not_as_usual_goes_the_long_way(node):
+    """Another class, a wrong dtype, an array that is not contiguous: the same words, and no slot is lost."""
+    publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
+    for number in range(3):
+        publisher.publish(scan(number))
+        subscriber.recv(SOON_S)
+    with pytest.raises(TypeError, match="carries Scan"):
+        publisher.publish(make_block(0, 100_000))
+    with pytest.raises(TypeError, match="float64"):
+        publisher.publish(Scan(1, np.zeros(100_000)))
+    with pytest.raises((TypeError, ValueError), match="stamp_ns"):
+        publisher.publish(Scan("soon", np.zeros(100_000, np.float32)))
+    assert publisher.publish(Scan(5, np.arange(200_000, dtype=np.float32)[::2]))
+    message = subscriber.recv(SOON_S)
+    assert message.stamp_ns == 5
+    assert (message.ranges == np.arange(0, 200_000, 2)).all()
+    del message
+    wait_for(lambda: slots_held(publisher) == 0)
+
+
+def test_publishers_in_several_threads(node):
+    """Messages copied with and without the lock, small ones between them: each arrives once, in order."""
+    publisher, subscriber = connected(node, Block, reliable(64, 60.0))
+    sizes, count, threads = (10, 40_000, 200_000, 600_000), 40, 4
+    made = [
+        [make_block(1000 * k + number, sizes[(number + k) % 4]) for number in range(count)]
+        for k in range(threads)
+    ]
+    refused = []
+
+    def publish(k):
+        refused.extend(block.number for block in made[k] if not publisher.publish(block))
+
+    workers = [threading.Thread(target=publish, args=(k,)) for k in range(threads)]
+    for worker in workers:
+        worker.start()
+    seen = []
+    for _ in range(count * threads):
+        block = subscriber.recv(SOON_S)
+        assert is_whole(block)
+        seen.append(block.number)
+    for worker in workers:
+        worker.join(SOON_S)
+    assert not refused
+    for k in range(threads):
+        assert [number % 1000 for number in seen if number // 1000 == k] == list(range(count))
+    assert (subscriber.counters.received, subscriber.counters.lost) == (count * threads, 0)
+    assert publisher.counters.published == count * threads
+
+
+def test_closing_while_others_publish(node):
+    """The memory stays as long as somebody copies into it."""
+    for _ in range(10):
+        publisher, subscriber = connected(node, Scan, keep_last(4))
+        message = scan(1, 1_000_000)
+        ended = []
+
+        def publish(publisher=publisher, message=message, ended=ended):
+            try:
+                while True:
+                    publisher.publish(message)
+            except Closed:
+                ended.append(True)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        subscriber.recv(SOON_S)
+        time.sleep(0.003)
+        publisher.close(linger_s=0.0)
+        thread.join(SOON_S)
+        assert ended
+        subscriber.close()

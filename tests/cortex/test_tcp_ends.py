@@ -17,7 +17,8 @@ import pytest
 from peer import Block, is_whole, make_block
 from processes import SOON_S, fork_server, wait_for
 
-from cortex import reliable
+import cortex.node
+from cortex import keep_last, reliable
 from cortex.context import Closed
 
 RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "8"))
@@ -232,3 +233,27 @@ def a_subscriber_leaves(node, child, start_child, generator, tmp_path):
     assert longest_s < SOON_S / 2.0
     child.ask(do="close", topic="/numbers")
     victim.end()
+
+
+def test_the_end_comes_after_a_full_queue(make_node, monkeypatch):
+    publisher = make_node("one", listen="127.0.0.1").publisher("/blocks", Block)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(cortex.node, "host_id", lambda: "another host")
+        node = make_node("two", listen="127.0.0.1")
+    subscriber = node.subscriber("/blocks", Block, policy=keep_last(4))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert subscriber.wait_for_publisher(SOON_S)
+    assert subscriber.carriers == ["tcp"]
+    block, count = make_block(0, 10_000), 6_000
+    with subscriber._receive_lock:  # nobody reads: queues and buffers fill up, and the rest is dropped
+        for _ in range(count):
+            publisher.publish(block)
+        closing = threading.Thread(target=publisher.close, kwargs={"linger_s": SOON_S})
+        closing.start()
+        closing.join(0.3)
+        assert closing.is_alive()  # the reader has not said yet that it knows
+    counters = subscriber.counters
+    wait_for(lambda: counters.received + counters.lost + counters.overtaken + len(subscriber._queue) == count)
+    closing.join(SOON_S)
+    assert not closing.is_alive()
+    assert counters.lost > 0
