@@ -94,6 +94,24 @@ def connect(
     return publisher, subscriber
 
 
+def take(subscriber: Any, timeout_s: float = 0.0) -> Any:
+    """The next message; None if none comes in time."""
+    try:
+        return subscriber.recv(timeout_s)
+    except TimeoutError:
+        return None
+
+
+def take_all(subscriber: Any) -> list[Any]:
+    """The messages that are there now."""
+    return list(iter(lambda: take(subscriber), None))
+
+
+def accounted(counters: Any) -> int:
+    """How many messages a subscriber knows of."""
+    return counters.received + counters.lost + counters.overtaken
+
+
 def policy_of(words: list[Any]) -> Policy:
     """A policy from its name and arguments."""
     return getattr(cortex, words[0])(**(words[1] if len(words) > 1 else {}))
@@ -172,9 +190,7 @@ class Peer:
         first = None
         deadline_s = time.monotonic() + timeout_s
         while last < until:
-            try:
-                got = subscriber.recv(deadline_s - time.monotonic())
-            except TimeoutError:
+            if (got := take(subscriber, deadline_s - time.monotonic())) is None:
                 break
             number = number_of(got)
             first = number if first is None else first
@@ -294,14 +310,11 @@ def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0, **place:
                 torn += sum(not is_whole(block) for block in kept)
                 lost, overtaken = sub.counters.lost, sub.counters.overtaken
                 say(count=count, torn=torn, lost=lost, overtaken=overtaken, rejected=sub.counters.rejected)
-            try:
-                block = sub.recv(0.02)
-            except TimeoutError:
-                continue
-            count += 1
-            torn += not is_whole(block)
-            kept.append(block)
-            del kept[: len(kept) - keep]
+            if (block := take(sub, 0.02)) is not None:
+                count += 1
+                torn += not is_whole(block)
+                kept.append(block)
+                del kept[: len(kept) - keep]
 
 
 def as_recorder(path: str, limit_file_bytes: int | None = None) -> None:

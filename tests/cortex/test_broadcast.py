@@ -11,15 +11,14 @@ import resource
 import select
 import socket
 import struct
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import zmq
-from peer import Block, Number, connect, is_whole, make_block
-from processes import SOON_S, wait_for
+from peer import Block, Number, accounted, connect, is_whole, make_block, take_all
+from processes import SOON_S, Beside, wait_for
 
 import cortex.broadcast
 import cortex.link
@@ -143,25 +142,19 @@ def test_every_reliable_reader_gets_every_frame_in_order(ring, largest):
 
 def test_threads_read_while_the_publisher_writes(ring):
     """Each sleeps until the bell rings; it waits for the slowest, and nobody loses anything."""
-    readers = [ring.join(strict=True)[0] for _ in range(3)]
     count = 20_000
-    got: list[list[int]] = [[] for _ in readers]
 
-    def read(reader, numbers: list[int]) -> None:
+    def read(reader) -> list[int]:
+        numbers: list[int] = []
         while len(numbers) < count:
-            try:
+            with contextlib.suppress(zmq.Again):
                 numbers.append(number_of(reader.receive(0)))
-            except zmq.Again:
-                continue
+        return numbers
 
-    threads = [threading.Thread(target=read, args=pair) for pair in zip(readers, got, strict=True)]
-    for thread in threads:
-        thread.start()
+    threads = [Beside(read, ring.join(strict=True)[0]) for _ in range(3)]
     for number in range(count):
         wait_for(lambda number=number: takes(ring.writer, frame(number, 40)), every_s=1e-5)
-    for thread in threads:
-        thread.join(SOON_S)
-    assert got == [list(range(count))] * 3
+    assert [thread.join() for thread in threads] == [[list(range(count))]] * 3
 
 
 def test_a_reliable_reader_holds_up_the_publisher(ring):
@@ -173,11 +166,6 @@ def test_a_reliable_reader_holds_up_the_publisher(ring):
     assert ring.writer.patience(1064) == -1
     assert takes(ring.writer, frame(count, 1000))
     assert read_all(reader) == list(range(1, count + 1))
-
-
-def test_slots_for_nothing(ring):
-    """Bodies of 0 bytes have slots, too."""
-    ring.writer.provide(0, True, False)
 
 
 def test_a_ring_that_finds_no_memory_tries_once(ring):
@@ -254,19 +242,10 @@ def test_a_lossy_reader_keeps_the_newest_and_disturbs_nobody(ring):
 def test_a_lossy_reader_in_a_race_sees_no_torn_frame(ring):
     """Each frame is checked byte by byte; numbers only grow."""
     reader, _ = ring.join(strict=False)
-    ended = threading.Event()
-
-    def write() -> None:
-        for number in range(20_000):
-            takes(ring.writer, frame(number, 3000))
-        ended.set()
-
-    thread = threading.Thread(target=write)
-    thread.start()
     got: list[int] = []
-    while not ended.is_set():
-        got += read_all(reader)
-    thread.join()
+    with Beside(lambda: [takes(ring.writer, frame(number, 3000)) for number in range(20_000)]) as writing:
+        while writing.thread.is_alive():
+            got += read_all(reader)
     got += read_all(reader)
     assert got == sorted(set(got))
     assert got[-1] == 19_999
@@ -318,19 +297,12 @@ def test_a_ring_that_brings_nonsense_is_left_for_the_socket(make_node, start_chi
     publisher = make_node().publisher("/blocks", Block)
     child = start_child("endless_subscriber", topic="/blocks", policy=["reliable", {"timeout_s": SOON_S}])
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    sent = 0
-
-    def publish() -> None:
-        nonlocal sent
+    for sent in (1, 2):
         assert publisher.publish(make_block(sent, 100))
-        sent += 1
-
-    publish()
-    wait_for(lambda: child.ask()["count"] == 1)
-    publisher._fanout.ring._ring.send(b"nonsense" * 20)
-    wait_for(lambda: child.ask()["rejected"] == 1)
-    publish()
-    wait_for(lambda: child.ask()["count"] == sent)
+        wait_for(lambda sent=sent: child.ask()["count"] == sent)
+        if sent == 1:
+            publisher._fanout.ring._ring.send(b"nonsense" * 20)
+            wait_for(lambda: child.ask()["rejected"] == 1)
     assert child.ask()["lost"] == 0
 
 
@@ -362,17 +334,13 @@ def test_what_came_before_the_answer_was_read_counts(make_node, start_child, mon
     child.ask(do="publish", topic="/blocks", count=100, size=RING_BYTES // 20)
     child.finish()
     wait_for(lambda: not subscriber.sources())
-    count = 0
 
-    def accounted() -> int:
-        nonlocal count
-        with contextlib.suppress(TimeoutError):
-            assert is_whole(subscriber.recv(0.0))
-            count += 1
-        return count + subscriber.counters.lost + subscriber.counters.overtaken
+    def all_known() -> bool:
+        assert all(map(is_whole, take_all(subscriber)))
+        return accounted(subscriber.counters) >= 100
 
-    wait_for(lambda: accounted() >= 100)
-    assert accounted() == 100
+    wait_for(all_known)
+    assert accounted(subscriber.counters) == 100
     assert subscriber.counters.lost > 0
 
 
@@ -425,8 +393,7 @@ def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_chil
     values = []
 
     def has_read(count: int) -> bool:
-        with contextlib.suppress(TimeoutError):
-            values.append(subscriber.recv(0.05).value)
+        values.extend(message.value for message in take_all(subscriber))
         return subscriber.publisher_count == 1 and len(values) >= count
 
     wait_for(lambda: has_read(int(latch)))

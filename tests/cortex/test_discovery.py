@@ -29,13 +29,7 @@ from processes import SOON_S, wait_for
 from cortex.control import LEASE_NS
 from cortex.discovery import Directory
 from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, runtime_dir
-from cortex.records import (
-    Alive,
-    Changed,
-    Heartbeat,
-    Hello,
-    Welcome,
-)
+from cortex.records import Alive, Changed, Heartbeat, Hello, Welcome
 from cortex.wire import control_frame, parse_control
 
 __all__ = ["context", "make"]

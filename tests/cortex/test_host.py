@@ -14,15 +14,7 @@ from pathlib import Path
 import pytest
 from processes import SOON_S
 
-from cortex.host import (
-    FileLock,
-    NodeFiles,
-    domain_id,
-    host_id,
-    node_lives,
-    runtime_dir,
-    sweep,
-)
+from cortex.host import FileLock, NodeFiles, domain_id, host_id, node_lives, runtime_dir, sweep
 
 ROOT = Path(__file__).resolve().parents[2]
 

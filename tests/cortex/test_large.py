@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peer import Block, Scan, connect, is_whole, make_block
-from processes import SOON_S, shared_mappings, wait_for
+from peer import Block, Scan, accounted, connect, is_whole, make_block, take, take_all
+from processes import SOON_S, Beside, shared_mappings, wait_for
 
 import cortex.back_pressure
 import cortex.broadcast
@@ -110,56 +110,42 @@ def test_a_reader_that_hoards_hurts_only_itself(node):
     publisher, hoarder = connected(node, Scan, keep_last(64))
     other = node.subscriber("/large", Scan, policy=keep_last(64))
     assert publisher.wait_for_subscribers(2, SOON_S)
-    kept = []
-    took_s = []
-
-    def take():
-        if (message := _try(hoarder)) is not None:
-            kept.append(message)
-
+    kept, took_s = [], []
     for number in range(100):
         begin = time.monotonic()
         assert publisher.publish(scan(number))
         took_s.append(time.monotonic() - begin)
         assert other.recv(SOON_S).stamp_ns == number
-        take()
+        kept += filter(None, [take(hoarder, 0.005)])
     assert sorted(took_s)[80] < 0.05  # the last 60 of them are those that it could wait for
-    counters = hoarder.counters
-    wait_for(lambda: take() or counters.received + counters.lost + counters.overtaken == 100)
-    assert [message.stamp_ns for message in kept] == sorted({message.stamp_ns for message in kept})
+    wait_for(lambda: kept.extend(take_all(hoarder)) or accounted(hoarder.counters) == 100)
+    assert [message.stamp_ns for message in kept] == list(range(100))
     assert all((message.ranges == message.stamp_ns).all() for message in kept)
-    assert (other.counters.received, other.counters.lost) == (100, 0)
-    assert counters.received == 100
+    assert (other.counters.received, other.counters.lost, hoarder.counters.received) == (100, 0, 100)
     assert 1 <= sum(map(is_shared, kept)) <= 32
     kept.clear()
     publisher.publish(scan(100))
-    message = hoarder.recv(SOON_S)
-    assert is_shared(message)
+    assert is_shared(hoarder.recv(SOON_S))
 
 
-def test_a_reader_that_keeps_all_there_is_holds_up_its_publisher(node, monkeypatch):
+def test_a_reader_that_keeps_all_there_is_holds_up_its_publisher(node):
     """A reliable one, that may copy nothing more: what is lost is counted at both ends, and it goes on."""
     publisher, subscriber = connected(node, Scan, reliable(2, 0.01))
     kept = []
     for number in range(60):
         delivered = publisher.publish(scan(number, 4_000_000))
-        if (message := _try(subscriber)) is not None:
-            kept.append(message)
+        kept += filter(None, [take(subscriber, 0.005)])
     assert not delivered
     assert sum(not is_shared(message) for message in kept) * 16_000_000 <= 64 << 20
     assert all((message.ranges == message.stamp_ns).all() for message in kept)
     kept.clear()
-    message = None
 
     def arrives():
         publisher.publish(scan(99, 10))
-        return (message := _try(subscriber)) is not None and message.stamp_ns == 99
+        return 99 in [message.stamp_ns for message in take_all(subscriber)]
 
     wait_for(arrives)
-    while _try(subscriber) is not None:
-        pass
-    counters = subscriber.counters
-    wait_for(lambda: counters.received + counters.lost == publisher.counters.published)
+    wait_for(lambda: take_all(subscriber) or accounted(subscriber.counters) == publisher.counters.published)
 
 
 @pytest.mark.parametrize("count", [3, 70])
@@ -183,13 +169,13 @@ def test_many_readers(node, count):
 
 
 @pytest.mark.parametrize("policy", [reliable(64, 60.0), keep_last(64)], ids=str)
-@pytest.mark.parametrize("waiting", [1, 11])
+@pytest.mark.parametrize("waiting", [1, 3])
 def test_messages_that_grow_and_shrink(node, policy, waiting):
     """Also while some wait: what lies in an older ring is still delivered."""
     publisher, subscriber = connected(node, Scan, policy)
     sizes = [5_000, 10, 20_000, 80_000, 320_000, 640_000, 5_000, 1_000_000, 10, 4_200, 1_000_001]
     kept = []
-    for begin in range(0, 22, waiting):
+    for begin in range(0, 24, waiting):
         sent = [scan(number, sizes[number % 11]) for number in range(begin, begin + waiting)]
         assert all(map(publisher.publish, sent))
         for expected in sent:
@@ -206,21 +192,19 @@ def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
     size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
     publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
-    ring, count, results = publisher._fanout.ring._ring, 0, []
+    ring, count = publisher._fanout.ring._ring, 0
     while ring.patience(64) < 0:  # less than a frame that names a slot would find
         publisher.publish(scan(1, 3_000 if ring.patience(13_000) < 0 else 1))
         count += 1
     slots = ring.slots
-    thread = threading.Thread(target=lambda: results.append(publisher.publish(scan(2, size))))
-    thread.start()
-    wait_for(lambda: publisher._back_pressure.is_waiting)
-    other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
-    assert other.wait_for_publisher(timeout_s=SOON_S)
-    for _ in range(count):
-        assert subscriber.recv(SOON_S).stamp_ns == 1
-    assert subscriber.recv(SOON_S) == scan(2, size)
-    thread.join(SOON_S)
-    assert results == [True]
+    with Beside(publisher.publish, scan(2, size)) as waiting:
+        wait_for(lambda: publisher._back_pressure.is_waiting)
+        other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
+        assert other.wait_for_publisher(timeout_s=SOON_S)
+        for _ in range(count):
+            assert subscriber.recv(SOON_S).stamp_ns == 1
+        assert subscriber.recv(SOON_S) == scan(2, size)
+    assert waiting.results == [True]
     assert publisher.publish(scan(3, size))
     assert other.recv(SOON_S) in (scan(2, size), scan(3, size))
     assert ring.slots > slots
@@ -253,19 +237,11 @@ def test_memory_stays_flat(node):
 def test_a_reader_without_shared_memory(node, monkeypatch):
     """It gets the same bytes; one that can share goes on sharing."""
     publisher, sharing = connected(node, Scan, reliable(8, 60.0))
-    publisher.publish(scan(0))
-    assert is_shared(sharing.recv(SOON_S))
-
     with monkeypatch.context() as patch:
         patch.setattr(cortex.link, "native", None)
         plain = node.subscriber("/large", Scan, policy=reliable(8, 60.0))
         assert publisher.wait_for_subscribers(2, SOON_S)
         assert plain.wait_for_publisher(SOON_S)
-        wait_for(lambda: publisher.publish(scan(1)) and _try(plain))
-    publisher.publish(scan(-1))
-    for subscriber in (sharing, plain):
-        while subscriber.recv(SOON_S).stamp_ns != -1:
-            pass
     for number, size in enumerate((10, LARGE, 5_000, 10, 300_000)):
         publisher.publish(scan(number, size))
         first, second = sharing.recv(SOON_S), plain.recv(SOON_S)
@@ -273,13 +249,6 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
         assert is_shared(first) == (size > 4096)
         assert not second.ranges.flags.writeable
     assert plain.counters.rejected == 0
-
-
-def _try(subscriber):
-    try:
-        return subscriber.recv(0.005)
-    except TimeoutError:
-        return None
 
 
 def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
@@ -340,13 +309,13 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     for _ in range(60):
         publisher.publish(message)
     assert sum(publisher._fanout.large.waiting_bytes.values()) <= 80 << 20
-    counters = subscriber.counters
 
     def has_caught_up():
         publisher.publish(scan(1, 10))
-        return any(scan.stamp_ns == 1 for scan in iter(lambda: _try(subscriber), None))
+        return 1 in [message.stamp_ns for message in take_all(subscriber)]
 
     wait_for(has_caught_up)
+    counters = subscriber.counters
     assert counters.received > 1
     assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
@@ -355,11 +324,13 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
     """Not each large message, nor with each new reader; it goes on when it reads, and counts what it lost."""
     monkeypatch.setattr(cortex.link, "native", None)
     publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
-    waits = []
-    wait = publisher._back_pressure.wait_for
-    monkeypatch.setattr(
-        publisher._back_pressure, "wait_for", lambda *arguments: waits.append(wait(*arguments)) or waits[-1]
-    )
+    waits, wait_for_room = [], publisher._back_pressure.wait_for
+
+    def wait(*arguments):
+        waits.append(wait_for_room(*arguments))
+        return waits[-1]
+
+    monkeypatch.setattr(publisher._back_pressure, "wait_for", wait)
     with monkeypatch.context() as still:
         still.setattr(subscriber, "top_up", lambda now_ns: None)
         delivered = [publisher.publish(scan(number, 250_000)) for number in range(25)]
@@ -371,17 +342,16 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
     received = []
 
     def goes_on():
-        if publisher.publish(scan(len(delivered), 250_000)):
-            return True
-        delivered.append(False)
-        received.extend(scan.stamp_ns for scan in iter(lambda: _try(subscriber), None))
+        delivered.append(publisher.publish(scan(len(delivered), 250_000)))
+        received.extend(message.stamp_ns for message in take_all(subscriber))
+        return delivered[-1]
 
     wait_for(goes_on)
-    last = len(delivered)
-    while not received or received[-1] < last:
-        received.append(subscriber.recv(SOON_S).stamp_ns)
+    wait_for(
+        lambda: received.extend(m.stamp_ns for m in take_all(subscriber)) or len(delivered) - 1 in received
+    )
     assert received == sorted(set(received))
-    assert len(received) + subscriber.counters.lost == last + 1
+    assert accounted(subscriber.counters) == len(delivered)
 
 
 def fill_slots(publisher):
@@ -456,11 +426,7 @@ def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, m
         poor.setattr(publisher._fanout.ring, "acquire", refuse)
         with pytest.raises(MemoryError):
             publisher.publish(scan(0))
-    sent = []
-    thread = threading.Thread(target=lambda: sent.append(publisher.publish(scan(1))), daemon=True)
-    thread.start()
-    thread.join(SOON_S)
-    assert sent == [True]
+    assert Beside(publisher.publish, scan(1)).join() == [True]
     assert subscriber.recv(SOON_S).stamp_ns == 1
     assert subscriber.counters.lost == 0
 
@@ -616,26 +582,14 @@ def test_publishers_in_several_threads(node):
     """Messages copied with and without the lock, small ones between them: each arrives once, in order."""
     publisher, subscriber = connected(node, Block, reliable(64, 60.0))
     sizes, count, threads = (10, 40_000, 200_000, 600_000), 40, 4
-    made = [
-        [make_block(1000 * k + number, sizes[(number + k) % 4]) for number in range(count)]
-        for k in range(threads)
-    ]
-    refused = []
-
-    def publish(k):
-        refused.extend(block.number for block in made[k] if not publisher.publish(block))
-
-    workers = [threading.Thread(target=publish, args=(k,)) for k in range(threads)]
-    for worker in workers:
-        worker.start()
+    made = [[make_block(1000 * k + n, sizes[(n + k) % 4]) for n in range(count)] for k in range(threads)]
+    workers = [Beside(lambda blocks: all(map(publisher.publish, blocks)), blocks) for blocks in made]
     seen = []
     for _ in range(count * threads):
         block = subscriber.recv(SOON_S)
         assert is_whole(block)
         seen.append(block.number)
-    for worker in workers:
-        worker.join(SOON_S)
-    assert not refused
+    assert all(worker.join() == [True] for worker in workers)
     for k in range(threads):
         assert [number % 1000 for number in seen if number // 1000 == k] == list(range(count))
     assert (subscriber.counters.received, subscriber.counters.lost) == (count * threads, 0)
@@ -644,23 +598,17 @@ def test_publishers_in_several_threads(node):
 
 def test_closing_while_others_publish(node):
     """The memory stays as long as somebody copies into it."""
+    message = scan(1, 1_000_000)
+
+    def publish(publisher):
+        with contextlib.suppress(Closed):
+            while True:
+                publisher.publish(message)
+
     for _ in range(10):
         publisher, subscriber = connected(node, Scan, keep_last(4))
-        message = scan(1, 1_000_000)
-        ended = []
-
-        def publish(publisher=publisher, message=message, ended=ended):
-            try:
-                while True:
-                    publisher.publish(message)
-            except Closed:
-                ended.append(True)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        subscriber.recv(SOON_S)
-        time.sleep(0.003)
-        publisher.close(linger_s=0.0)
-        thread.join(SOON_S)
-        assert ended
+        with Beside(publish, publisher):
+            subscriber.recv(SOON_S)
+            time.sleep(0.003)
+            publisher.close(linger_s=0.0)
         subscriber.close()

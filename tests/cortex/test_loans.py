@@ -6,13 +6,12 @@ import dataclasses
 import gc
 import os
 import signal
-import threading
 import warnings
 
 import numpy as np
 import pytest
 from peer import Scan, make_block
-from processes import SOON_S, wait_for
+from processes import SOON_S, Beside, wait_for
 from test_large import connected, scan, slots_held
 
 from cortex import Loan, Publisher, keep_last, reliable
@@ -90,20 +89,15 @@ def test_the_garbage_collector_comes_at_the_worst_moment(node):
     fill(second.__enter__(), 1)
     cycle: list[object] = [first, second]
     cycle.append(cycle)
-    done = threading.Event()
 
-    def collect() -> None:
+    def collect() -> list[str]:
         with publisher._large_lock, publisher._lock, warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             gc.collect()
-        heard.extend(str(each.message) for each in said if each.category is ResourceWarning)
-        done.set()
+        return [str(each.message) for each in said if each.category is ResourceWarning]
 
-    heard: list[str] = []
     del first, second, cycle
-    threading.Thread(target=collect, daemon=True).start()
-    assert done.wait(SOON_S)
-    assert heard == [FORGOTTEN]  # of the first: the block of the other was left by an exception
+    assert Beside(collect).join() == [[FORGOTTEN]]  # the block of the second was left by an exception
     loans = borrow_all(publisher)
     assert len(loans) == count
     drop_all(loans)
@@ -113,15 +107,7 @@ def test_a_forgotten_loan_does_not_hold_up_the_end(node):
     publisher, _ = connected(node, Scan, keep_last())
     with pytest.warns(ResourceWarning, match=FORGOTTEN):
         forget(publisher)
-    end_in_time(publisher)
-
-
-def end_in_time(publisher: Publisher[Scan]) -> None:
-    """Close a publisher that has all the time in the world for what is on its way."""
-    thread = threading.Thread(target=publisher.close, kwargs={"linger_s": 100.0 * SOON_S}, daemon=True)
-    thread.start()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    Beside(publisher.close, linger_s=100.0 * SOON_S).join()  # it waits for nothing
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node

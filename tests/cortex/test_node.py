@@ -9,14 +9,13 @@ import logging
 import os
 import subprocess
 import sys
-import threading
 import time
 import weakref
 
 import pytest
 import zmq
 from peer import Number, OtherNumber, Scan, connect
-from processes import ROOT, SOON_S, wait_for
+from processes import ROOT, SOON_S, Beside, wait_for
 
 from cortex import latest, reliable
 from cortex.context import new_socket
@@ -183,13 +182,10 @@ def close_in(order, make_node):
             while True:
                 publisher.publish(Number(0, 0))
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    for index in order:
-        things[index].close()
-    subscriber.close()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    with Beside(publish):
+        for index in order:
+            things[index].close()
+        subscriber.close()
 
 
 def test_what_is_closed_is_forgotten(make_node):
@@ -315,7 +311,7 @@ def publish():
         publisher.publish(Number(0, 0))
 thread = threading.Thread(target=publish)
 thread.start()
-for _ in range(20):
+for _ in range(8):
     pid = os.fork()
     if not pid:
         node.close()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-import threading
 import time
 from types import SimpleNamespace
 
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, Scan, connect
-from processes import SOON_S, wait_for
+from processes import SOON_S, Beside, wait_for
 
 from cortex import keep_last, message, reliable
 from cortex.pub_socket import PubSockets
@@ -107,20 +105,11 @@ def test_what_was_published_may_be_changed(node, size):
 def test_small_and_large_messages_keep_their_order(node):
     publisher, subscriber = connect(node, "/scans", Scan, reliable(8, 60.0))
     sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
-    received = []
-
-    def take():
-        while len(received) < 240:
-            message, info = subscriber.recv_with_info(SOON_S)
-            assert (message.ranges == np.float32(message.stamp_ns)).all()
-            received.append((message.stamp_ns, info.sequence, len(message.ranges)))
-
-    thread = threading.Thread(target=take)
-    thread.start()
-    for number, size in zip(range(240), itertools.cycle(sizes), strict=False):
-        assert publisher.publish(scan(number, size))
-    thread.join(SOON_S)
-    assert received == [(k, k, sizes[k % len(sizes)]) for k in range(240)]
+    with Beside(lambda: [subscriber.recv_with_info(SOON_S) for _ in range(240)]) as reading:
+        for number in range(240):
+            assert publisher.publish(scan(number, sizes[number % 12]))
+    for number, (got, info) in enumerate(reading.results[0]):
+        assert (got, info.sequence) == (scan(number, sizes[number % 12]), number)
 
 
 # Latching
@@ -192,60 +181,39 @@ def test_use_after_close(node, options):
 def test_closing_while_another_thread_is_held_up(node):
     """It gets out with `Closed`, not when the reader's time is over."""
     publisher, _ = connect(node, "/numbers", Number, reliable(1, 4 * SOON_S))
-    ended = []
 
     def publish():
-        try:
-            while True:
-                publisher.publish(Number(0, 0))
-        except Closed as error:
-            ended.append(str(error))
+        while True:
+            publisher.publish(Number(0, 0))
 
-    threads = [threading.Thread(target=publish) for _ in range(2)]
-    for thread in threads:
-        thread.start()
+    def ends():
+        with pytest.raises(Closed, match="the publisher of /numbers is closed"):
+            publish()
+        return True
+
+    threads = [Beside(ends), Beside(ends)]
     published = -1
     while published != (published := publisher._fast_send.sequence) or published < 100:
         time.sleep(0.05)
     publisher.close()
-    for thread in threads:
-        thread.join(SOON_S)
-    assert ended == ["the publisher of /numbers is closed"] * 2
+    assert [thread.join() for thread in threads] == [[True], [True]]
 
 
 def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     publisher, subscriber = connect(node, "/numbers", Number, reliable(1, 4 * SOON_S), max_wait_s=4 * SOON_S)
-    done = threading.Event()
-
-    def publish():
-        for value in range(40_000):
-            assert publisher.publish(Number(0, value))
-        done.set()
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    assert not done.wait(0.1)
-    subscriber.close()
-    assert done.wait(SOON_S)
-    thread.join()
+    with Beside(lambda: all(publisher.publish(Number(0, value)) for value in range(40_000))) as publishing:
+        publishing.thread.join(0.1)
+        assert publishing.thread.is_alive()
+        subscriber.close()
+    assert publishing.results == [True]
 
 
 def test_a_flood_of_subscriptions_holds_up_nobody():
     """A peer sends more of them than can be read."""
-
-    class Flood:
-        def get(self, option):
-            return zmq.POLLIN
-
-        def recv(self, flags):
-            return b"\1" + bytes(32)
-
+    flood = SimpleNamespace(get=lambda option: zmq.POLLIN, recv=lambda flags: b"\1" + bytes(32))
     pub_sockets = PubSockets()
-    pub_sockets.add(SimpleNamespace(socket=Flood(), listener=None))
-    thread = threading.Thread(target=pub_sockets.tick, daemon=True)
-    thread.start()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    pub_sockets.add(SimpleNamespace(socket=flood, listener=None))
+    Beside(pub_sockets.tick).join()
 
 
 def test_a_log_that_travels_over_cortex(node):

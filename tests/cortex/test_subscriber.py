@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import queue
 import signal
 import threading
 import time
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, OtherNumber, Scan, connect
-from processes import SOON_S, in_time, wait_for
+from processes import SOON_S, Beside, in_time, wait_for
 
 from cortex import keep_last, receive_lock, reliable
 from cortex.codec import codec_of
@@ -88,26 +87,15 @@ def test_a_handler_that_uses_the_subscriber_it_has_interrupted_is_told_so(number
 def test_a_message_wakes_who_waits(numbers):
     """It does not wait for the next look: a tenth of a second would be that."""
     publisher, subscriber = numbers
-    asked, answered = queue.SimpleQueue(), queue.SimpleQueue()
-
-    def receive():
-        while asked.get():
-            sent_ns = subscriber.recv(SOON_S).stamp_ns
-            answered.put(time.monotonic_ns() - sent_ns)
 
     def delay_ns():
-        asked.put(True)
-        time.sleep(2e-3)  # so that it waits, most likely
-        publisher.publish(Number(time.monotonic_ns(), 0))
-        return answered.get(timeout=SOON_S)
+        with Beside(lambda: (subscriber.recv(SOON_S).stamp_ns, time.monotonic_ns())) as receiving:
+            time.sleep(2e-3)  # so that it waits, most likely
+            publisher.publish(Number(time.monotonic_ns(), 0))
+        ((sent_ns, received_ns),) = receiving.results
+        return received_ns - sent_ns
 
-    thread = threading.Thread(target=receive)
-    thread.start()
-    try:
-        wait_for(lambda: max(delay_ns() for _ in range(10)) < 0.02e9)  # the machine may be busy for a while
-    finally:
-        asked.put(False)
-        thread.join()
+    wait_for(lambda: max(delay_ns() for _ in range(10)) < 0.02e9)  # the machine may be busy for a while
 
 
 def test_what_is_known_of_a_message(node, numbers):
@@ -139,20 +127,12 @@ def test_arrays_cannot_be_written(node):
 def test_several_threads_share_a_stream(numbers):
     """Each message goes to one of them, and each ends when the stream is closed."""
     publisher, subscriber = numbers
-    taken = [[] for _ in range(4)]
-    threads = [
-        threading.Thread(target=lambda values=values: values.extend(m.value for m in subscriber))
-        for values in taken
-    ]
-    for thread in threads:
-        thread.start()
+    threads = [Beside(lambda: [message.value for message in subscriber]) for _ in range(4)]
     for value in range(2000):
         assert publisher.publish(Number(0, value))
     wait_for(lambda: subscriber.counters.received == 2000)
     subscriber.close()
-    for thread in threads:
-        thread.join(SOON_S)
-        assert not thread.is_alive()
+    taken = [values for thread in threads for values in thread.join()]
     assert sorted(itertools.chain.from_iterable(taken)) == list(range(2000))
     assert all(values == sorted(values) for values in taken)
 
@@ -264,8 +244,7 @@ def test_many_publishers_of_a_topic(node):
 @pytest.mark.parametrize("policy", [reliable(16, 60.0), keep_last(64)], ids=str)
 def test_no_publisher_starves_another(node, policy, how):
     """Two that send more than is read: both come through."""
-    streams = {0: [], 1: []}
-    done = threading.Event()
+    streams, done = {0: [], 1: []}, threading.Event()
 
     def take(message):
         streams[message.stamp_ns].append(message.value)
@@ -279,30 +258,21 @@ def test_no_publisher_starves_another(node, policy, how):
     wait_for(lambda: subscriber.wait_for_publisher(SOON_S) and subscriber.publisher_count == 2)
 
     def publish(number):
-        value = 0
-        while not done.is_set():
+        for value in itertools.takewhile(lambda _: not done.is_set(), itertools.count()):
             publishers[number].publish(Number(number, value))
-            value += 1
-            if value % 8 == 0:
+            if value % 8 == 7:
                 time.sleep(50e-6)  # else it is the threads of this process that starve each other
 
-    threads = [threading.Thread(target=publish, args=(number,)) for number in range(2)]
-    for thread in threads:
-        thread.start()
-    deadline = time.monotonic() + SOON_S
+    threads = [Beside(publish, number) for number in range(2)]
     try:
-        while not done.is_set() and time.monotonic() < deadline:
-            if how == "callback":
-                done.wait(0.01)
-            else:
-                take(subscriber.recv(SOON_S))
+        if how == "recv":
+            wait_for(lambda: take(subscriber.recv(SOON_S)) or done.is_set(), every_s=0.0)
+        assert done.wait(SOON_S), {number: len(values) for number, values in streams.items()}
     finally:
-        starved = not done.is_set()
         done.set()
         subscriber.close()
         for thread in threads:
             thread.join()
-    assert not starved, {number: len(values) for number, values in streams.items()}
     assert all(values == sorted(values) for values in streams.values())
 
 
@@ -375,10 +345,9 @@ def test_a_publisher_that_left_is_let_go_while_another_waits_for_room(node, monk
 
 
 @pytest.mark.parametrize("how", ["recv", "recv_async"])
-def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how):
+def test_a_deadline_holds_while_what_comes_cannot_be_read(numbers, monkeypatch, how):
     """A publisher that only sends what is malformed does not keep a control loop waiting."""
-    publisher, subscriber = node.publisher("/number", Number), node.subscriber("/number", Number)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = numbers
     publisher.publish(Number(1, 1))
     assert subscriber.recv(SOON_S) == Number(1, 1)
     (link,) = subscriber._links
@@ -390,12 +359,8 @@ def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how
         return link.message_head + b"\xff" * 48
 
     monkeypatch.setattr(link, "receive", malformed)
-
-    async def receive() -> None:
-        await subscriber.recv_async(0.1)
-
     with pytest.raises(TimeoutError):
-        subscriber.recv(0.1) if how == "recv" else asyncio.run(receive())
+        subscriber.recv(0.1) if how == "recv" else asyncio.run(subscriber.recv_async(0.1))
     assert time.monotonic() < end_s
     assert subscriber.counters.rejected > 0
 
@@ -416,37 +381,31 @@ def test_callbacks_are_called_in_order(node):
 
 def test_no_callback_after_close(node):
     """When `close` has returned, nothing more is called, and nothing is under way."""
-    state = {"running": False, "closed": False, "late": 0}
-    started = threading.Event()
+    running, late, closed, started = [], [], threading.Event(), threading.Event()
 
     def slow(message):
-        state["late"] += state["closed"]
-        state["running"] = True
+        late.extend([message] if closed.is_set() else [])
+        running.append(message)
         started.set()
-        deadline = time.monotonic() + 0.02
-        while time.monotonic() < deadline:
-            time.sleep(1e-3)
-        state["running"] = False
+        time.sleep(0.02)
+        running.clear()
 
     publisher, subscriber = connect(node, "/numbers", Number, callback=slow)
     for value in range(30):
         publisher.publish(Number(value, value))
     assert started.wait(SOON_S)
     subscriber.close()
-    running, state["closed"] = state["running"], True
     assert not running
+    closed.set()
     done = threading.Event()
-    other = node.subscriber("/numbers", Number, lambda message: done.set())
-    assert publisher.wait_for_subscribers(1, SOON_S)
+    node.subscriber("/numbers", Number, lambda message: done.set())
     wait_for(lambda: publisher.publish(Number(0, 0)) and done.wait(0.01))
-    assert state["late"] == 0
-    other.close()
+    assert not late
 
 
 def test_a_callback_closes_its_subscriber(node):
     """It is called no more, although messages were there already."""
-    received = []
-    subscribers = []
+    received, subscribers = [], []
 
     def once(message):
         received.append(message.value)
@@ -454,11 +413,9 @@ def test_a_callback_closes_its_subscriber(node):
 
     publisher = node.publisher("/numbers", Number)
     blocker, free = threading.Event(), threading.Event()
-    node.subscriber("/block", Number, lambda message: (blocker.set(), free.wait(SOON_S)))
-    block = node.publisher("/block", Number)
+    block, _ = connect(node, "/block", Number, callback=lambda _: (blocker.set(), free.wait(SOON_S)))
     subscribers.append(node.subscriber("/numbers", Number, once))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    assert block.wait_for_subscribers(timeout_s=SOON_S)
     block.publish(Number(0, 0))
     assert blocker.wait(SOON_S)
     for value in range(10):
