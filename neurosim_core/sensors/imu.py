@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """Inertial measurement unit: specific force and angular rate at its mount, and their errors.
 
 Without errors the reading is the exact kinematics of the state: with r the mount in B and w the body rate,

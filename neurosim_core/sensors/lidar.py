@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """LiDAR: points along the rays of a scan, each cast at a time of its own.
 

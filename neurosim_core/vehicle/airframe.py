@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,assignment"
+# mypy: disable-error-code="attr-defined,call-overload,assignment"
 """The parameters of a multirotor: as settings, and on a device as the kernels read them."""
 
 from __future__ import annotations

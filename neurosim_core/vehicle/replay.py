@@ -173,7 +173,7 @@ def replay(
         load = _load(config, vehicle.state.rotor_speed)
         if missing_torque:
             turned = _STEP_S * calibration.missing((sample + 0.5) * _STEP_S, load)
-            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)  # type: ignore[no-untyped-call]
+            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)
     unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
     pushed, felt = np.array(forces), np.array(measured_forces)
     return Replay(
