@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block
 from processes import ROOT, SOON_S
-from test_end_of_stream import Leavers, expected, leavers
+from test_end_of_stream import expected, leavers
 from wire_vectors import message_to_plain
 
 from cortex import keep_last, reliable
@@ -74,13 +73,13 @@ def cargo(*arguments: str) -> str:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def build() -> None:
+def build():
     """Everything is built once."""
     cargo("build")
 
 
 @pytest.fixture
-def start(runtime: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+def start(runtime):
     """Starts one of the programs, with a registry for it to find, and ends it."""
     ensure_registry(0)
     started: list[subprocess.Popen[bytes]] = []
@@ -259,7 +258,7 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     assert publishing.close() == {"published": 1, "timeouts": 0}
 
 
-def test_rust_reports_what_it_has_not_heard_the_end_of(runtime: Path, leavers: Leavers):
+def test_rust_reports_what_it_has_not_heard_the_end_of(runtime, leavers):
     (runtime / "0").mkdir(mode=0o700)
     leavers.router.bind(f"ipc://{runtime}/0/registry")
     program, pipe = TARGET / "debug" / "cortex-peer", subprocess.PIPE
