@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,type-arg"
+# mypy: disable-error-code="attr-defined,type-arg"
 """How the host keeps a GPU busy: streams, graphs of launches that come again, copies that need no wait.
 
 On a CPU a launch returns when it has finished, and all of this does nothing.

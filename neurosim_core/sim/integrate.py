@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """The flight of one batch: commands in, the motion from boundary to boundary, what was sampled there out."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
-# mypy: disable-error-code="no-untyped-call"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type"
 """Where vehicles begin, and the kernels that put them there and take masks and rows of any type."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
