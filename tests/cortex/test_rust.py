@@ -134,7 +134,7 @@ class Publishing:
 
 
 class Reading:
-    """A `cortex-peer sub` that ends by itself, and whose output is read meanwhile: it must not wait for us."""
+    """A `cortex-peer sub` that ends by itself, and whose output is read meanwhile: it must never wait."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._results: list[tuple[list[Any], list[str]]] = []
