@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import itertools
 import json
 import os
 import time
@@ -102,11 +103,9 @@ def test_other_tools_can_read_the_file(node, tmp_path):
             publisher.publish(Number(i, i))
         wait_for(lambda: recorder.stats.written == 1000)
     with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        seen = [(schema, channel, message) for schema, channel, message in reader.iter_messages()]
+        seen = list(make_reader(file, validate_crcs=True).iter_messages())
     assert [message.sequence for _, _, message in seen] == list(range(1000))
     schema, channel, _ = seen[0]
-    assert schema is not None
     assert Schema.from_json(schema.data.decode()) == schema_of(Number)
     assert (channel.message_encoding, schema.encoding) == ("cortex", "cortex-json")
     assert channel.metadata["fingerprint"] == f"{schema_of(Number).fingerprint:016x}"
@@ -134,29 +133,28 @@ def test_a_busy_topic_is_recorded_without_loss(node, tmp_path, compression):
 def test_all_topics_are_recorded_also_those_that_come_later(make_node, tmp_path):
     path = tmp_path / "run.mcap"
     robot, logger = make_node("robot"), make_node("logger")
-    first = robot.publisher("/first", Number)
+
+    def publish(node, topic, message):
+        publisher = node.publisher(topic, type(message))
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        publisher.publish(message)
+        return publisher
+
+    robot.publisher("/first", Number)
     with Recorder(logger, path) as recorder:
-        assert first.wait_for_subscribers(timeout_s=SOON_S)
-        first.publish(Number(1, 1))
-        second = make_node("late").publisher("/second", Scan)
-        assert second.wait_for_subscribers(timeout_s=SOON_S)
-        second.publish(Scan(2, np.ones(3, np.float32)))
-        first.close()
-        again = robot.publisher("/first", Number)  # has another number, and counts from 0 again
-        assert again.wait_for_subscribers(timeout_s=SOON_S)
-        again.publish(Number(3, 3))
-        other = robot.publisher("/first", OtherNumber)
-        assert other.wait_for_subscribers(timeout_s=SOON_S)
-        other.publish(OtherNumber(4, 0.5))
+        publish(robot, "/first", Number(1, 1)).close()
+        publish(make_node("late"), "/second", Scan(2, np.ones(3, np.float32)))
+        publish(robot, "/first", Number(3, 3))  # has another number, and counts from 0 again
+        publish(robot, "/first", OtherNumber(4, 0.5))
         wait_for(lambda: recorder.stats.written == 4)
     with open_log(path) as log:
         found = {
-            (t.topic, t.schema.name, t.schema.fingerprint): (t.message_count, t.nodes) for t in log.topics
+            (t.topic, t.schema.fingerprint): (t.schema.name, t.message_count, t.nodes) for t in log.topics
         }
         assert found == {
-            ("/first", "Number", schema_of(Number).fingerprint): (2, ("robot",)),
-            ("/first", "Number", schema_of(OtherNumber).fingerprint): (1, ("robot",)),
-            ("/second", "Scan", schema_of(Scan).fingerprint): (1, ("late",)),
+            ("/first", schema_of(Number).fingerprint): ("Number", 2, ("robot",)),
+            ("/first", schema_of(OtherNumber).fingerprint): ("Number", 1, ("robot",)),
+            ("/second", schema_of(Scan).fingerprint): ("Scan", 1, ("late",)),
         }
         infos = [info for info, _, _ in log.raw(["/first"])]
         assert [info.sequence for info in infos] == [0, 0, 0]
@@ -185,24 +183,21 @@ def test_best_effort_counts_what_it_loses(node, tmp_path):
     """Everything that was published is either in the file or counted."""
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
+    sent = itertools.count()
     with Recorder(node, path, ["/number"], policy=keep_last(4)) as recorder:
         assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        for i in range(30_000):
-            publisher.publish(Number(i, i))
-        published = 30_000
+        for _ in range(30_000):
+            publisher.publish(Number(0, next(sent)))
 
         def is_complete() -> bool:
-            nonlocal published
-            stats = recorder.stats
-            if stats.written + stats.lost == published:
+            if recorder.stats.written + recorder.stats.lost == publisher.counters.published:
                 return True
-            publisher.publish(Number(published, published))  # shows the gap before it
-            published += 1
+            publisher.publish(Number(0, next(sent)))  # shows the gap before it
             return False
 
         wait_for(is_complete, every_s=0.05)
     with open_log(path) as log:
-        values = numbers(log)
+        values, published = numbers(log), publisher.counters.published
         assert values == sorted(set(values))
         assert values[-1] == published - 1
         ended = json.loads(log.end["/number"])
@@ -325,9 +320,8 @@ def test_a_file_can_be_cut_anywhere(sample, tmp_path):
 
 def test_a_damaged_summary_is_passed_over(sample, tmp_path):
     """The messages are still whole; the file is walked through to find them."""
-    data = bytearray(sample.read_bytes())
+    data, path = bytearray(sample.read_bytes()), tmp_path / "damaged.mcap"
     data[-100] ^= 1
-    path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     with open_log(path) as log:
         assert log.cut == "its summary is missing or damaged"
@@ -450,7 +444,7 @@ def test_a_message_that_cannot_be_written_leaves_no_trace(tmp_path):
     with LogWriter(path) as log:
         for topic in ("/numbers", "/others"):
             with pytest.raises(TypeError, match=r"Number\.value"):
-                log.write(topic, Number(0, "one"), 5)  # type: ignore[arg-type]
+                log.write(topic, Number(0, "one"), 5)
         log.write("/numbers", Number(0, 1), 10**18)
     with open_log(path) as read:
         assert [each.topic for each in read.topics] == ["/numbers"]
