@@ -57,12 +57,7 @@ def attitude_reference(
     z. Where the thrust points below the horizon, (y, -y) both satisfy the heading and the one nearer to the
     body's is taken, so that a flip about any axis is continuous.
 
-    Args:
-        thrust: Thrust per mass in W (acceleration minus gravity) [m/s^2].
-        thrust_rate: Its time derivative (jerk) [m/s^3].
-        thrust_acceleration: Its second time derivative (snap) [m/s^4].
-        heading: Yaw and its derivatives.
-        orientation: Present q_WB; used in degenerate cases only.
+    Thrust is per mass, in W (acceleration minus gravity) [m/s^2], with its time derivatives.
     """
     magnitude = wp.length(thrust)
     y_B = wp.quat_rotate(orientation, wp.vec3d(_ZERO, wp.float64(1.0), _ZERO))

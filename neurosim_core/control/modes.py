@@ -185,10 +185,7 @@ MODES: dict[str, Mode] = {
 def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
     """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time.
 
-    Args:
-        mode: Name of the mode.
-        terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only
-            applies the limits.
+    It compensates the given `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only applies the limits.
 
     Raises:
         ValueError: There is no such mode.

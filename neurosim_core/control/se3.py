@@ -113,13 +113,7 @@ class Se3Parameters:
 def make_parameters(
     vehicle: MultirotorConfig, config: Se3Config, matrix: NDArray[np.float64]
 ) -> Se3Parameters:
-    """Return what kernels need to know of a vehicle and its gains.
-
-    Args:
-        vehicle: The vehicle.
-        config: Gains and limits.
-        matrix: See `allocation_matrix`.
-    """
+    """Return what kernels need to know of a vehicle, its gains and its `allocation_matrix`."""
     parameters = Se3Parameters()
     parameters.mass_kg = vehicle.mass_kg
     parameters.gravity_m_s2 = vehicle.gravity_m_s2
@@ -241,16 +235,10 @@ def rate_wrench(
     body_rate: wp.vec3d,
     angular_acceleration: wp.vec3d,
 ) -> Wrench:
-    """Return the wrench that closes on a body rate; the lowest level, used by all above.
+    """Return the wrench that closes on a body rate [rad/s]; the lowest level, used by all above.
 
-    The rate error then obeys e' + rate_gain e = 0.
-
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        thrust_N: Collective thrust [N].
-        body_rate: Rate to close on, in B [rad/s].
-        angular_acceleration: Angular acceleration to have at no rate error, in B [rad/s^2].
+    The rate error then obeys e' + rate_gain e = 0; without one the angular acceleration is that given
+    [rad/s^2].
     """
     w = state.body_rate
     wrench = Wrench()
@@ -267,14 +255,7 @@ def rate_wrench(
 def attitude_wrench(
     parameters: Se3Parameters, state: VehicleState, thrust_N: wp.float64, reference: AttitudeReference
 ) -> Wrench:
-    """Return the wrench that closes on a moving attitude.
-
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        thrust_N: Collective thrust [N].
-        reference: Attitude, rate and angular acceleration of the desired frame D.
-    """
+    """Return the wrench of a thrust [N] that closes on a moving attitude."""
     q_DB = wp.quat_inverse(reference.orientation) * state.orientation
     sign = _TWO
     if q_DB[3] < _ZERO:
@@ -298,13 +279,7 @@ def thrust_wrench(
 ) -> Wrench:
     """Return the wrench that turns the rotors' thrust to where it gives an acceleration, and gives it.
 
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        acceleration: Acceleration to have, in W [m/s^2].
-        jerk: Its time derivative [m/s^3].
-        snap: Its second time derivative [m/s^4].
-        heading: Where to look.
+    Acceleration, jerk and snap are in W [m/s^2, m/s^3, m/s^4].
     """
     thrust = reachable_thrust(
         acceleration - state.air_acceleration + wp.vec3d(_ZERO, _ZERO, parameters.gravity_m_s2),

@@ -48,11 +48,7 @@ class LensData:
 
 
 def make_lens_data(lens: Lens, device: Any = "cpu") -> Any:
-    """Return a lens for the function that `projector` makes of its kind.
-
-    Args:
-        lens: One of the kinds of `lenses.AnyLens`.
-        device: Where a table of rays goes.
+    """Return a lens, one of `lenses.AnyLens`, for the function that `projector` makes of its kind.
 
     Raises:
         ValueError: The lens does not say where points are.

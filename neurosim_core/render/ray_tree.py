@@ -75,11 +75,7 @@ def _lay_out(
 
 
 def make_ray_tree(mesh: wp.Mesh) -> RayTree:
-    """Return the tree of a mesh as it is now; waits for the device.
-
-    Args:
-        mesh: Made with `bvh_constructor="sah"`, with at least one triangle.
-    """
+    """Return the tree of a mesh (`bvh_constructor="sah"`, not empty) as it is now; waits for the device."""
     face_count = mesh.indices.shape[0] // 3
     device, node_limit = mesh.device, 2 * face_count
     tree = RayTree()
@@ -99,11 +95,6 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
 def intersect_tree(tree: RayTree, origin: wp.vec3, ray: wp.vec3, far_m: float) -> wp.vec4:
     """Return the first hit of a ray: distance, u and v of `ray_intersection.Hit`, and the bits of the face.
 
-    Args:
-        tree: The scene.
-        origin: Origin of the ray [m].
-        ray: Direction of the ray, of unit length.
-        far_m: Beyond this distance the ray hits nothing [m]: the face is -1. A ray that is not finite hits
-            nothing.
+    Beyond `far_m` the ray, of unit length, hits nothing: the face is -1. So does one that is not finite.
     """
     ...

@@ -125,12 +125,8 @@ class TilePlace:
 def tile_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:
     """Return the Warp function that locates a tile in one instant.
 
-    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; view and worlds.
-
-    Args:
-        terms: Of the kernel.
-        images: Outputs that have image slots are written.
-        instants: Outputs that all instants have are written.
+    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; view and worlds. Outputs are
+    written that have image slots (`images`), or that all instants have (`instants`).
     """
     find_tile = tile_finder(terms)
 

@@ -191,9 +191,7 @@ class EventKeys:
     def cut(self, ends_ns: Sequence[int], end_bit: int) -> tuple[list[Any], list[int]]:
         """Sort the keys and return them as columns, and the index of the first event after each window.
 
-        Args:
-            ends_ns: Ends of the windows [ns], at least one.
-            end_bit: Beyond the highest bit that a key may have.
+        There is one end of a window at least [ns]; `end_bit` is beyond the highest bit that a key may have.
         """
         count = self.count
         if count == 0:

@@ -236,12 +236,7 @@ class Pixels:
         return len(self._bounds)
 
     def make_scan(self, frame_count: int, *, keys: wp.array[wp.int64] | None = None) -> Scan:
-        """Return buffers for stacks of at most `frame_count` frames.
-
-        Args:
-            frame_count: Most frames.
-            keys: Where its keys go if there is one chunk; None: to buffers of its own.
-        """
+        """Return buffers for stacks of at most so many frames; keys of one chunk go to `keys`, if given."""
         first_time = len(self._bounds) * _COUNTERS_ROOM
         inputs = HostInput(wp.zeros(first_time + frame_count + 2, dtype=wp.int64, device=self._device))
         chunks = []

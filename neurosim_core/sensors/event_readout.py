@@ -173,15 +173,8 @@ def _read_events(
 ) -> None:
     """Read events one by one; the time at which each will be read is known when it comes.
 
-    Args:
-        bus: Parameters and memory.
-        arrivals: Keys of `_by_nanosecond`, sorted.
-        count: How many.
-        origin_ns: Origin of the keys, since the reset [ns].
-        first_out: Where the keys of the events read go.
-        keys_out: Keys of events at the time when they are read.
-        dropped_ns_out: When lost events came, from the keys' origin [ns].
-        counters: Overwritten; see _READ and the others.
+    `arrivals` are sorted keys of `_by_nanosecond`, with their origin from the reset [ns]; what is read goes
+    to `keys_out` from `first_out` on; of lost events the time from the keys' origin is noted [ns].
     """
     free = bus.free[0]
     read = wp.int32(0)
@@ -380,14 +373,9 @@ class Readout:
     ) -> int:
         """Replace the keys of events that have happened by those of events that are read; return how many.
 
-        Args:
-            keys: Overwritten from `first` on; room for `count` + `waiting_count` keys is needed there.
-            first: Where they begin.
-            count: Events that have happened since the last call, in any order.
-            spare: Overwritten; at least `count` keys, on CUDA twice as many.
-            order: On CUDA overwritten, room like that of `spare`.
-            origin_us: Origin of the keys' time [us].
-            now_ns: All events until then have happened [ns].
+        All events until `now_ns` have happened: `count` keys from `first` on, in any order; room for
+        `waiting_count` more is needed there. `spare` and, on CUDA, `order` are overwritten; they have room
+        for `count` keys, on CUDA for twice as many.
         """
         wp.launch(
             _by_nanosecond,

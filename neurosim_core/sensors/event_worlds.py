@@ -162,12 +162,10 @@ class WorldEventCamera:
         return None if self.terms else self._thresholds
 
     def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None, *, reset_ns: int = 0) -> None:
-        """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device.
+        """Draw what stays in some pixels anew, and let later noise have other seeds; waits for the device.
 
-        Args:
-            seeds: Of all worlds.
-            worlds: Indices of those that get other seeds; None: all.
-            reset_ns: Time of the reset that follows, where it is not the origin of the world's time [ns].
+        Seeds are those of all worlds, of which `worlds` (None: all) get others; `reset_ns` is the time of the
+        reset that follows, where it is not the origin of the world's time.
         """
         if not self.terms:
             return
@@ -207,12 +205,7 @@ class WorldEventCamera:
         self._noise = noise
 
     def begin(self, mask: wp.array[wp.int32], parity: int) -> None:
-        """Let some worlds take frame 0 as their reference, and forget all events; launches only.
-
-        Args:
-            mask: Not 0: this world, shape [world].
-            parity: Which of the two states is the present one.
-        """
+        """Let worlds whose mask is not 0 take frame 0 as reference; forget all events; launches only."""
         shape = self._base.shape
         for array in (self.results.offsets, self.results.counts, self.stack.dropped, self.stack.counters):
             array.zero_()
@@ -243,13 +236,10 @@ class WorldEventCamera:
         return self._offsets_ns[offsets_ns]
 
     def find(self, clock_ns: wp.array[wp.int64], offsets_ns: tuple[int, ...], parity: int) -> None:
-        """Find the events of a step; launches only, on CUDA.
+        """Find the events of a step; launches only, on CUDA; see `WorldFrameSensor.find`.
 
-        Args:
-            clock_ns: Time of each world at the begin of the step [ns].
-            offsets_ns: From there to the last frame seen before, and to each frame [ns]; seen before on the
-                host, so that nothing is allocated.
-            parity: Which of the two states is the present one; the other is after this, if there is a frame.
+        Offsets were seen before on the host, so that nothing is allocated. The other of the two states is the
+        present one after this, if there is a frame.
         """
         frame_count = len(offsets_ns) - 1
         offsets = self.offsets(offsets_ns)

@@ -79,13 +79,7 @@ def begin_step(
     # In/out:
     stack: Stack,
 ) -> None:
-    """Set the stamps of a world, and forget the counts of the step before.
-
-    Args:
-        clock_ns: Time of each world at the begin of the step [ns].
-        offsets_ns: From there to the last frame that was seen (<= 0) and to each frame [ns].
-        stack: Its stamps, origins, counts and limits are overwritten.
-    """
+    """Set the stamps of a world (`WorldFrameSensor.find`); forget counts and limits of the step before."""
     world = wp.tid()
     origin_us = (clock_ns[world] + offsets_ns[0]) // _US
     stack.origin_us[world] = origin_us
@@ -193,23 +187,8 @@ def scan(
 ) -> None:
     """Take ideal pixels over the frames of a step; threads are [world, pixel], whole blocks to a world.
 
-    Args:
-        thresholds: ON and OFF of each world.
-        width: Pixels per row.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        first_world: World of the first threads.
-        first_pixel: Pixel of the first threads of each world.
-        end_pixel: Threads at or past it (they fill the last CUDA block) have no pixel.
-        frame_count: Frames to scan.
-        part: ALL, COUNT or AGAIN.
-        lead: Frames at the start that are known to be quiet, [world, pixel].
-        base: Log radiance of the reset, likewise.
-        last: Last sample.
-        crossed: Levels crossed upwards and downwards.
-        stack: Frames in; keys, counters or the table out.
-        last_out: `last` after the step.
-        crossed_out: `crossed` after the step.
+    Threads begin at a world and a pixel; those at or past `end_pixel` (they fill the last CUDA block) have no
+    pixel. `part` is ALL, COUNT or AGAIN; the others are those of `scan_pixel`.
     """
     index, thread = wp.tid()
     world = first_world + index

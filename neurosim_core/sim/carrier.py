@@ -173,15 +173,7 @@ class Carrier:
         device: str,
         max_step_ns: int,
     ) -> None:
-        """Bring paths to the device.
-
-        Args:
-            config: The airframe that the settings name.
-            paths: All with an attitude.
-            path_of_world: Which of them each body follows, shape [N].
-            device: Where to compute.
-            max_step_ns: What counts as a step [ns].
-        """
+        """Bring paths, all with an attitude, to the device; each body follows one, `path_of_world`."""
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)

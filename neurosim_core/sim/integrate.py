@@ -110,11 +110,8 @@ def plan_batch(
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
-    Args:
-        state: As of the end of what was launched.
-        stretch: What comes next.
-        closed_loop: Let the path controller command; otherwise the last command is held.
-        begin_ns: Where it begins [ns]; None: at the end of what was launched.
+    It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
+    controller commands; otherwise the last command is held.
     """
     number = state.launched_count
     stamps_ns = [

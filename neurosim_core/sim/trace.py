@@ -283,11 +283,8 @@ class Trace:
     def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
 
-        Args:
-            surfaces: `Surfaces`.
-            fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
-            slot: Where to write, in [0, capacity).
-            elapsed_ns: Time since the beginning of the batch [ns].
+        Vehicles that touch something are marked in `fleet`, and held if so configured; `elapsed_ns` counts
+        from the beginning of the batch.
         """
         if self._recording[0] is not fleet:
             launch = wp.launch(
@@ -317,14 +314,8 @@ class Trace:
     ) -> None:
         """Write the poses T_WC = T_WB T_BC of a camera at the first `count` of the given slots, in float32.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
-            p_WC: Positions, shape [world K]; overwritten.
-            q_WC: Orientations, shape [world K]; overwritten.
-            stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
+        Where the camera is on the body in each world is given as vec3d [m] and quatd, shape [world].
+        Positions, orientations, [world K], and times [ns], [world K, 1] or empty, are overwritten.
         """
         key = (slots.ptr, count, p_WC.ptr)
         # another list of slots may have the memory of one that is gone
@@ -376,12 +367,7 @@ class Trace:
     def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            twist: spatial_vectord, shape [world K]; overwritten.
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
+        As `camera_poses`; `twist` is of spatial_vectord, shape [world K].
         """
         world_count = self.states.shape[1]
         wp.launch(
@@ -425,14 +411,10 @@ class Trace:
 def make_surfaces(
     fields: Any, scene: Any, *, radius_m: float, ground_height_m: float | None, holds: bool
 ) -> Surfaces:
-    """Return what vehicles can touch.
+    """Return what vehicles of a radius can touch: `DistanceField` of each scene, index of that of each world.
 
-    Args:
-        fields: Distance to each scene, device array of `DistanceField`.
-        scene: Index of the scene of each world, device array of int32.
-        radius_m: Radius of the vehicle [m].
-        ground_height_m: z of the plane that it may land on [m]; None: there is none.
-        holds: A vehicle that touches something is held.
+    `ground_height_m` is z of the plane that they may land on; None: there is none. With `holds` a vehicle
+    that touches something is held.
     """
     surfaces = Surfaces()
     surfaces.fields, surfaces.scene = fields, scene
