@@ -285,20 +285,9 @@ def _read_rows(
 
 
 class Readout:
-    """The arbiter of one event camera and the events that wait for it.
+    """The arbiter of one event camera and the events that wait for it, `waiting_count` now.
 
-    Args:
-        config: Its parameters.
-        height: Rows of the sensor [px].
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        pixel_shift: Bits of a key below its column, without what is not of the place of the pixel.
-        device: Where the keys are.
-        seed: Seed of the run, for late stamps.
-        sensor: Name of the camera, likewise.
-
-    Attributes:
-        waiting_count: Events that wait now.
+    `pixel_shift`: bits of a key below its column, without what is not of the place of the pixel.
     """
 
     def __init__(
