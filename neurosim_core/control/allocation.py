@@ -23,10 +23,8 @@ _ONE = wp.constant(wp.float64(1.0))
 class Motors:
     """What all rotors of a vehicle share."""
 
-    speed_min_rad_s: wp.float64
-    """Lowest speed [rad/s]."""
-    speed_max_rad_s: wp.float64
-    """Highest speed [rad/s]."""
+    speed_min_rad_s: wp.float64  # Lowest speed [rad/s]
+    speed_max_rad_s: wp.float64  # Highest speed [rad/s]
     lead: wp.float64
     """Time constant of the motors over the one they shall seem to have; 1 commands the speed that is
     wanted."""

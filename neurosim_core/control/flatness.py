@@ -22,24 +22,18 @@ _ZERO = wp.constant(wp.float64(0.0))
 class AttitudeReference:
     """An attitude to follow, with its derivatives."""
 
-    orientation: wp.quatd
-    """q_WD of the desired body frame D, xyzw."""
-    body_rate: wp.vec3d
-    """w_WD in D [rad/s]."""
-    angular_acceleration: wp.vec3d
-    """Time derivative of `body_rate` [rad/s^2]."""
+    orientation: wp.quatd  # q_WD of the desired body frame D, xyzw
+    body_rate: wp.vec3d  # w_WD in D [rad/s]
+    angular_acceleration: wp.vec3d  # Time derivative of `body_rate` [rad/s^2]
 
 
 @wp.struct
 class Heading:
     """Yaw and its derivatives; y_D is kept orthogonal to `direction`, as in a Z-X-Y Euler sequence."""
 
-    direction: wp.vec3d
-    """b1 = (cos yaw, sin yaw, 0) in W."""
-    rate_rad_s: wp.float64
-    """Time derivative of yaw [rad/s]."""
-    acceleration_rad_s2: wp.float64
-    """Second time derivative of yaw [rad/s^2]."""
+    direction: wp.vec3d  # b1 = (cos yaw, sin yaw, 0) in W
+    rate_rad_s: wp.float64  # Time derivative of yaw [rad/s]
+    acceleration_rad_s2: wp.float64  # Second time derivative of yaw [rad/s^2]
 
 
 @wp.func

@@ -59,18 +59,12 @@ CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position
 class Feedback:
     """The arrays of a batch of vehicles that a controller reads, one element a vehicle."""
 
-    position: wp.array[wp.vec3d]
-    """p_WB [m]."""
-    velocity: wp.array[wp.vec3d]
-    """v_WB in W [m/s]."""
-    orientation: wp.array[wp.quatd]
-    """q_WB, xyzw."""
-    body_rate: wp.array[wp.vec3d]
-    """w_WB in B [rad/s]."""
-    rotor_speed: wp.array2d[wp.float64]
-    """[rad/s], shape [N, R]."""
-    stamp_ns: wp.array[wp.int64]
-    """Time since the start of the episode [ns]."""
+    position: wp.array[wp.vec3d]  # p_WB [m]
+    velocity: wp.array[wp.vec3d]  # v_WB in W [m/s]
+    orientation: wp.array[wp.quatd]  # q_WB, xyzw
+    body_rate: wp.array[wp.vec3d]  # w_WB in B [rad/s]
+    rotor_speed: wp.array2d[wp.float64]  # [rad/s], shape [N, R]
+    stamp_ns: wp.array[wp.int64]  # Time since the start of the episode [ns]
 
 
 @wp.func

@@ -76,38 +76,22 @@ class Se3Config(Settings):
 class Se3Parameters:
     """Vehicle, gains and limits, as kernels take them; see `Se3Config` for the gains."""
 
-    mass_kg: wp.float64
-    """Mass [kg]."""
-    gravity_m_s2: wp.float64
-    """Gravity [m/s^2]."""
-    inertia: wp.mat33d
-    """Inertia about the centre of mass, in B [kg m^2]."""
-    thrust_max_m_s2: wp.float64
-    """Highest collective thrust over mass [m/s^2]."""
-    motors: Motors
-    """Limits of the motors."""
-    position_per_velocity_per_s: wp.float64
-    """Position gain over velocity gain [1/s]."""
-    velocity_gain_per_s: wp.float64
-    """Acceleration per velocity error [1/s]."""
-    attitude_gain: wp.vec3d
-    """About the body axes [1/s^2]."""
-    rate_gain: wp.vec3d
-    """About the body axes [1/s]."""
-    speed_max_m_s: wp.float64
-    """Highest correcting velocity [m/s]."""
-    acceleration_max_m_s2: wp.float64
-    """Highest correcting acceleration [m/s^2]."""
-    body_rate_max_rad_s: wp.float64
-    """Highest body rate asked for [rad/s]."""
-    command_thrust_max_n: wp.float64
-    """Highest collective thrust that a command may ask for [N]."""
-    command_speed_max_m_s: wp.float64
-    """Highest speed that a command may ask for [m/s]."""
-    command_rate_max_rad_s: wp.float64
-    """Highest body or yaw rate that a command may ask for [rad/s]."""
-    command_position_max_m: wp.float64
-    """Largest coordinate that a command may ask for [m]."""
+    mass_kg: wp.float64  # Mass [kg]
+    gravity_m_s2: wp.float64  # Gravity [m/s^2]
+    inertia: wp.mat33d  # Inertia about the centre of mass, in B [kg m^2]
+    thrust_max_m_s2: wp.float64  # Highest collective thrust over mass [m/s^2]
+    motors: Motors  # Limits of the motors
+    position_per_velocity_per_s: wp.float64  # Position gain over velocity gain [1/s]
+    velocity_gain_per_s: wp.float64  # Acceleration per velocity error [1/s]
+    attitude_gain: wp.vec3d  # About the body axes [1/s^2]
+    rate_gain: wp.vec3d  # About the body axes [1/s]
+    speed_max_m_s: wp.float64  # Highest correcting velocity [m/s]
+    acceleration_max_m_s2: wp.float64  # Highest correcting acceleration [m/s^2]
+    body_rate_max_rad_s: wp.float64  # Highest body rate asked for [rad/s]
+    command_thrust_max_n: wp.float64  # Highest collective thrust that a command may ask for [N]
+    command_speed_max_m_s: wp.float64  # Highest speed that a command may ask for [m/s]
+    command_rate_max_rad_s: wp.float64  # Highest body or yaw rate that a command may ask for [rad/s]
+    command_position_max_m: wp.float64  # Largest coordinate that a command may ask for [m]
 
 
 def make_parameters(
@@ -146,14 +130,10 @@ def make_parameters(
 class VehicleState:
     """State of one vehicle."""
 
-    position: wp.vec3d
-    """p_WB [m]."""
-    velocity: wp.vec3d
-    """v_WB in W [m/s]."""
-    orientation: wp.quatd
-    """q_WB, xyzw."""
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
+    position: wp.vec3d  # p_WB [m]
+    velocity: wp.vec3d  # v_WB in W [m/s]
+    orientation: wp.quatd  # q_WB, xyzw
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
     air_acceleration: wp.vec3d
     """What the air is known to add to the acceleration, in W [m/s^2]; 0 where it is not compensated."""
     air_torque: wp.vec3d
@@ -164,10 +144,8 @@ class VehicleState:
 class Wrench:
     """What the rotors are asked for."""
 
-    thrust_N: wp.float64
-    """Collective thrust along z_B [N]."""
-    torque: wp.vec3d
-    """Torque in B [N m]."""
+    thrust_N: wp.float64  # Collective thrust along z_B [N]
+    torque: wp.vec3d  # Torque in B [N m]
 
 
 @wp.func

@@ -24,20 +24,14 @@ _SPHERE_MARGIN = 1.01
 class BodyData:
     """The arrays of bodies that the kernel reads; empty without bodies."""
 
-    mesh: wp.array[wp.uint64]
-    """Trees, each in the frame O of its body, shape [B]."""
-    first_face: wp.array[int]
-    """First face of each body in the arrays of `SceneData`, shape [B]."""
+    mesh: wp.array[wp.uint64]  # Trees, each in the frame O of its body, shape [B]
+    first_face: wp.array[int]  # First face of each body in the arrays of `SceneData`, shape [B]
     corner_normal: wp.array[wp.vec3]
     """Shading normals in O, on the front of the face, of all bodies one after another, shape [3F]."""
-    shading: wp.uint64
-    """What of the scene casts shadows on bodies; 0 if nothing does."""
-    p_OC: wp.array2d[wp.vec3]
-    """Position of the camera [m], shape [K, B]."""
-    q_OC: wp.array2d[wp.quat]
-    """Orientation of the camera, shape [K, B]."""
-    sphere_C: wp.array2d[wp.vec4]
-    """Centre and radius of a sphere around the body [m], shape [K, B]."""
+    shading: wp.uint64  # What of the scene casts shadows on bodies; 0 if nothing does
+    p_OC: wp.array2d[wp.vec3]  # Position of the camera [m], shape [K, B]
+    q_OC: wp.array2d[wp.quat]  # Orientation of the camera, shape [K, B]
+    sphere_C: wp.array2d[wp.vec4]  # Centre and radius of a sphere around the body [m], shape [K, B]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -29,8 +29,7 @@ wp.set_module_options({"enable_backward": False})
 class RayTree:
     """A tree for `intersect_tree`. A child is the index of a node or, below zero, -1 - that of a triangle."""
 
-    root: int
-    """The first child."""
+    root: int  # The first child
     nodes: wp.array[wp.vec4]
     """Four rows a node: low x, high x, low y, high y of its first child; the same of its second; low and high
     z of the first, then of the second; both children, as the bits of integers."""

@@ -167,8 +167,7 @@ class Motion:
     sway: wp.vec3d
     sway_hz: wp.float64
     sway_rad: wp.float64
-    orbit_e1: wp.vec3d
-    """Times the radius, as `orbit_e2`."""
+    orbit_e1: wp.vec3d  # Times the radius, as `orbit_e2`
     orbit_e2: wp.vec3d
     orbit_hz: wp.float64
     orbit_rad: wp.float64

@@ -57,14 +57,10 @@ class FreeSpaceConfig(Settings):
 class DistanceField:
     """Distance to the scene, on a device."""
 
-    mesh: wp.uint64
-    """Triangles of the scene (`wp.Mesh.id`)."""
-    distance: wp.array3d[wp.float32]
-    """Exact distance at voxel centres [m], shape [nx, ny, nz]."""
-    origin: wp.vec3
-    """Centre of voxel (0, 0, 0) [m]."""
-    voxel: wp.float32
-    """Spacing [m]."""
+    mesh: wp.uint64  # Triangles of the scene (`wp.Mesh.id`)
+    distance: wp.array3d[wp.float32]  # Exact distance at voxel centres [m], shape [nx, ny, nz]
+    origin: wp.vec3  # Centre of voxel (0, 0, 0) [m]
+    voxel: wp.float32  # Spacing [m]
 
 
 @wp.func

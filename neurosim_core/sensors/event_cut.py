@@ -125,8 +125,7 @@ def find_ends(
 class Event:
     """What a key says."""
 
-    time_us: wp.int64
-    """From the keys' time origin."""
+    time_us: wp.int64  # From the keys' time origin
     x: wp.uint16
     y: wp.uint16
     polarity: wp.uint8

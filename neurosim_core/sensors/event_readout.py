@@ -72,22 +72,16 @@ class _Bus:
     seed: wp.uint64
     stream: wp.uint32
     pixel_shift: wp.int32
-    free: wp.array[wp.int64]
-    """When the bus is free, shape [1]."""
+    free: wp.array[wp.int64]  # When the bus is free, shape [1]
     ready: wp.array[wp.int64]
     """With a handshake: when the event of a pixel is read, shape [pixel]; else empty."""
     # by rows only
-    place: wp.array[wp.int64]
-    """Row, column and polarity of events that wait, shape [queue_length]."""
-    following: wp.array[wp.int32]
-    """The next event of the same row, or the next free place."""
-    head: wp.array[wp.int32]
-    """First event of each row; -1: none."""
+    place: wp.array[wp.int64]  # Row, column and polarity of events that wait, shape [queue_length]
+    following: wp.array[wp.int32]  # The next event of the same row, or the next free place
+    head: wp.array[wp.int32]  # First event of each row; -1: none
     tail: wp.array[wp.int32]
-    asked: wp.array[wp.int64]
-    """When the first event of each row came."""
-    rows: wp.array[wp.int32]
-    """Rows in the order in which they are read, a ring."""
+    asked: wp.array[wp.int64]  # When the first event of each row came
+    rows: wp.array[wp.int32]  # Rows in the order in which they are read, a ring
 
 
 @wp.func

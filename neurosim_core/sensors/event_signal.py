@@ -27,8 +27,7 @@ class Signal:
     slope: wp.float64
     decay: wp.float64
     tau: wp.float64
-    last: wp.float64
-    """Value at the end."""
+    last: wp.float64  # Value at the end
 
 
 @wp.struct
@@ -36,8 +35,7 @@ class Crossing:
     """An event found in a piece, or none."""
 
     time_ns: wp.float64
-    polarity: wp.int32
-    """-1: none."""
+    polarity: wp.int32  # -1: none
     voltage: wp.float64
 
 

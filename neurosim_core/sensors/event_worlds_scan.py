@@ -49,26 +49,17 @@ _US = wp.constant(wp.int64(1000))
 class Stack:
     """What the pixels of one camera see in a step, and what comes of it. Shapes begin with [world]."""
 
-    log_radiance: wp.array3d[wp.float32]
-    """[world, frame, pixel]"""
-    stamps: wp.array2d[wp.int64]
-    """Of the state and of each frame, from the origin [ns], [world, frame + 1]."""
-    origin_us: wp.array[wp.int64]
-    """Origin of the keys' time since the reset of the world [us]."""
+    log_radiance: wp.array3d[wp.float32]  # [world, frame, pixel]
+    stamps: wp.array2d[wp.int64]  # Of the state and of each frame, from the origin [ns], [world, frame + 1]
+    origin_us: wp.array[wp.int64]  # Origin of the keys' time since the reset of the world [us]
     since_reset_ns: wp.array[wp.int64]
     """The same from the reset of the pixels on, which noise counts from [ns]."""
-    row_limit: wp.array2d[wp.int32]
-    """Rows whose events are kept, [world, frame]."""
-    overflow: wp.array[wp.int32]
-    """1: the world has more events than fit."""
-    table: wp.array3d[wp.int32]
-    """Events of the worlds that have too many, [world, frame, row]; zeros before."""
-    keys: wp.array2d[wp.int64]
-    """[world, capacity]"""
-    counters: wp.array2d[wp.int64]
-    """As in `event_scan.scan_pixel`, [world, 3]."""
-    dropped: wp.array[wp.int32]
-    """Events that were lost in the step."""
+    row_limit: wp.array2d[wp.int32]  # Rows whose events are kept, [world, frame]
+    overflow: wp.array[wp.int32]  # 1: the world has more events than fit
+    table: wp.array3d[wp.int32]  # Events of the worlds that have too many, [world, frame, row]; zeros before
+    keys: wp.array2d[wp.int64]  # [world, capacity]
+    counters: wp.array2d[wp.int64]  # As in `event_scan.scan_pixel`, [world, 3]
+    dropped: wp.array[wp.int32]  # Events that were lost in the step
 
 
 @wp.kernel

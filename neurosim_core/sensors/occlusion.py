@@ -39,10 +39,8 @@ class Surroundings:
     """What is around cameras, and the lenses through which they see it."""
 
     lenses: wp.array[LensData]
-    mesh: wp.array[wp.uint64]
-    """Of each scene."""
-    scene_instances: int
-    """How many there are before those of bodies."""
+    mesh: wp.array[wp.uint64]  # Of each scene
+    scene_instances: int  # How many there are before those of bodies
     motions: wp.array[Motion]
     body_mesh: wp.array[wp.uint64]
 

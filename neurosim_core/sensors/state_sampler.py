@@ -70,11 +70,9 @@ class Errors:
     """Errors of one group of three axes; see `ErrorConfig`."""
 
     white: wp.vec3d
-    walk: wp.vec3d
-    """Standard deviation of its step from one sample to the next."""
+    walk: wp.vec3d  # Standard deviation of its step from one sample to the next
     markov: wp.vec3d
-    decay: wp.float64
-    """Of the process from one sample to the next."""
+    decay: wp.float64  # Of the process from one sample to the next
     resolution: wp.vec3d
     stream: wp.uint32
 
@@ -140,12 +138,9 @@ class Sampling:
 
     motion: Motion
     seeds: wp.array[wp.uint64]
-    active: wp.array[wp.int32]
-    """0: the world is left alone."""
-    sample: wp.array[wp.int64]
-    """Number of the sample since the reset."""
-    memory: wp.array2d[wp.vec3d]
-    """Of errors, shape [world, groups * 2]."""
+    active: wp.array[wp.int32]  # 0: the world is left alone
+    sample: wp.array[wp.int64]  # Number of the sample since the reset
+    memory: wp.array2d[wp.vec3d]  # Of errors, shape [world, groups * 2]
 
 
 @functools.cache

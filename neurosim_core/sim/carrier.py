@@ -34,8 +34,7 @@ _SMALL_RAD2 = wp.constant(wp.float64(1.0e-2))
 class AttitudeArrays:
     """The attitudes of paths behind each other, on a device."""
 
-    knots: wp.array[wp.quatd]
-    """q_WB, shape [knot]."""
+    knots: wp.array[wp.quatd]  # q_WB, shape [knot]
     rotation_vectors: wp.array2d[wp.vec3d]
     """Coefficients in rising powers of normalised time [rad], shape [piece, 4]."""
 
@@ -45,10 +44,8 @@ class _Turn:
     """Orientation and its derivatives."""
 
     orientation: wp.quatd
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
-    acceleration: wp.vec3d
-    """dw_WB/dt in B [rad/s^2]."""
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
+    acceleration: wp.vec3d  # dw_WB/dt in B [rad/s^2]
 
 
 @wp.func

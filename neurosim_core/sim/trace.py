@@ -31,16 +31,11 @@ _LAUNCHES_MAX = 256
 class Surfaces:
     """What vehicles can touch: the scene that each world is in, and the ground."""
 
-    fields: wp.array[DistanceField]
-    """Distance to each scene, shape [scene]."""
-    scene: wp.array[int]
-    """Which of them a world is in, shape [world]."""
-    radius_m: float
-    """Radius of the vehicle [m]."""
-    ground_height_m: wp.float64
-    """z of the plane that it may land on [m]; -inf: there is none."""
-    holds: int
-    """1: a vehicle that touches something is held until its world is reset."""
+    fields: wp.array[DistanceField]  # Distance to each scene, shape [scene]
+    scene: wp.array[int]  # Which of them a world is in, shape [world]
+    radius_m: float  # Radius of the vehicle [m]
+    ground_height_m: wp.float64  # z of the plane that it may land on [m]; -inf: there is none
+    holds: int  # 1: a vehicle that touches something is held until its world is reset
 
 
 @wp.struct
@@ -57,12 +52,10 @@ class Fleet:
     status: wp.array[wp.int32]
     redone_count: wp.array[wp.int64]
     evaluation_count: wp.array[wp.int64]
-    clock_ns: wp.array[wp.int64]
-    """Time of the world at the beginning of the batch [ns]."""
+    clock_ns: wp.array[wp.int64]  # Time of the world at the beginning of the batch [ns]
     collided: wp.array[wp.int32]
     """1: the vehicle has touched something in this batch, or is held because it did."""
-    active: wp.array[wp.int32]
-    """0: the world is left alone by samplers and collisions."""
+    active: wp.array[wp.int32]  # 0: the world is left alone by samplers and collisions
 
 
 @wp.struct
@@ -74,10 +67,8 @@ class Rows:
     clearance: wp.array2d[wp.float32]
     redone: wp.array2d[wp.int64]
     stamps: wp.array2d[wp.int64]
-    history: History
-    """Of all boundaries, as far back as rays with times of their own need it."""
-    entries: wp.array2d[wp.int64]
-    """Number of the entry of each slot in `history`; empty without one."""
+    history: History  # Of all boundaries, as far back as rays with times of their own need it
+    entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
 
 @wp.kernel
