@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.control import CommandMode, Controller
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
@@ -43,7 +43,7 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
         if mode == "motor_speeds":
             array: Any = state.vehicle.arrays.rotor_speed_command
         else:
-            state.controllers[mode] = make_controller(
+            state.controllers[mode] = Controller(
                 mode,
                 model.airframe,
                 model.config.control.gains,
