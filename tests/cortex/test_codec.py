@@ -227,6 +227,7 @@ def test_a_message_of_another_type_is_refused():
     for cls, value in ((Point, Other(1.0)), (Imu, Point(1.0)), (MotorCommand, Point(1.0))):
         with pytest.raises(TypeError, match=f"got {type(value).__name__}, expected {cls.__name__}"):
             codec_of(cls).encode(value, 1000)
+    assert codec_of(Point) is codec_of(Point)
     with pytest.raises(TypeError, match="@cortex"):
         codec_of(int)
     with pytest.raises(TypeError, match="not a message type"):
