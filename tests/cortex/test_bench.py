@@ -28,9 +28,6 @@ ROOT = Path(__file__).resolve().parents[2]
 FLOATS = 10
 
 
-# What a subscriber counts.
-
-
 def fed(
     sequences: list[int], *, floats: int = FLOATS, swap: tuple[int, ...] = (), consume: bool = False
 ) -> Any:
@@ -71,9 +68,6 @@ def test_tally_sees_a_torn_payload(at):
     torn[at] = 2.0
     tally.handler()(0, torn)
     assert tally.report["corrupt"] == 1
-
-
-# Children.
 
 
 def _fails(_pipe: Any, job: str) -> None:
@@ -129,9 +123,6 @@ def test_child_that_hangs_is_killed_with_all_that_it_started():
         with pytest.raises(ChildFailed, match="deadline passed"):
             child.expect()
     wait_for(lambda: all(gone(pid) for pid in pids))
-
-
-# Judging.
 
 
 def rates(*values: float, **more: object) -> list[Report]:
@@ -207,9 +198,6 @@ def test_another_checkout_is_measured_beside_each_way_of_cortex():
     assert latency.bars[-1] == Bar("cortex", ("cortex, before",), "<=", 1.05, "rtt_p50_us")
     for case in (case.beside("/there") for case in CASES):
         assert all(bar.metric in case.metrics for bar in case.bars), case.name
-
-
-# Tables.
 
 
 def printed(function: Any, results: Any, **options: Any) -> str:

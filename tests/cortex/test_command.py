@@ -165,9 +165,6 @@ def column(output: str, name: str, line: int = -1) -> str:
     return cells[titles.index(name)]
 
 
-# Looking
-
-
 def test_where_nothing_runs_it_says_what_to_do(runtime):
     for command in ("topics", "nodes"):
         status, output, errors = cortex(command)
@@ -312,9 +309,6 @@ def test_types_are_compared(make_node, tmp_path):
     assert "there are /number" in errors
 
 
-# Watching
-
-
 def test_echo_fits_the_terminal(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything())
@@ -383,9 +377,6 @@ def rates_and_delays_are_right() -> bool:
         and float(column(bw, "bandwidth").split()[0]) == pytest.approx(1.6, rel=0.3)
         and max(delays_s) < 0.5
     )
-
-
-# Files
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -503,9 +494,6 @@ def test_wrong_use_is_told_from_failure(arguments, complaint, capsys):
     assert complaint in capsys.readouterr().err
 
 
-# Tools
-
-
 COMMANDS = "topics nodes top info echo hz bw delay record play keys doctor schema cpp bench discovery"
 
 
@@ -552,9 +540,6 @@ def test_discovery_serves_until_interrupted(runtime, make_node):
     status, _, errors = interrupt(child)
     assert status == 0
     assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
-
-
-# Text
 
 
 @pytest.mark.parametrize(

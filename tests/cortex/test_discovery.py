@@ -44,9 +44,6 @@ def long_leases(monkeypatch):
         monkeypatch.setattr(f"cortex.{name}.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
 
 
-# Seeing each other
-
-
 def test_two_nodes_see_each_other_change_and_leave(make, long_leases):
     with serving():
         one, two = make("one"), make("two")
@@ -79,9 +76,6 @@ def test_a_node_that_is_started_before_the_registry(make):
     assert not early[0].directory.connected
     with serving():
         drive(early, lambda: early[0].names == ["two"] and early[1].names == ["one"])
-
-
-# Death
 
 
 def test_a_registry_whose_files_were_removed_makes_way(make):

@@ -91,9 +91,6 @@ def registry_pid(base):
         return pid if pid in processes_with(str(base)) else None
 
 
-# SIGKILL
-
-
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(4, 60.0)], ids=str)
 def test_publishers_are_killed(make_node, start_child, runtime, tmp_path, policy):
     """Whatever it was doing: what has arrived is whole, and stays so; the next publisher is heard.
@@ -226,9 +223,6 @@ def test_registries_are_killed(make_node, start_child, runtime):
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
 
 
-# SIGSTOP
-
-
 @pytest.mark.parametrize("sizes", [[100], [150_000]], ids=["small", "large"])
 @pytest.mark.parametrize(
     "policy", [*POLICIES[:2], ["reliable", {"depth": 4, "timeout_s": 0.3}]], ids=lambda p: p[0]
@@ -282,9 +276,6 @@ def test_a_publisher_is_stopped(make_node, start_child, runtime):
         last += 1
     assert subscriber.counters.lost == 0
     child.finish()
-
-
-# Other faults
 
 
 @pytest.mark.parametrize(("limit", "shared"), [(100_000, 0), (1_000_000, 2)], ids=["a ring", "slots"])

@@ -50,9 +50,6 @@ def is_shared(message):
     return False
 
 
-# Leases
-
-
 def test_an_array_that_is_copied_past_the_caches(node):
     """In 64-byte steps, and what is left of them."""
     publisher, subscriber = connected(node, Block, reliable())
@@ -100,9 +97,6 @@ def test_views_outlive_everything(make_node, end):
     kept.clear()
     gc.collect()
     wait_for(lambda: not shared_mappings())
-
-
-# Quotas
 
 
 def test_a_reader_that_hoards_hurts_only_itself(node):
@@ -163,9 +157,6 @@ def test_many_readers(node, count):
         del messages
     assert sum(subscriber.counters.lost for subscriber in subscribers) == 0
     wait_for(lambda: slots_held(publisher) == 0)
-
-
-# Rings
 
 
 @pytest.mark.parametrize(
@@ -230,9 +221,6 @@ def test_memory_stays_flat(node):
     before = resident()
     run(12_000)
     assert resident() - before < 8 << 20  # 1 kB each would be 12 MB; one large one leaked in eight, 300 MB
-
-
-# Without shared memory
 
 
 def test_a_reader_without_shared_memory(node, monkeypatch):
@@ -430,9 +418,6 @@ def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, m
     assert Beside(publisher.publish, scan(1)).join() == [True]
     assert subscriber.recv(SOON_S).stamp_ns == 1
     assert subscriber.counters.lost == 0
-
-
-# Loans
 
 
 @pytest.mark.parametrize("size", [3, LARGE])

@@ -219,9 +219,6 @@ def test_a_publisher_that_was_killed_is_counted(make_node, tmp_path, start_child
         assert numbers(log) == list(range(10))
 
 
-# Files that were cut off or damaged
-
-
 def test_a_killed_recorder_leaves_all_but_the_last_second(start_child, tmp_path):
     path = tmp_path / "run.mcap"
 
@@ -378,9 +375,6 @@ def test_a_range_of_time_and_topics_is_read(tmp_path):
         assert numbers(log, start_s=5.0) == []
         with pytest.raises(ValueError, match="has no topic /nothing; it has /number"):
             next(log.raw(["/nothing"]))
-
-
-# Playing
 
 
 @pytest.fixture

@@ -165,9 +165,6 @@ def test_nothing_of_any_kind_is_leaked():
     assert all(abs(now - then) < 40 for then, now in zip(before, after, strict=True))  # 50 rounds would be 50
 
 
-# Through a ring
-
-
 @message
 class Frames:
     """Nothing in it is of a size known in advance."""

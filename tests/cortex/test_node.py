@@ -43,9 +43,6 @@ def run_script(code):
     return done.stdout.split()
 
 
-# Seeing each other
-
-
 def test_nodes_and_topics(make_node):
     one, two = make_node("one"), make_node("two")
     for node, topic, kind in ((one, "/scan", Scan), (one, "/number", Number), (two, "/scan", Scan)):
@@ -75,9 +72,6 @@ def test_domains_do_not_see_each_other(make_node):
     assert subscriber.publisher_count == 0
 
 
-# Counters of others
-
-
 def test_counters_of_this_and_other_nodes(make_node):
     one, two = make_node("one"), make_node("two")
     publisher = one.publisher("/numbers", Number)
@@ -97,9 +91,6 @@ def test_counters_of_this_and_other_nodes(make_node):
         assert got.latency_counts.sum() > 0
     with pytest.raises(KeyError):
         one.ask_stats(12345)
-
-
-# Junk
 
 
 def test_junk_on_the_control_socket(make_node, caplog):
@@ -138,9 +129,6 @@ def test_junk_on_the_control_socket(make_node, caplog):
     logged = [r for r in caplog.records if r.levelno >= logging.WARNING]
     assert 1 <= len(logged) <= 3
     assert "rejected a control frame" in " ".join(r.getMessage() for r in logged)
-
-
-# The end
 
 
 def test_closing_ends_everything(make_node):
@@ -243,9 +231,6 @@ print(time.time())
     wait_for(lambda: set(os.listdir(runtime_dir(0))) <= DOMAIN_FILES)
 
 
-# Forks
-
-
 def test_a_fork_disturbs_neither_side(runtime):
     """The parent's node goes on; the child ends as it likes, and may have a node of its own."""
     code = """
@@ -331,9 +316,6 @@ node.close()
 print("done")
 """
     assert run_script(code) == ["done"]
-
-
-# The clock
 
 
 def test_a_jump_of_the_clock(make_node, monkeypatch):

@@ -23,9 +23,6 @@ def connected(node, policy, **options):
     return publisher, subscriber
 
 
-# Values
-
-
 @pytest.mark.parametrize("make", [keep_last, reliable])
 def test_policies_have_bounds(make):
     for depth in (0, -1, 65_537):

@@ -23,9 +23,6 @@ def scan(number, size=3):
     return Scan(number, np.full(size, number, np.float32))
 
 
-# What is refused
-
-
 @pytest.mark.parametrize("listened", [False, True])
 def test_a_message_of_another_type_is_refused(node, listened):
     publisher = node.publisher("/numbers", Number)
@@ -87,9 +84,6 @@ def test_a_message_may_be_empty(node, inline_max):
     assert subscriber.recv(SOON_S) == Nothing()
 
 
-# Snapshots and order
-
-
 @pytest.mark.parametrize("size", [10, LARGE])
 def test_what_was_published_may_be_changed(node, size):
     publisher, subscriber = connect(node, "/scans", Scan)
@@ -112,9 +106,6 @@ def test_small_and_large_messages_keep_their_order(node):
         assert (got, info.sequence) == (scan(number, sizes[number % 12]), number)
 
 
-# Latching
-
-
 @pytest.mark.parametrize("size", [3, LARGE])
 @pytest.mark.parametrize("policy", [keep_last(4), reliable(4)], ids=str)
 def test_a_late_subscriber_gets_the_last_message(node, size, policy):
@@ -133,9 +124,6 @@ def test_a_late_subscriber_gets_the_last_message(node, size, policy):
         assert subscriber.recv(SOON_S).stamp_ns == 5 + late
         assert subscriber.counters.lost == 0
         subscriber.close()
-
-
-# Coming and going
 
 
 def test_subscribers_are_counted(node):

@@ -55,9 +55,6 @@ __all__ = ["context", "make"]
 pytestmark = pytest.mark.usefixtures("runtime")
 
 
-# The registry's process
-
-
 def test_many_processes_at_once_start_one_registry():
     code = (
         "import sys, time\nfrom cortex.registry import ensure_registry\n"
@@ -158,9 +155,6 @@ def test_a_registry_that_cannot_start_is_tried_again_but_not_in_a_loop(make, mon
     assert tried[1] - tried[0] > 0.99
     assert tried[2] - tried[1] > 1.99
     assert caplog.text.count("no process for you") == 1
-
-
-# Limits, and frames that are not what they should be
 
 
 def test_a_flood_of_nodes_is_bounded_and_told_why(make, caplog):

@@ -216,9 +216,6 @@ def test_description_shows_the_structure():
     assert "expected: unknown" in str(TypeMismatch("x", None, None))
 
 
-# Classes
-
-
 def test_a_class_from_a_schema():
     cls: Any = type_from_schema(schema_of(Scan))
     assert cls is type_from_schema(Schema.from_json(SCAN_TEXT))

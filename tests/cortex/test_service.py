@@ -57,9 +57,6 @@ def begin_call(client, value, outcomes):
     return thread
 
 
-# Replies
-
-
 def test_a_task_calls_without_blocking_the_loop(node):
     """Other tasks go on while the handler works."""
     go_on = threading.Event()
@@ -78,9 +75,6 @@ def test_a_task_calls_without_blocking_the_loop(node):
 
     with node.client("/double", Number, Number) as client:
         assert asyncio.run(run(client)).value == 42
-
-
-# Failures
 
 
 def test_a_handler_that_raises(node, caplog):
@@ -153,9 +147,6 @@ def test_a_request_has_a_limit(node, excess):
         else:
             assert client.call(Bulk(bytes(size)), timeout_s=SOON_S).value == size
         assert client.call(Bulk(b"123"), SOON_S).value == 3
-
-
-# Deadlines
 
 
 def test_a_handler_that_takes_too_long(node):
@@ -281,9 +272,6 @@ def test_too_many_requests(node):
         thread.join(SOON_S)
         client.close()
     assert sum(isinstance(outcome, int) for outcome in outcomes) == PENDING_MAX + 1
-
-
-# Servers in other processes
 
 
 def test_a_handler_that_calls_back(make_node):

@@ -28,9 +28,6 @@ def scan(number, size=LARGE):
     return Scan(number, np.full(size, number, np.float32))
 
 
-# Blocking
-
-
 def test_nothing_comes_in_time(numbers):
     _, subscriber = numbers
 
@@ -137,9 +134,6 @@ def test_several_threads_share_a_stream(numbers):
     assert all(values == sorted(values) for values in taken)
 
 
-# Raw and generic
-
-
 @pytest.mark.parametrize("size", [3, LARGE])
 def test_raw_bodies(node, size):
     """What echo and record read, bytes and schema; play publishes them as they are."""
@@ -174,9 +168,6 @@ def test_any_type_is_understood(node):
         np.testing.assert_array_equal(got.ranges, scan(3, size).ranges)
 
 
-# Another type
-
-
 def test_another_type_is_told_once_with_both_structures(node):
     """Whoever waits is told; then the messages of others come."""
     node.publisher("/numbers", OtherNumber)
@@ -201,9 +192,6 @@ def test_another_type_is_told_once_with_both_structures(node):
     assert next(messages) == Number(1, 1)
 
 
-# Iterators
-
-
 def test_use_after_close(numbers):
     _, subscriber = numbers
     subscriber.close()
@@ -219,9 +207,6 @@ def test_use_after_close(numbers):
             call()
     assert list(subscriber) == []
     assert subscriber.publisher_count == 0
-
-
-# Publishers that leave
 
 
 def test_many_publishers_of_a_topic(node):
@@ -363,9 +348,6 @@ def test_a_deadline_holds_while_what_comes_cannot_be_read(numbers, monkeypatch, 
         subscriber.recv(0.1) if how == "recv" else asyncio.run(subscriber.recv_async(0.1))
     assert time.monotonic() < end_s
     assert subscriber.counters.rejected > 0
-
-
-# Callbacks
 
 
 def test_callbacks_are_called_in_order(node):

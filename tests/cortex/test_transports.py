@@ -114,9 +114,6 @@ def test_a_latch_over_tcp(pair):
         child.ask(do="close", topic="/blocks")
 
 
-# Security
-
-
 def test_what_the_environment_says_of_other_hosts_can_be_overridden(runtime, monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     keys = new_keys(tmp_path / "keys")
@@ -188,9 +185,6 @@ def test_who_is_not_let_in(make_node, start_child, tmp_path, who, runtime):
     assert publisher.subscriber_count == 1
     assert refused.ask(do="receive", topic="/numbers", until=1, timeout_s=0.5)["count"] == 0
     assert stranger.public not in known
-
-
-# Limits of what comes in
 
 
 def disconnected(socket, action, within_s):

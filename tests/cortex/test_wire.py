@@ -48,9 +48,6 @@ headers = st.builds(
 )
 
 
-# Round trips
-
-
 @given(headers)
 def test_a_header_survives(header):
     packed = pack_header(header)
@@ -109,9 +106,6 @@ def test_an_attach_answer_survives_is_refused_or_fits_its_frame(key, answer, dat
     frame = mutate(data.draw(st.randoms()), frame)
     with contextlib.suppress(MalformedMessage):
         assert len(frame) == 64 + len(parse_answer(frame).latched)
-
-
-# Control frames
 
 
 @given(u64, u64, st.integers(0, 2**32))
