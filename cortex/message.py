@@ -218,7 +218,6 @@ _Reading = tuple[FieldType, Any, "tuple[str, str] | None"]
 
 
 def _read_hint(hint: Any, where: str) -> _Reading:
-    """Return the type, the Python class of its enum or message if it has one, and the unit."""
     origin = typing.get_origin(hint)
     if origin is Annotated:
         return _read_annotated(hint, where)
