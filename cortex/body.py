@@ -262,8 +262,7 @@ class Reader:
         """Return the message whose block begins somewhere in the buffer."""
         sizes: Sizes = {}
         return new_message(
-            cls,
-            [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields.of[cls]],
+            cls, [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields.of[cls]]
         )
 
     def _get(self, kind: FieldType, bound: Any, at: int, sizes: Sizes) -> Any:

@@ -12,16 +12,7 @@ from typing import Any
 import numpy as np
 
 from cortex.bench.peers import PATIENCE_S, PONG_FLOATS, Job, Peer, Send, peer_of
-from cortex.bench.tally import (
-    END,
-    WARM,
-    Finished,
-    Floats,
-    Handler,
-    Tally,
-    make_payloads,
-    resident_kb,
-)
+from cortex.bench.tally import END, WARM, Finished, Floats, Handler, Tally, make_payloads, resident_kb
 
 _WARM_PINGS = 20
 _WARM_S = 0.005
