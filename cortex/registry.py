@@ -244,8 +244,8 @@ class Registry:
             self._reply(route, records.Refused(record.node, reason))
             return
         # What comes on one connection is in order; what comes on another may be older than what we have.
-        is_same_route = entry is not None and entry.route == route and record.revision != entry.revision
-        if entry is None or record.revision > entry.revision or is_same_route:
+        is_next = entry is not None and entry.route == route and record.revision != entry.revision
+        if entry is None or record.revision > entry.revision or is_next:
             self._store(record, route, now_ns, entry)
         else:
             self._routes.pop(entry.route, None)  # it has connected anew
