@@ -111,8 +111,7 @@ def _show_live(
     live = not options.once and is_terminal()
     counts = _Counts(node, topic)
     while True:
-        if counts.publishers or counts.subscribers or topic is None:
-            time.sleep(_PERIOD_S)
+        time.sleep(_PERIOD_S)
         counts = _Counts(node, topic, counts)
         print((_CLEAR if live else "") + "\n".join(lines(node, counts)), flush=True)
         if options.once:
