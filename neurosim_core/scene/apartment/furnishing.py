@@ -58,7 +58,7 @@ class RoomSpace:
 
     def _inside(self, boxes: Array) -> NDArray[np.bool_]:
         x0, y0, x1, y1 = self.room.rect
-        return ((boxes[:, 0, :2] >= (x0, y0)) & (boxes[:, 1, :2] <= (x1, y1))).all(axis=1)
+        return np.asarray(((boxes[:, 0, :2] >= (x0, y0)) & (boxes[:, 1, :2] <= (x1, y1))).all(axis=1))
 
     def put(self, piece: Piece, offset: ArrayLike, yaw_rad: float = 0.0, **allowed: bool) -> bool:
         """Place a piece at a position in the world if it fits there; `_free` says what can be allowed."""
