@@ -65,7 +65,7 @@ def measure(options: Options) -> Chapter:
     said = f"{sum(within)} of {len(within)} figures"
     claims = [*claims_of(curves), Claim(text, "sources of the presets", said, all(within))]
     met = sum(claim.met is True for claim in claims)
-    noise = "Rates are means over the pixels of a still scene [Hz]; sources are in event_presets.py."
+    noise = "Rates are means over the pixels of a still scene [Hz]; sources are in event_presets.yaml."
     return Chapter(
         name="pixel",
         title="A test bench for event pixels",
@@ -292,23 +292,24 @@ def _sine_gain(
 
 def measure_noise_figures(bench: TestBench) -> list[Row]:
     """Return a row for each figure that the source of a preset has of noise, beside what the preset does."""
-    names = ("davis346", "gen3") if bench.quick else engine.PRESETS
+    figures = {name: preset["noise"] for name, preset in engine.event_presets().items() if "noise" in preset}
+    names = ("davis346", "gen3") if bench.quick else tuple(figures)
     side, seconds = bench.pick(96, 48), bench.pick(60, 20)
     rows: list[Row] = []
     for name in names:
         found: dict[float, dict[str, float]] = {}
         config = make_preset(name, readout=None)
         white_lux = config.measured_noise.white_lux if config.measured_noise else 1000.0
-        for figure in engine.PRESETS[name].noise:
-            if figure.lux not in found:
-                level = math.log(config.white_radiance * figure.lux / white_lux)
-                log = np.full((2, side, side), level)
+        for figure in figures[name]:
+            lux, quantity, given, spread = (figure[key] for key in ("lux", "quantity", "value", "spread"))
+            if lux not in found:
+                log = np.full((2, side, side), math.log(config.white_radiance * lux / white_lux))
                 events = bench.expose(config, log, [0.0, float(seconds)])
-                found[figure.lux] = _noise_statistics(events, side, seconds)
-            value = found[figure.lux][figure.quantity]
-            row: Row = {"preset": name, "light [lux]": figure.lux, "quantity": figure.quantity}
-            row |= {"preset's": value, "source's": figure.value, "its spread": figure.spread}
-            rows.append({**row, "within": abs(value - figure.value) <= figure.spread})
+                found[lux] = _noise_statistics(events, side, seconds)
+            value = found[lux][quantity]
+            row: Row = {"preset": name, "light [lux]": lux, "quantity": quantity}
+            row |= {"preset's": value, "source's": given, "its spread": spread}
+            rows.append({**row, "within": abs(value - given) <= spread})
     return rows
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from neurosim_core.scene.apartment.draws import stream
-from neurosim_core.scene.apartment.tables import read_table
+from neurosim_core.tables import read_table
 
 if TYPE_CHECKING:
     from neurosim_core.scene.apartment.apartment import ApartmentConfig
@@ -130,7 +130,7 @@ def make_floor_plan(config: ApartmentConfig) -> FloorPlan:
 
     Of many random subdivisions of a rectangle the one with the best proportions is taken.
     """
-    seed, rooms, sizes = config.seed, config.rooms, read_table("plan")
+    seed, rooms, sizes = config.seed, config.rooms, read_table(__file__, "plan")
     roles = _MANY[:rooms] if rooms > 2 else (("studio",), ("living", "bedroom"))[rooms - 1]
     best: tuple[float, list[Rect], list[Door], Rect] | None = None
     for attempt in range(400):
@@ -183,7 +183,7 @@ def _badness(cells: Sequence[Rect], roles: Sequence[Role], outline: Rect) -> flo
     badness = 0.0
     for cell, role in zip(cells, roles, strict=True):
         short, long = sorted((cell.width - WALL_M, cell.depth - WALL_M))
-        side_min_m = read_table("plan")[role]["side_min_m"]
+        side_min_m = read_table(__file__, "plan")[role]["side_min_m"]
         badness += 4.0 * max(0.0, side_min_m - short) + max(0.0, long / short - 1.6)
         badness += 0.6 * all(own != outer for own, outer in zip(cell, outline, strict=True))
     return badness
@@ -262,7 +262,7 @@ def _walls(
 
 def _windows(role: Role, length_m: float, ceiling_m: float, rng: np.random.Generator) -> list[Opening]:
     """Return windows in an outer wall, evenly spread."""
-    size = {"sill_m": 0.85, "window_m": 1.35} | read_table("plan")[role]
+    size = {"sill_m": 0.85, "window_m": 1.35} | read_table(__file__, "plan")[role]
     width = size["window_m"] + rng.uniform(-0.1, 0.15)
     count = 1 if length_m < 2.0 * width + 2.2 else 2
     if role == "bathroom" or length_m < width + 1.0:

@@ -97,18 +97,11 @@ class RoomSpace:
         prefer: Place = "anywhere",
         window: bool = False,
     ) -> tuple[Wall, float] | None:
-        """Place a piece at the best spot along the walls.
+        """Place a piece at the best spot along the walls; return the wall and the position along it, or None.
 
-        Args:
-            piece: What shall be placed.
-            draws: Breaks ties.
-            front: Floor in front of it that must be free of other bodies, and stays so but for its group [m].
-            sides: Floor on both sides that must be free [m].
-            prefer: The ends of walls, or the middle of long walls without windows.
-            window: It may hide a window.
-
-        Returns:
-            The wall and the position along it, or None when it fits nowhere.
+        In front and on both sides of it so much floor must be free of other bodies [m], and that in front
+        stays so but for its group. `prefer`: the ends of walls, or the middle of long walls without windows,
+        one of which it may hide with `window`.
         """
         (x0, y0, z0), (x1, _, z1) = piece.bounds
         deep, heights = WALL_GAP_M - y0, (z0 + _LIFT_M, z1 + _LIFT_M)

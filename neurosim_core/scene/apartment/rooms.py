@@ -13,7 +13,7 @@ from neurosim_core.scene.apartment.floorplan import Room, Wall
 from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
 from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
-from neurosim_core.scene.apartment.tables import read_table
+from neurosim_core.tables import read_table
 
 if TYPE_CHECKING:
     from neurosim_core.scene.apartment.apartment import ApartmentConfig
@@ -40,7 +40,7 @@ class Furnisher:
 
     def furnish(self) -> RoomSpace:
         """Do all steps, and return the furniture, the lamps and what space is left."""
-        for number, step in enumerate(read_table("rooms")[self._room.role]):
+        for number, step in enumerate(read_table(__file__, "rooms")[self._room.role]):
             ((method, options),) = step.items()
             self._do(f"{method} {number}", method, **options)
         self._do("windows", "_dress_windows")
@@ -78,7 +78,7 @@ class Furnisher:
         around: Sequence[dict[str, Any]] = (),
         **options: Any,
     ) -> None:
-        """Place pieces along the walls, each in the first way that fits, with what belongs to them.
+        """Place `count` pieces along the walls, each in the first way that fits, with what belongs to them.
 
         `rooms.yaml` documents the options; those that are not named here hold for all `tries`.
         """

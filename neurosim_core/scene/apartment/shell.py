@@ -27,7 +27,7 @@ _NO_DRAWS = Draws()
 def make_shell(
     plan: FloorPlan, finishes: Sequence[Finish], surfaces: Mapping[str, Surface], config: ApartmentConfig
 ) -> list[Piece]:
-    """Build every room of the plan, where it stands.
+    """Build every room of the plan, where it stands, of the surfaces that each is lined with.
 
     Ceilings are pieces `ceiling` and the top is `roof`, so that they can be left out of a picture from above;
     the walls have tops just below the roof.
