@@ -109,7 +109,7 @@ def test_it_is_not_there_or_withdrawn(node):
 
 def test_other_types(node):
     node.service("/double", Number, Number, double)
-    refused = pytest.raises(TypeMismatch, match=r"(?s)/double.*actual.*float64.*int64")
+    refused = pytest.raises(TypeMismatch, match=r"(?s)/double.*float64.*actual.*int64")
     with node.client("/double", OtherNumber, Number) as client, refused:
         client.call(OtherNumber(0, 1.0))
     with node.client("/double", Number, Scan) as client, pytest.raises(TypeMismatch):
