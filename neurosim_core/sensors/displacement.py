@@ -104,12 +104,11 @@ class DisplacementRule:
         p_BC: wp.vec3d,
         q_BC: wp.quatd,
         motions: Any = None,
-        spacing_px: int = PROBE_SPACING_PX,
     ) -> None:
         """Allocate the buffers.
 
         `rate` is the clock whose ticks are chosen from; `motions` of the bodies are a device array of
-        `scene.bodies.Motion`, by default as the scene has them; `spacing_px` is the distance between probes.
+        `scene.bodies.Motion`, by default as the scene has them.
         """
         self.coarse_count = 0
         self._limit_px = max_displacement_px
@@ -118,9 +117,9 @@ class DisplacementRule:
         self._mesh = arrays.mesh_id
         self._device = device = arrays.device
         self._on_cpu = wp.get_device(device).is_cpu
-        self._spacing_px = float(spacing_px)
-        self._columns = math.ceil(lens.width / spacing_px) + 2  # one beyond each border
-        self._probe_count = self._columns * (math.ceil(lens.height / spacing_px) + 2) + 4
+        self._spacing_px = float(PROBE_SPACING_PX)
+        self._columns = math.ceil(lens.width / PROBE_SPACING_PX) + 2  # one beyond each border
+        self._probe_count = self._columns * (math.ceil(lens.height / PROBE_SPACING_PX) + 2) + 4
         self._lens = Pinhole()
         self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens.intrinsics()
         self._lens.width, self._lens.height = lens.width, lens.height
@@ -179,8 +178,6 @@ class DisplacementRule:
         slots: Sequence[int],
         stamps_ns: Sequence[int],
         forced: Sequence[bool],
-        *,
-        vehicle: int = 0,
     ) -> list[int]:
         """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
 
@@ -191,7 +188,7 @@ class DisplacementRule:
         chosen: list[int] = []
         for begin in range(0, len(slots), self._block):
             block = slice(begin, begin + self._block)
-            self._load(states, slots[block], stamps_ns[block], vehicle)
+            self._load(states, slots[block], stamps_ns[block])
             found = [begin + tick for tick in self._choose(forced[block])]
             self._last_ns = stamps_ns[found[-1]] if found else self._last_ns
             chosen += found
@@ -221,7 +218,7 @@ class DisplacementRule:
             )
         return chosen
 
-    def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int], vehicle: int) -> None:
+    def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int]) -> None:
         """Bring the poses of a block to the device."""
         count = len(slots)
         first = self._rate.first_tick(stamps_ns[0])
@@ -235,7 +232,7 @@ class DisplacementRule:
         wp.launch(
             load_poses,
             dim=count,
-            inputs=[*self._mount, states, vehicle, self._slots, self._step_s],
+            inputs=[*self._mount, states, 0, self._slots, self._step_s],
             outputs=[self._poses],
             device=self._device,
         )
