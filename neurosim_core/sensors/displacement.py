@@ -26,10 +26,7 @@ What a ray hits of a moving body is a point of the body, and moves with it: wher
 function of time. The corners of the bounding boxes of bodies count as well, whether something hides them or
 not, if the box overlaps the picture and the corner is no further outside of it than the picture is large.
 
-It pays where a flight has slow and fast parts, as renders follow the speed. At an even speed it does not: in
-the generated apartment at 0.54 m/s, 96x72 pixels and 0.1 to 0.2 px, a fixed rate of the same error needed
-3 to 7 % fewer renders, and 14 to 18 % less CPU time. What a render costs should be more than what the choice
-costs for the ticks between two renders: on a fast GPU and a small picture a fixed rate may be cheaper.
+It pays where a flight has slow and fast parts (docs/decisions/adaptive-sampling.md).
 
 Limit: an object of the scene that no ray hits is not seen to move. It is narrower than the spacing, and it
 moves at most by f |t| / z px relative to the far background, for the translation t of the camera between two
@@ -65,9 +62,7 @@ from neurosim_core.sensors.displacement_kernels import (
 )
 
 PROBE_SPACING_PX = 16
-"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render. Flying sideways
-through the generated apartment and a furnished house at 346x260, what moved most by a grid of 3 px moved at
-most 5 % further than allowed over 480 renders; with 32 px it was 14 %, with 8 px 2 %."""
+"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render."""
 
 _BLOCK = 64
 """Ticks that are chosen from together; on CUDA all pairs of them are compared."""
