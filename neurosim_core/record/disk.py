@@ -24,11 +24,6 @@ class Disk:
         self._sealed_size = 0
         self._held: dict[tuple[int, int], bytes] = {}
 
-    @property
-    def failed(self) -> bool:
-        """Whether a write has failed."""
-        return self._error is not None
-
     def seal(self) -> None:
         """Bring what was held back to disk.
 
