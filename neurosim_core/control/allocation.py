@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,assignment"
-# mypy: disable-error-code="no-untyped-call,no-any-return"
 """Control allocation: collective thrust and torque -> rotor speeds within the motors' limits.
 
 A wrench within limits is given exactly. Of any other, a multirotor gives up in a fixed order what it can best

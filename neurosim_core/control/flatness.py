@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,assignment"
-# mypy: disable-error-code="no-untyped-call,no-any-return"
 """Differential flatness of a multirotor: thrust, yaw and their derivatives -> attitude, its rates.
 
 Reference: Mellinger, Kumar (2011), Minimum snap trajectory generation and control for quadrotors, section III

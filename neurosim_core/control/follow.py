@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """Following a path from outside of the simulation: the state of one vehicle in, a command out."""
 
 from __future__ import annotations

@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-call"
 """The base of controllers that are computed in Python on the host."""
 
 from __future__ import annotations

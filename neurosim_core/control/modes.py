@@ -1,5 +1,4 @@
-# mypy: disable-error-code="attr-defined,misc,arg-type,call-overload,index"
-# mypy: disable-error-code="no-untyped-call,no-untyped-def,untyped-decorator"
+# mypy: disable-error-code="attr-defined,misc,arg-type,call-overload,index,no-untyped-def"
 """Command modes: what a setpoint is at each level, and the controller that turns it into rotor speeds.
 
     mode          setpoint row (float64)                          closes on

@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,assignment"
-# mypy: disable-error-code="no-untyped-call,no-any-return"
 """Geometric tracking control on SE(3), one Warp function a level; each level hands a target to the one below.
 
     position -> velocity -> thrust vector -> attitude -> torque -> rotor speeds (allocation.py)

@@ -556,7 +556,7 @@ def import_h5py() -> ModuleType:
         import h5py
     except ImportError as error:
         raise ImportError(f"recordings need h5py: {install_hint('record')}") from error
-    return h5py  # type: ignore[no-any-return]
+    return h5py
 
 
 def _deflate(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:

@@ -1,6 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
-# mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc,valid-type"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,assignment,return-value"
+# mypy: disable-error-code="call-overload,empty-body,misc,valid-type"
 # ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
 """Antialiasing: a pixel is the mean of the faces that it shows, weighed by how much of it each covers.
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,no-untyped-call,assignment,arg-type"
+# mypy: disable-error-code="index,attr-defined,misc,operator,assignment,arg-type"
 """Pixels that no light reaches, such as those outside the image circle of a fisheye lens."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="assignment,empty-body,no-untyped-call,untyped-decorator,valid-type"
+# mypy: disable-error-code="assignment,empty-body,valid-type"
 """What the kernels of antialiasing on CUDA leave to each other, and how many threads they have."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structs as objects.

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="operator,arg-type"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,assignment,operator,arg-type"
 """Moving bodies as the ray caster keeps them: a tree for each in its frame, and where the camera is in it."""
 
 from __future__ import annotations

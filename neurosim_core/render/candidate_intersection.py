@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-any-return,untyped-decorator,valid-type,no-untyped-def"
+# mypy: disable-error-code="valid-type,no-untyped-def"
 """Intersection of rays with the candidate list of their tile.
 
 The test evaluates three edge functions, normalised such that their sum is one over the distance. The ray hits

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="assignment,union-attr,no-untyped-call"
+# mypy: disable-error-code="assignment,union-attr"
 """Candidate lists: one search of the tree for all rays of a tile of pixels in several instants; exact.
 
 The rays of 8 x 8 pixels in M consecutive instants lie in a narrow frustum: that of the tile, swept by the

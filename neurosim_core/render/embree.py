@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,no-untyped-def,empty-body,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def,empty-body"
 """Rays on the CPU by Embree, which casts packets of rays ten times faster than Warp casts single ones.
 
 Kernels call the shared library that the package `embreex` carries through the address of its function: no

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,assignment,empty-body"
-# mypy: disable-error-code="no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,assignment,empty-body"
 # ruff: noqa: UP018  (typed literals have a meaning in kernels)
 """Frustum search: the triangles of the tree in the frustum of a tile, swept by the motion of the camera.
 

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,no-any-return,operator,no-untyped-def"
-# mypy: disable-error-code="return-value"
+# mypy: disable-error-code="index,attr-defined,misc,operator,no-untyped-def,return-value"
 # ruff: noqa: UP018, RUF046  (typed literals are variables in kernels)
 """Light: the one equation of how a surface looks, and its shadows, computed once per scene.
 

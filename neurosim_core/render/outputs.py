@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,assignment,return-value,empty-body"
-# mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """Render outputs: their arrays, and the functions that write a pixel of them."""
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,no-untyped-def,empty-body,untyped-decorator,valid-type"
+# mypy: disable-error-code="no-untyped-def,empty-body,valid-type"
 """Shading of a packet of rays on a CPU, in loops over its lanes that become vector instructions.
 
 The arithmetic and its order are those of `shading.py` for baked light and mip-mapped textures, so the bytes

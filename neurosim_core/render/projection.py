@@ -1,6 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,call-overload"
-# mypy: disable-error-code="return-value,assignment,valid-type,untyped-decorator,no-untyped-call"
-
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,call-overload,return-value"
+# mypy: disable-error-code="assignment,valid-type"
 """Where points are in the picture of a lens, on the device: the models of `lenses.py`."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,attr-defined"
+# mypy: disable-error-code="attr-defined"
 """The second renderer: rgb and depth through pyrender and OpenGL, to check the first one against.
 
 Geometry, visibility, perspective and texture filtering are OpenGL's; light is that of `lighting`, as colours

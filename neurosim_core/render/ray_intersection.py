@@ -1,6 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,arg-type,assignment,call-overload"
-# mypy: disable-error-code="no-untyped-def,empty-body"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,arg-type,assignment,call-overload,no-untyped-def,empty-body"
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """Intersection of a ray with the scene, with a face of a candidate list, and with moving bodies."""
 

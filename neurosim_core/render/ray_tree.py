@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,no-untyped-def,untyped-decorator,empty-body,index"
+# mypy: disable-error-code="no-untyped-def,empty-body,index"
 """The bounding volume hierarchy of a `wp.Mesh`, laid out for single rays.
 
 A node holds the boxes of its two children side by side, and a leaf holds the corners of its triangles: one

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment,no-any-return"
+# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment"
 """A scene on a device, ready to be cast at: triangles, light, textures and trees, shared by all cameras."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,misc,no-any-return,operator,arg-type,return-value,empty-body"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,misc,operator,arg-type,return-value,empty-body"
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,type-arg,misc,index,call-overload,operator"
+# mypy: disable-error-code="attr-defined,type-arg,misc,index,call-overload,operator"
 """A test card instead of a view: pictures at next to no cost, to measure everything else.
 
 A bright square moves with the camera over a fixed card. A picture is a pure function of the pose: the card is

@@ -1,5 +1,4 @@
 # mypy: disable-error-code="assignment,index,no-untyped-def,return-value"
-# mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """The camera of a launch: rays, poses and worlds, and the layout of tiles of 8 x 8 pixels."""
 

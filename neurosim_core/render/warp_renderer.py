@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment,no-any-return"
+# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment"
 """The renderer of the simulator: ray casting in Warp, the same source on CPU and CUDA."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,type-arg"
+# mypy: disable-error-code="attr-defined,type-arg"
 """How the host keeps a GPU busy: streams, graphs of launches that come again, copies that need no wait.
 
 On a CPU a launch returns when it has finished, and all of this does nothing.
@@ -155,10 +155,12 @@ class RecordedLaunch:
     Args:
         kernel: Its parameters are numbers, arrays and structs.
         device: Where to launch.
+        block_dim: Threads of a block on CUDA.
     """
 
-    def __init__(self, kernel: wp.Kernel, device: Any) -> None:
+    def __init__(self, kernel: wp.Kernel, device: Any, *, block_dim: int = 256) -> None:
         self._kernel = kernel
+        self._block_dim = block_dim
         self._device = wp.get_device(device)
         self._recorded: Any = None
         self._dim: int | tuple[int, ...] = 0
@@ -171,14 +173,19 @@ class RecordedLaunch:
         """
         if self._recorded is None:
             self._recorded = wp.launch(
-                self._kernel, dim=dim, inputs=list(arguments), device=self._device, record_cmd=True
+                self._kernel,
+                dim=dim,
+                inputs=list(arguments),
+                device=self._device,
+                block_dim=self._block_dim,
+                record_cmd=True,
             )
         else:
             if dim != self._dim:
                 self._recorded.set_dim(dim)
             for index, (value, last) in enumerate(zip(arguments, self._arguments, strict=True)):
                 if value is not last:
-                    packed = value.__ctype__() if isinstance(value, wp.array) else value
+                    packed = value.__ctype__() if hasattr(value, "__ctype__") else value
                     self._recorded.set_param_at_index_from_ctype(index, packed)
         self._recorded.launch()
         self._dim, self._arguments = dim, arguments

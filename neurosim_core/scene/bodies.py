@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="operator,arg-type,no-any-return"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,assignment,operator,arg-type"
 """Bodies that move through the scene on prescribed paths: their poses are pure functions of time.
 
 A body is rigid and has a frame O. With t the time since the start of the episode [s], and what is not given

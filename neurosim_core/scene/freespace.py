@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,no-any-return"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type"
 """Where there is room: distance to the scene on a voxel grid, what can be reached, collisions in flight.
 
 The distance is unsigned and exact at voxel centres (nearest point on any triangle). It is 1-Lipschitz, so a

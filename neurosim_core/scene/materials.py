@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,return-value,assignment,operator"
-# mypy: disable-error-code="no-any-return"
+# mypy: disable-error-code="index,attr-defined,misc,return-value,assignment,operator"
 """Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled.
 
 A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the

@@ -1,6 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="valid-type,call-overload,assignment,untyped-decorator"
-
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,valid-type,call-overload,assignment"
 """Adaptive sampling in time: which ticks of an event camera's clock have to be rendered.
 
 Between two renders log radiance is taken as linear in time, which is good as long as nothing moves far across

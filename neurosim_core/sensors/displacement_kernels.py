@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="valid-type,call-overload,assignment,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,valid-type,call-overload,assignment"
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """Kernels of adaptive sampling: probes that look for what moves, and how far it moves in the picture."""
 

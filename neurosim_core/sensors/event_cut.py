@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
 """Kernels for the keys of events between the scan and the packets: windows, origins, columns."""
 
 import warp as wp

@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-call"
 """What an event camera is given: frames and stamps, as it takes them, or why it does not."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,attr-defined"
+# mypy: disable-error-code="attr-defined"
 """Keys of events that the host has counted: gathered, sorted, cut into windows and taken apart.
 
 Keys are as in `event_levels`. What no window has taken yet stays, and its time goes on from the last cut.

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,arg-type,no-any-return,no-untyped-call,call-overload,untyped-decorator"
-# mypy: disable-error-code="assignment,no-untyped-def,attr-defined"
+# mypy: disable-error-code="index,arg-type,call-overload,assignment,no-untyped-def,attr-defined"
 """The pixels of an event camera that are not ideal: their parameters as drawn, and their states.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,var-annotated"
+# mypy: disable-error-code="index,attr-defined,misc,var-annotated"
 """The pixels of an event camera: their state, and the launches that take them from one stack to the next.
 
 Scans may be under way one behind the other: each has the state before it and the state after it, in a ring.

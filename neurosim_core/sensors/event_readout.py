@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,assignment,return-value"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,assignment,return-value"
 """The arbiter that reads events out of the pixels: a queue with one server.
 
 `event`: events are read in the order in which they come, and the bus is busy for 1 / bandwidth with each. An

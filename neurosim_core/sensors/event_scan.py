@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
 """The scan of an ideal pixel over a stack of frames, which writes the keys of its events.
 
 What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,assignment,return-value"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,assignment,return-value"
 """When the signal of an event pixel reaches a level, and when a voltage with noise touches a threshold.
 
 Times are nanoseconds since the frame before. The law of these signals is described in `event_noise_model`.

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="misc,attr-defined,no-untyped-call"
+# mypy: disable-error-code="misc,attr-defined"
 """How event pixels depart from the ideal: the base of the settings of a noise term, and the terms by kind."""
 
 from __future__ import annotations

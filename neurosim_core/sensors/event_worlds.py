@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,index,assignment"
+# mypy: disable-error-code="attr-defined,call-overload,index,assignment"
 """One event camera in many worlds: frames of all worlds in, events of all worlds out, on the device."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment,no-untyped-def,valid-type"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
+# mypy: disable-error-code="no-untyped-def,valid-type"
 """Kernels of event cameras in one world or many: the scan of all pixels, and keys in order.
 
 The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise_scan`: their functions get the

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,var-annotated"
+# mypy: disable-error-code="index,attr-defined,misc,var-annotated"
 """The event camera: from frames of log radiance to a sorted stream of events.
 
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-any-return,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,no-untyped-def"
 """The GPS receiver: geodetic position and velocity, late, with errors that come and go.
 
 The world W is a tangent plane of the WGS84 ellipsoid: east, north, up at an origin.

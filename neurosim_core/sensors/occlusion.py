@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """What hides a point from a camera, told by a ray, or by the picture of the same camera at another time.
 
 Nothing is on the way from the other camera to a point where the picture shows only what is further than that

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload"
 """The true state of the vehicle, as a sensor."""
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,valid-type,no-any-return"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,valid-type"
 """What the processing of pictures shares: where a thread works, the poses of a batch, and one launch."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,call-overload"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """What small sensors share: errors of a measurement, delays, dropouts, and a sampler of one kernel.
 
 Errors are added per axis: a random walk from 0, a first-order Gauss-Markov process that is stationary from

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """What the cameras see of one batch: which instants they render, in one launch each, and the packets."""
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,no-any-return,arg-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,assignment,no-untyped-def"
 """What carries the sensors where no vehicle does: a body that follows a motion exactly.
 
 With phi the rotation vector of a piece and t its length, R_WB = R(knot) exp(phi), and with the right Jacobian

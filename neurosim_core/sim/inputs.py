@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """What users hand to many worlds: commands, seeds and masks, from the host or on the device."""
 
 from __future__ import annotations

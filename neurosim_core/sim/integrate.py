@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """The flight of one batch: commands in, the motion from boundary to boundary, what was sampled there out."""
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ import logging
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
-import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.control import CommandMode, make_controller
@@ -21,7 +20,6 @@ from neurosim_core.sensors.sampler_checks import sample_packet
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.reset import begin_batch, end_batch
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
@@ -173,8 +171,6 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
 
 def integrate(state: State, batch: Batch) -> None:
     """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
-    device, count = state.vehicle.device, state.world_count
-    wp.launch(begin_batch, dim=count, inputs=[state.fleet], device=device)
     elapsed_ns = 0
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
@@ -187,10 +183,17 @@ def integrate(state: State, batch: Batch) -> None:
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
-        state.trace.record(state.surfaces, state.fleet, slot, elapsed_ns)
+        place = slot - batch.slot
+        state.trace.record(
+            state.surfaces,
+            state.fleet,
+            slot,
+            elapsed_ns,
+            first=place == 0,
+            last=place == len(batch.boundaries) - 1,
+        )
         if batch.closed_loop and boundary.control and not isinstance(state.vehicle, Carrier):
             state.path_controller.update(state.vehicle.arrays)
-    wp.launch(end_batch, dim=count, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
 
 
 def _fetch(state: State, batch: Batch) -> None:

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """What does not change during a run: the scene, the path, and what has to be computed of them."""
 
 from __future__ import annotations

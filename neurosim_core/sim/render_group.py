@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+# mypy: disable-error-code="attr-defined,call-overload"
 """The device buffers of one render group, in all worlds; `render_job.py` takes batches through them.
 
 Several batches may be in flight. Each has a renderer of its own: what a batch saw stays until it has been

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+# mypy: disable-error-code="attr-defined,call-overload"
 """The batches of a render group: which ticks are rendered, how, and what is read when that is done."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """A run, batch by batch: with the path controller on the device, or with a controller outside.
 
 On a CUDA device `run_model` launches the next batches before it reads one back, so the device always has

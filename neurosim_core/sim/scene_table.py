@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+# mypy: disable-error-code="attr-defined,call-overload"
 """The scenes that worlds are in: one for all, or several, which kernels find by index."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+# mypy: disable-error-code="attr-defined,call-overload"
 """What changes during a run: the vehicles of all worlds, the buffers of their sensors, and the progress."""
 
 from __future__ import annotations

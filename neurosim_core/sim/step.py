@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-call"
 """The data flow of the simulator, in one function: read `launch` first.
 
     commands -> integrate -> sample the state -> pose cameras -> render -> scan events -> packets

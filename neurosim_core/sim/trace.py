@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.runtime.cuda import HostCopy
+from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, room_around
 from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
@@ -22,8 +22,6 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 3
-_ELAPSED_PARAMETER = 4
 _LAUNCHES_MAX = 256
 
 
@@ -91,8 +89,12 @@ def _record(
     # In:
     slot: int,
     elapsed_ns: wp.int64,
+    is_first: int,
+    is_last: int,
 ) -> None:
     world = wp.tid()
+    if is_first != 0:  # touches of the batch before are forgotten, except of vehicles that are held by one
+        fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
     position = fleet.position[world]
     for axis in range(3):
         rows_out.states[slot, world, axis] = position[axis]
@@ -125,6 +127,8 @@ def _record(
         fleet.collided[world] = 1
         if surfaces.holds != 0:
             fleet.status[world] = STATUS_COLLISION
+    if is_last != 0:
+        fleet.clock_ns[world] += elapsed_ns
 
 
 @wp.kernel
@@ -277,10 +281,12 @@ class Trace:
         self._is_cuda = wp.get_device(device).is_cuda
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
-        self._recording: tuple[Any, Any] = (None, None)
+        self._record = RecordedLaunch(_record, device, block_dim=BLOCK_DIM)
         self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
 
-    def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
+    def record(
+        self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int, *, first: bool, last: bool
+    ) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
 
         Args:
@@ -288,21 +294,12 @@ class Trace:
             fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
             slot: Where to write, in [0, capacity).
             elapsed_ns: Time since the beginning of the batch [ns].
+            first: It is the first slot of a batch: vehicles touch nothing yet.
+            last: It is the last one: clocks of worlds move on to it.
         """
-        if self._recording[0] is not fleet:
-            launch = wp.launch(
-                _record,
-                dim=self.states.shape[1],
-                inputs=[surfaces, fleet, self._rows, slot, elapsed_ns],
-                device=self.states.device,
-                block_dim=BLOCK_DIM,
-                record_cmd=True,
-            )
-            self._recording = (fleet, launch)
-        launch = self._recording[1]
-        launch.set_param_at_index(_SLOT_PARAMETER, slot)
-        launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
-        launch.launch()
+        self._record.launch(
+            self.states.shape[1], [surfaces, fleet, self._rows, slot, elapsed_ns, int(first), int(last)]
+        )
 
     def camera_poses(
         self,

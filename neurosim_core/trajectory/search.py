@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,no-untyped-call"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type"
 """Shortest ways through a voxel grid: A* with a binary heap, as one thread of compiled code.
 
 It runs on the CPU whatever the simulation runs on: a search is a chain of decisions that no second thread can

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """Forces and torques on the airframe: thrust, rotor drag, translational lift, flapping, parasitic drag.
 
 With u_i = v_a + w x r_i the air speed of rotor i in B, v_a that of the centre of mass, Omega_i its speed and

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """A horizontal ground: feet that press into it and slip on it, and rotors that push harder above it.
 
 A foot at depth d > 0 that sinks at a speed s is pushed up by k d (1 + c s), never pulled down: a spring with

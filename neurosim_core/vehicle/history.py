@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,no-any-return,arg-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,valid-type,return-value"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,assignment,no-untyped-def"
+# mypy: disable-error-code="valid-type,return-value"
 """The history of a flight, and the motion between its entries.
 
 The history has the state at every boundary of the integration, on the device, as far back as somebody needs.

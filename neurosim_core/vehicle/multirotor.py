@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,union-attr,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,union-attr,assignment"
 """Rigid multirotors: state, and stepping in integer time, for one vehicle or thousands."""
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ _G_M_S2 = 9.80665  # the unit of the log's accelerometer
 _STEP_S = 1e-3
 _STRIDE = 50  # samples from the beginning of a window to that of the next
 _PAST_S = 0.15  # flight before a window that tells the thrust for a command
-_DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.CRAZYFLIE
+_DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.yaml
 _TILT_S = 10.0  # how slowly the mean direction of the specific force corrects the integrated attitude
 _ROOM_S = 1.0  # over longer, the mean velocity of a flight in a room is nought
 _FILTER_STEP_S = 0.01
@@ -173,7 +173,7 @@ def replay(
         load = _load(config, vehicle.state.rotor_speed)
         if missing_torque:
             turned = _STEP_S * calibration.missing((sample + 0.5) * _STEP_S, load)
-            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)  # type: ignore[no-untyped-call]
+            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)
     unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
     pushed, felt = np.array(forces), np.array(measured_forces)
     return Replay(

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """Wind: a constant, discrete gusts, and Dryden turbulence that a vehicle meets on its way.
 
 Turbulence follows the low-altitude model: a frozen field that passes the vehicle at its air speed V, with

@@ -68,7 +68,7 @@ def nothing(flags: int) -> bytes:
 
 
 @pytest.fixture
-def ring(tmp_path: Path):
+def ring(tmp_path):
     made = Ring(tmp_path)
     yield made
     made.close()

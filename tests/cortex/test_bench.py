@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,7 @@ def fed(
 
 
 @pytest.mark.parametrize("consume", [False, True])
-def test_tally_counts_every_message_between_the_markers(consume: bool):
+def test_tally_counts_every_message_between_the_markers(consume):
     report = fed([WARM, WARM, *range(200)], consume=consume)
     assert (report["received"], report["lost"], report["misordered"], report["corrupt"]) == (200, 0, 0, 0)
     assert report["rate"] > 0.0
@@ -66,7 +65,7 @@ def test_tally_sees_a_payload_that_is_not_the_message_s_own():
 
 
 @pytest.mark.parametrize("at", [0, 5_000, 9_999])
-def test_tally_sees_a_torn_payload(at: int):
+def test_tally_sees_a_torn_payload(at):
     tally = Tally(10_000, lambda: None)
     torn = make_payloads(10_000)[0].copy()
     torn[at] = 2.0
@@ -113,7 +112,7 @@ def test_child_and_parent_talk():
     ("role", "text"), [(_fails, "ValueError: no socket here"), (_dies, "died with status -9")]
 )
 @pytest.mark.parametrize("beside", [False, True])
-def test_child_that_fails_is_noticed(role: Any, text: str, beside: bool):
+def test_child_that_fails_is_noticed(role, text, beside):
     """Also when another one's report is waited for."""
     with Child(role, "socket", deadline_s=SOON_S) as child, Child(_hangs, None, deadline_s=SOON_S) as other:
         other.expect()
@@ -191,7 +190,7 @@ def test_cases_are_chosen_by_name_or_family():
         choose(["hug"])
 
 
-def test_a_peer_that_is_not_installed_is_reported(monkeypatch: pytest.MonkeyPatch):
+def test_a_peer_that_is_not_installed_is_reported(monkeypatch):
     monkeypatch.setattr("cortex.bench.measure.missing", lambda transport: "not installed")
     case = Case("x", "title", 10, (Contestant("a peer", "Cyclone DDS"),))
     result = run_case(case, Settings())
@@ -232,7 +231,7 @@ def test_summary_says_met_or_missed_and_counts():
     assert "1 met, 1 missed" in text
 
 
-def test_csv_holds_every_repetition(tmp_path: Path):
+def test_csv_holds_every_repetition(tmp_path):
     write_csv(tmp_path / "out.csv", results())
     with (tmp_path / "out.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -247,7 +246,7 @@ def test_csv_holds_every_repetition(tmp_path: Path):
     [(["no-such-case"], "unknown case 'no-such-case'"), (["--repeats", "0"], "repeats >= 1")]
     + [(["--seconds", value], "0 < seconds <= 600") for value in ("0", "-1", "nan", "1e9")],
 )
-def test_wrong_arguments_are_refused(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]):
+def test_wrong_arguments_are_refused(arguments, said, capsys):
     assert main(arguments) == 2
     assert said in capsys.readouterr().err
 
@@ -259,7 +258,7 @@ TINY = [case.name for case in CASES if not case.name.startswith("threshold-")] +
 
 
 @pytest.fixture(scope="module")
-def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[dict[str, str]]]:
+def tiny_run(tmp_path_factory):
     """One repetition of every case, a few milliseconds each, in a process that has no ZeroMQ context yet."""
     path = tmp_path_factory.mktemp("bench") / "out.csv"
     before = set(Path("/dev/shm").glob("*")) if Path("/dev/shm").is_dir() else set()
@@ -286,7 +285,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[dict[s
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_case(tiny_run: tuple[str, list[dict[str, str]]], name: str):
+def test_case(tiny_run, name):
     """Every contestant of the case has all its figures, and what is reliable lost nothing."""
     (case,) = choose([name])
     rows = {row["contestant"]: row for row in tiny_run[1] if row["case"] == name}
@@ -305,7 +304,7 @@ def test_case(tiny_run: tuple[str, list[dict[str, str]]], name: str):
             assert int(row["received"]) == int(row["sent"]) > 0, contestant.name
 
 
-def test_tiny_run_prints_every_bar(tiny_run: tuple[str, list[dict[str, str]]]):
+def test_tiny_run_prints_every_bar(tiny_run):
     text = tiny_run[0]
     counts = [int(part.split()[0]) for part in text.strip().splitlines()[-1].split(", ")]
     assert sum(counts) == sum(len(case.bars) for case in choose(TINY))
@@ -314,7 +313,7 @@ def test_tiny_run_prints_every_bar(tiny_run: tuple[str, list[dict[str, str]]]):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_run_that_is_ended_leaves_no_process(short_folder: Path, number: signal.Signals):
+def test_a_run_that_is_ended_leaves_no_process(short_folder, number):
     command = [sys.executable, "-m", "cortex", "bench", "typed-40", "--seconds", "300"]
     environment = {**os.environ, "TMPDIR": str(short_folder)}
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment) as bench:
@@ -330,7 +329,7 @@ def test_a_run_that_is_ended_leaves_no_process(short_folder: Path, number: signa
 
 
 @pytest.fixture
-def short_folder() -> Iterator[Path]:
+def short_folder():
     """Return a directory for temporary files whose path leaves room for the names of sockets."""
     with tempfile.TemporaryDirectory(prefix="tb", dir="/tmp") as folder:
         yield Path(folder)

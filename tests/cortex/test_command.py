@@ -96,7 +96,7 @@ _children: list[subprocess.Popen[str]] = []
 
 
 @pytest.fixture(autouse=True)
-def no_child_left() -> Iterator[None]:
+def no_child_left():
     """End what a test that failed has left running."""
     yield
     while _children:
@@ -181,7 +181,7 @@ def column(output: str, name: str, line: int = -1) -> str:
 # Looking
 
 
-def test_where_nothing_runs_it_says_what_to_do(runtime: Path) -> None:
+def test_where_nothing_runs_it_says_what_to_do(runtime):
     for command in ("topics", "nodes"):
         status, output, errors = cortex(command)
         assert (status, output) == (0, "")
@@ -190,7 +190,7 @@ def test_where_nothing_runs_it_says_what_to_do(runtime: Path) -> None:
     assert not list(runtime.glob("*/registry*"))  # looking has started nothing
 
 
-def test_topics_and_nodes_are_listed(make_node: MakeNode) -> None:
+def test_topics_and_nodes_are_listed(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     robot.publisher("/number", Number)
     robot.publisher("/scan", Scan)
@@ -221,7 +221,7 @@ def whole_info(topic: str, **options: int) -> tuple[int, str, str]:
     return next(answer for answer in answers if "did not answer" not in answer[1])
 
 
-def test_two_types_on_one_topic_are_told_apart(make_node: MakeNode) -> None:
+def test_two_types_on_one_topic_are_told_apart(make_node):
     one, other = make_node("one"), make_node("other")
     one.publisher("/scan", Scan)
     other.publisher("/scan", Number)
@@ -235,7 +235,7 @@ def test_two_types_on_one_topic_are_told_apart(make_node: MakeNode) -> None:
     assert {f"one  {marks[0]}", f"other  {marks[1]}", "other  any  keep_last(64)"} <= set(output.splitlines())
 
 
-def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
+def test_info_shows_counters_policies_and_the_type(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     publisher = robot.publisher("/scan", Scan, latch=True)
     received: list[Scan] = []
@@ -264,7 +264,7 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
     assert errors == "cortex info: there is no topic /nothing; there are /scan\n"
 
 
-def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None:
+def test_top_shows_all_topics_with_rates_and_losses(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     publisher = robot.publisher("/number", Number)
     robot.publisher("/scan", Scan)
@@ -287,7 +287,7 @@ def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None
         wait_for(is_right)
 
 
-def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> None:
+def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path):
     environment = {"XDG_CONFIG_HOME": str(tmp_path)}
     status, output, _ = cortex("doctor", environment=environment)
     assert status == 0, output
@@ -306,7 +306,7 @@ def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> Non
     assert "chmod 700" in output.splitlines()[0]
 
 
-def test_types_are_compared(make_node: MakeNode, tmp_path: Path) -> None:
+def test_types_are_compared(make_node, tmp_path):
     make_node().publisher("/number", Number)
     wait_for(lambda: "/number" in cortex("topics")[1])
     (tmp_path / "robot.py").write_text(
@@ -328,7 +328,7 @@ def test_types_are_compared(make_node: MakeNode, tmp_path: Path) -> None:
 # Watching
 
 
-def test_echo_fits_the_terminal(make_node: MakeNode) -> None:
+def test_echo_fits_the_terminal(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything())
     status, output, errors = cortex("echo", "/all", "-n", 1, columns=72)
@@ -353,7 +353,7 @@ def test_echo_fits_the_terminal(make_node: MakeNode) -> None:
     assert "…" not in output
 
 
-def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
+def test_echo_as_json_holds_everything(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything(3))
     status, output, _ = cortex("echo", "/all", "-n", 1, "--json")
@@ -367,7 +367,7 @@ def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
     }  # fmt: skip
 
 
-def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
+def test_rate_bandwidth_and_delay_are_measured(make_node):
     """100 messages of 16 bytes each second; a machine that stands still for a while is asked again."""
     publisher = make_node("robot").publisher("/number", Number)
     with publishing(publisher, 0.01):
@@ -402,7 +402,7 @@ def rates_and_delays_are_right() -> bool:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path, number: int) -> None:
+def test_record_until_told_to_stop_then_play(make_node, tmp_path, number):
     path = tmp_path / "run.mcap"
     robot = make_node("robot")
     publisher = robot.publisher("/number", Number)
@@ -429,9 +429,7 @@ def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_before_recording_has_begun_leaves_a_whole_file(
-    runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
+def test_a_signal_before_recording_has_begun_leaves_a_whole_file(runtime, tmp_path, monkeypatch, number):
     def interrupted(*arguments: Any, **options: Any) -> Recorder:
         recorder = Recorder(*arguments, **options)
         signal.raise_signal(number)
@@ -446,7 +444,7 @@ def test_a_signal_before_recording_has_begun_leaves_a_whole_file(
         assert (log.cut, log.message_count) == ("", 0)
 
 
-def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) -> None:
+def test_a_file_is_not_overwritten_unless_told(runtime, tmp_path):
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     status, output, errors = cortex("record", "-o", path, "/number")
@@ -477,13 +475,7 @@ def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) ->
         ("cpp no_such_module:Scan", "cortex cpp: there is no module no_such_module here or on the "),
     ],
 )
-def test_errors_are_one_line(
-    runtime: Path,
-    tmp_path: Path,
-    arguments: str,
-    complaint: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_errors_are_one_line(runtime, tmp_path, arguments, complaint, capsys):
     from test_log import write_numbers
 
     write_numbers(tmp_path / "run.mcap", range(5))
@@ -514,9 +506,7 @@ def test_errors_are_one_line(
         (["keys", "old"], "invalid choice: 'old'"),
     ],
 )
-def test_wrong_use_is_told_from_failure(
-    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_use_is_told_from_failure(arguments, complaint, capsys):
     with signals_kept():
         try:
             status = main(arguments)
@@ -533,9 +523,7 @@ COMMANDS = "topics nodes top info echo hz bw delay record play keys doctor schem
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS.split()])
-def test_every_command_has_help(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_has_help(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as end, signals_kept():
         main([*command.split(), "--help"])
@@ -545,14 +533,14 @@ def test_every_command_has_help(
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_help_loads_no_sockets() -> None:
+def test_help_loads_no_sockets():
     code = "import sys, cortex.cli; assert 'zmq' not in sys.modules; assert 'cortex.node' not in sys.modules"
     subprocess.run(
         [sys.executable, "-c", code], check=True, timeout=SOON_S, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
 
 
-def test_keys_are_made_once(tmp_path: Path) -> None:
+def test_keys_are_made_once(tmp_path):
     folder = tmp_path / "keys"
     status, output, errors = cortex("keys", "new", "--dir", folder)
     assert status == 0
@@ -568,7 +556,7 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
     assert (folder / "key.secret").read_text() == secret
 
 
-def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) -> None:
+def test_discovery_serves_until_interrupted(runtime, make_node):
     child = start("discovery")
     wait_for(lambda: (runtime / "0" / "registry").exists())
     make_node("robot").publisher("/number", Number)
@@ -602,11 +590,11 @@ def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) 
         (rate(123456.0), "123.5 kHz"),
     ],
 )
-def test_numbers_have_units(shown: str, expected: str) -> None:
+def test_numbers_have_units(shown, expected):
     assert shown == expected
 
 
-def test_names_of_others_command_no_terminal() -> None:
+def test_names_of_others_command_no_terminal():
     assert plain("robot") == "robot"
     assert plain("a\x1b[31m\n\x9b1mü\u202e") == "a\\x1b[31m\\x0a\\x9b1mü\\x202e"
 
@@ -617,7 +605,7 @@ def test_names_of_others_command_no_terminal() -> None:
     label=st.text(max_size=300),
     arrays=st.sampled_from(["none", "short"]),
 )
-def test_no_line_is_longer_than_the_terminal(columns: int, size: int, label: str, arrays: str) -> None:
+def test_no_line_is_longer_than_the_terminal(columns, size, label, arrays):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", str(columns))
         shown = everything(size, label.encode(errors="ignore").decode())
@@ -625,7 +613,7 @@ def test_no_line_is_longer_than_the_terminal(columns: int, size: int, label: str
     assert all(len(line) <= columns and line.isprintable() for line in lines)
 
 
-def test_json_has_no_numbers_that_json_does_not_know() -> None:
+def test_json_has_no_numbers_that_json_does_not_know():
     shown = everything()
     odd = Scan(1, np.array([math.nan, math.inf, 1.0], np.float32))
     assert to_plain(schema_of(Scan), odd) == {"stamp_ns": 1, "ranges": ["nan", "inf", 1.0]}

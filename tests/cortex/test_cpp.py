@@ -9,8 +9,6 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +30,6 @@ from wire_vectors import load_vectors, message_from_plain
 from cortex import wire
 from cortex.codec import MalformedMessage, codec_of
 from cortex.layout import VALUES_MAX, measure_fields
-from cortex.node import Node
 from cortex.policy import reliable
 from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
@@ -68,7 +65,7 @@ def too_many_values() -> bytes:
     return more
 
 
-def test_vectors_and_damaged_bodies(programs: Path) -> None:
+def test_vectors_and_damaged_bodies(programs):
     """Good bodies return as the same bytes, bad ones are rejected, damaged ones do no harm (ASan, UBSan)."""
     lines = []
     for vector in load_vectors().values():
@@ -88,7 +85,7 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
     assert done.stdout.startswith(f"{len(lines)} bodies, ")
 
 
-def test_a_peer_that_writes_at_random(programs: Path, tmp_path: Path) -> None:
+def test_a_peer_that_writes_at_random(programs, tmp_path):
     """Into a ring and its slots, a page, a bell, a connection: it hurts itself only (ASan, UBSan)."""
     done = subprocess.run(
         [programs / "hostile_test", tmp_path, str(HOSTILE_WRITES), "1"],
@@ -100,7 +97,7 @@ def test_a_peer_that_writes_at_random(programs: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
-def test_between_threads(programs: Path) -> None:
+def test_between_threads(programs):
     """Under the thread sanitizer: nothing is torn, lost or written while somebody looks at it."""
     done = subprocess.run(
         [programs / "broadcast_test"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
@@ -108,7 +105,7 @@ def test_between_threads(programs: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
-def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
+def test_nodes_between_threads(programs, runtime):
     """Under the thread sanitizer: shared publishers, leases that end elsewhere, nodes that end early."""
     ensure_registry(0)
     done = subprocess.run(
@@ -122,14 +119,14 @@ def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
-def test_installed_package_has_all_headers(programs: Path) -> None:
+def test_installed_package_has_all_headers(programs):
     installed = {path.name for path in (programs / "installed/include/cortex").iterdir()}
     shipped = {path.name for path in (CPP / "include/cortex").iterdir()}
     assert installed == shipped | {"messages.hpp", "records.hpp"}
     assert list((programs / "installed").glob("lib*/**/cortexConfig.cmake"))
 
 
-def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_messages_return_unchanged(start, make_node):
     """Python -> C++ -> Python, small in frames and large in slots of shared memory, both ways."""
     start("echo")
     node = make_node()
@@ -144,9 +141,7 @@ def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callab
     assert (back.counters.lost, back.counters.rejected) == (0, 0)
 
 
-def test_loans_arrive_as_views_of_shared_memory(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
+def test_loans_arrive_as_views_of_shared_memory(start, make_node):
     """C++ writes into its ring, Python looks at it there; small loans travel in frames."""
     node = make_node()
     for height in (2, 600):
@@ -167,9 +162,7 @@ def test_loans_arrive_as_views_of_shared_memory(
 
 
 @pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
-def test_slow_reader_knows_what_it_missed(
-    start: Callable[..., Peer], make_node: Callable[..., Node], policy: str, size: int
-) -> None:
+def test_slow_reader_knows_what_it_missed(start, make_node, policy, size):
     """Received, overtaken and lost messages add up to those that were sent."""
     node = make_node()
     scans = node.publisher("/scan", Scan)
@@ -186,9 +179,7 @@ def test_slow_reader_knows_what_it_missed(
     assert result["received"] + result["lost"] + result["overtaken"] == result["sequence"]
 
 
-def test_late_reliable_reader_of_python_is_told(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
+def test_late_reliable_reader_of_python_is_told(start, make_node):
     """A reader in C++ that holds up Python for too long loses messages, knows how many, and is taken back."""
     scans = make_node().publisher("/scan", Scan)
     peer = start("count", "/scan", "brief", 1000, 0)
@@ -207,9 +198,7 @@ def test_late_reliable_reader_of_python_is_told(
     assert refused > 0
 
 
-def test_late_reliable_reader_of_cpp_is_told(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
+def test_late_reliable_reader_of_cpp_is_told(start, make_node):
     """A reader in Python that holds up C++ for too long loses messages, knows how many, and is taken back."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(4, 0.001))
     peer = start("publish", "/scan", 1500, 3000)
@@ -228,9 +217,7 @@ def test_late_reliable_reader_of_cpp_is_told(
 
 
 @pytest.mark.parametrize("size", [10, 20_000])
-def test_latched_message_from_cpp(
-    start: Callable[..., Peer], make_node: Callable[..., Node], size: int
-) -> None:
+def test_latched_message_from_cpp(start, make_node, size):
     peer = start("publish", "/map", 3, size, "latch")
     node = make_node()
     wait_for(lambda: any(topic.topic == "/map" for topic in node.topics()))
@@ -240,7 +227,7 @@ def test_latched_message_from_cpp(
     assert peer.process.poll() is None
 
 
-def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_latched_message_to_cpp(start, make_node):
     scans = make_node().publisher("/scan", Scan, latch=True)
     scans.publish(Scan(5, np.full(20_000, 5, np.float32)))
     peer = start("count", "/scan", "4", 0, 0)
@@ -249,7 +236,7 @@ def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[
     assert json.loads(peer.line()) == {**CLEAN, "received": 1, "sequence": 1, "sources": 1, "last": 5}
 
 
-def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_mismatching_types_are_told(start, make_node):
     """Each side sees both structures, and goes on."""
     node = make_node()
     others = node.publisher("/scan", OtherScan)
@@ -268,7 +255,7 @@ def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Calla
         wrong.recv(SOON_S)
 
 
-def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_counters_can_be_asked(start, make_node):
     node = make_node()
     scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 10, 10)
@@ -282,9 +269,7 @@ def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[.
     assert (subscribed.topic, subscribed.policy) == ("/other", "reliable(depth=64, timeout_s=60)")
 
 
-def test_the_clock_is_that_of_the_registry(
-    start: Callable[..., Peer], make_node: Callable[..., Node], runtime: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_clock_is_that_of_the_registry(start, make_node, runtime, monkeypatch):
     """A registry whose host is a minute ahead: what a C++ node tells of its own clock says so."""
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() + 60 * 10**9)
@@ -300,9 +285,7 @@ def test_the_clock_is_that_of_the_registry(
         wait_for(lambda: abs(offset_ns() - (time.time_ns() - time.monotonic_ns())) < 10**9)
 
 
-def test_lies_are_rejected(
-    programs: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_lies_are_rejected(programs, runtime, monkeypatch, tmp_path):
     """A subscriber counts every frame that is wrong and reads those between; a false ring does no harm."""
     impostor = Impostor(runtime)
     try:
@@ -334,7 +317,7 @@ def test_lies_are_rejected(
     runtime.mkdir(mode=0o700)
 
 
-def test_example_reads_the_other(programs: Path, runtime: Path) -> None:
+def test_example_reads_the_other(programs, runtime):
     """The two example programs meet through a registry."""
     ensure_registry(0)
     listener = subprocess.Popen([programs / "listener", "5"], stdout=subprocess.PIPE, text=True)

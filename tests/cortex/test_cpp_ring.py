@@ -9,7 +9,6 @@ import shutil
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ import zmq
 from cpp_client import Impostor, Peer, make_frame, publishers_in_cpp, subscribers_in_cpp
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs, start
-from processes import SOON_S, Child, wait_for
+from processes import SOON_S, wait_for
 
 import cortex.link
 from cortex import wire
@@ -59,7 +58,7 @@ def sizes() -> list[int]:
     return [int(size) for size in SIZES.split(",")]
 
 
-def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_all_sizes_to_cpp_in_one_order(start, make_node):
     scans = make_node().publisher("/scan", Scan)
     peer = start("count", "/scan", "reliable", 0, 3, 3000)
     assert scans.wait_for_subscribers(1, SOON_S)
@@ -70,7 +69,7 @@ def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Ca
     assert result["wrong"] == result["lost"] == result["rejected"] == result["overtaken"] == 0
 
 
-def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_all_sizes_from_cpp_in_one_order(start, make_node):
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 3000, SIZES)
     for number in range(3000):
@@ -81,7 +80,7 @@ def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: 
     assert scans.carriers == ["ipc, shared memory"]
 
 
-def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
+def test_cpp_to_cpp_in_one_order(start):
     reader = start("count", "/scan", "reliable", 0, 3, 3000)
     writer = start("publish", "/scan", 3000, SIZES)
     result = result_of(reader)
@@ -90,7 +89,7 @@ def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
     assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
 
 
-def test_no_memory_for_slots(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+def test_no_memory_for_slots(start, make_node):
     """A C++ publisher that has no descriptor left for slots sends its readers to their sockets."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "full")
@@ -108,9 +107,7 @@ def counted(node: Node) -> list[int]:
 
 
 @pytest.mark.parametrize("policy", ["4", "brief"])
-def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
-    start: Callable[..., Peer], make_node: Callable[..., Node], policy: str
-) -> None:
+def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(start, make_node, policy):
     """It loses what it is too late for, and counts that; it gets the rest once it goes on."""
     node = make_node()
     stopped = start("count", "/scan", policy, 0, 0)
@@ -126,9 +123,7 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
     wait_for(lambda: counted(node) == [9000])
 
 
-def test_reader_without_ring(
-    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reader_without_ring(start, make_node, monkeypatch):
     """One without the C module asks for none: the C++ publisher serves it through ZeroMQ."""
     monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
@@ -138,9 +133,7 @@ def test_reader_without_ring(
     assert scans.counters.lost == 0
 
 
-def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(
-    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(start, make_node, monkeypatch):
     """It stands still, and holds up a C++ publisher after 8 MB, as one in Python."""
     monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.05))
@@ -152,9 +145,7 @@ def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(
     assert 8 <= result["taken"] <= 12
 
 
-def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
-    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(start, make_node, monkeypatch):
     """For a second, not for one with each large message."""
     monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 1.0))
@@ -168,9 +159,7 @@ def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
 
 
 @pytest.mark.parametrize(("others", "size", "held"), [(0, 10, 500), (2, 10, 500), (0, 20_000, 45)])
-def test_killed_cpp_reader_that_holds_up_its_publisher(
-    start: Callable[..., Peer], make_node: Callable[..., Node], others: int, size: int, held: int
-) -> None:
+def test_killed_cpp_reader_that_holds_up_its_publisher(start, make_node, others, size, held):
     """The publisher waits for a reliable reader, with all slots of its share; when that dies it goes on."""
     node = make_node()
     slow = start("count", "/scan", "reliable", 50_000, 3)
@@ -264,9 +253,7 @@ class SlowReader:
 
 
 @pytest.fixture
-def attach(
-    make_node: Callable[..., Node], start: Callable[..., Peer]
-) -> Iterator[Callable[..., tuple[SlowReader, dict[str, int]]]]:
+def attach(make_node, start):
     """Makes a C++ program publish until a reader has no room, and leave; both, and what the program says."""
     readers = []
 
@@ -289,9 +276,7 @@ def aux_of(frame: bytes) -> int:
     return int.from_bytes(frame[56:64], "little")
 
 
-def test_what_a_closed_publisher_has_taken_stays(
-    attach: Callable[..., tuple[SlowReader, dict[str, int]]],
-) -> None:
+def test_what_a_closed_publisher_has_taken_stays(attach):
     """Also when its process has ended; behind it the number that tells of the loss."""
     reader, result = attach(10**9, 2700)
     reader.publisher.end()
@@ -306,9 +291,7 @@ def test_what_a_closed_publisher_has_taken_stays(
 
 
 @pytest.mark.parametrize("confirms_end", [True, False], ids=["", "to an older version"])
-def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(
-    start: Callable[..., Peer], make_node: Callable[..., Node], confirms_end: bool
-) -> None:
+def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(start, make_node, confirms_end):
     """To a reader of its socket: what libzmq has no room for gets lost without a word."""
     start("fill", "/scan", 5, 10)
     source, address = place_of(make_node(), "/scan")
@@ -343,9 +326,7 @@ def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(
         context.destroy(linger=0)
 
 
-def test_cpp_reader_counts_what_it_had_no_time_for(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
-) -> None:
+def test_cpp_reader_counts_what_it_had_no_time_for(start, make_node):
     """It stands still until a publisher in Python, and another one in C++, have ended."""
     watcher, node = make_node(), make_node()
     reader = start("count", "/scan", "brief", 0, 0)
@@ -368,9 +349,7 @@ def test_cpp_reader_counts_what_it_had_no_time_for(
     wait_for(lambda: counted(watcher) == [sent])
 
 
-def test_cpp_reader_counts_a_stream_that_was_cut_off(
-    start: Callable[..., Peer], start_child: Callable[..., Child], make_node: Callable[..., Node]
-) -> None:
+def test_cpp_reader_counts_a_stream_that_was_cut_off(start, start_child, make_node):
     """Nobody knows how much of it was lost; one that was closed in order is complete."""
     reader = start("count", "/scan", "reliable", 0, 0)
     for orderly in (True, False):
@@ -389,9 +368,7 @@ def test_cpp_reader_counts_a_stream_that_was_cut_off(
     assert "ended without saying how much it had sent" in reader.end()
 
 
-def test_cpp_reader_takes_leave_of_a_publisher_while_another_is_busy(
-    start: Callable[..., Peer], start_child: Callable[..., Child], make_node: Callable[..., Node]
-) -> None:
+def test_cpp_reader_takes_leave_of_a_publisher_while_another_is_busy(start, start_child, make_node):
     reader = start("count", "/scan", "reliable", 0, 0)
     child = start_child("peer")
     child.ask(do="publisher", topic="/scan", type="Scan")
@@ -426,7 +403,7 @@ class RingImpostor(Impostor):
 
 
 @pytest.fixture
-def impostor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RingImpostor]:
+def impostor(runtime, monkeypatch):
     liar = RingImpostor(runtime)
     monkeypatch.setenv("CORTEX_TEST_REGISTRY", liar.registry)
     yield liar
@@ -454,7 +431,7 @@ def bad_frames() -> list[bytes]:
     ]
 
 
-def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> None:
+def test_lies_in_a_ring_are_rejected(programs, impostor):
     """Bad frames between good ones, at last none at all: then the socket is used again."""
     peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
     key = impostor.await_key()
@@ -485,7 +462,7 @@ def test_lies_in_a_ring_are_rejected(programs: Path, impostor: RingImpostor) -> 
     assert "nothing more comes through its ring" in peer.end()
 
 
-def test_ring_that_ends(programs: Path, impostor: RingImpostor) -> None:
+def test_ring_that_ends(programs, impostor):
     """All that is in it is read, what follows comes through the socket, and nothing is rejected."""
     peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
     impostor.take_in(impostor.await_key())
@@ -502,9 +479,7 @@ def test_ring_that_ends(programs: Path, impostor: RingImpostor) -> None:
     peer.end()
 
 
-def test_ring_of_a_publisher_that_is_gone_before_its_answer_came(
-    programs: Path, impostor: RingImpostor
-) -> None:
+def test_ring_of_a_publisher_that_is_gone_before_its_answer_came(programs, impostor):
     """What is in it is read, and nobody has said that this is all."""
     peer = Peer([programs / "peer", "count", "/scan", "reliable", 0, 0])
     impostor.take_in(impostor.await_key(), answers=False)

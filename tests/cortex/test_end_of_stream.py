@@ -11,7 +11,6 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,7 +112,7 @@ class Leavers(Impostor):
 
 
 @pytest.fixture
-def leavers(runtime: Path) -> Iterator[Leavers]:
+def leavers(runtime):
     impostor = Leavers(runtime)
     yield impostor
     impostor.close()
@@ -127,9 +126,7 @@ def expected(cut_off: int) -> dict[str, int]:
     return {name: sum(getattr(case, name) for case in cases) for name in COUNTERS}
 
 
-def test_python_reports_what_it_has_not_heard_the_end_of(
-    leavers: Leavers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_reports_what_it_has_not_heard_the_end_of(leavers, monkeypatch):
     monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 3 * 10**8)
     with Node("reader", registry=leavers.tcp_registry) as node:
         readers = [node.subscriber(f"/cut{number}", Scan, policy=reliable()) for number in (0, 1)]
@@ -146,9 +143,7 @@ def test_python_reports_what_it_has_not_heard_the_end_of(
 
 
 @needs_compiler
-def test_cpp_reports_what_it_has_not_heard_the_end_of(
-    programs: Path, leavers: Leavers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cpp_reports_what_it_has_not_heard_the_end_of(programs, leavers, monkeypatch):
     monkeypatch.setenv("CORTEX_TEST_REGISTRY", leavers.registry)
     peers = [Peer([programs / "peer", "count", f"/cut{number}", "reliable", 0, 0]) for number in (0, 1)]
     leavers.speak()
@@ -163,9 +158,7 @@ def test_cpp_reports_what_it_has_not_heard_the_end_of(
 
 
 @pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
-def test_a_lossy_reader_confirms_the_end(
-    request: pytest.FixtureRequest, leavers: Leavers, monkeypatch: pytest.MonkeyPatch, language: str
-) -> None:
+def test_a_lossy_reader_confirms_the_end(request, leavers, monkeypatch, language):
     """Else it is said once, and what the queue had no room for before it is counted by nobody."""
     with contextlib.ExitStack() as ends:
         if language == "C++":
@@ -194,12 +187,8 @@ def await_confirmed(leavers: Leavers, source: int, sequence: int) -> None:
 
 @pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
 def test_what_went_through_a_ring_that_cannot_be_mapped_is_lost(
-    request: pytest.FixtureRequest,
-    runtime: Path,
-    leavers: Leavers,
-    monkeypatch: pytest.MonkeyPatch,
-    language: str,
-) -> None:
+    request, runtime, leavers, monkeypatch, language
+):
     """Messages 5 to 8 did; the last of them is latched, and comes with the second answer."""
     with contextlib.ExitStack() as ends:
         listener = ends.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from peer import Block as Large
 from peer import Number, OtherNumber, Scan, is_whole, make_block
-from processes import ROOT, SOON_S, Child, wait_for
+from processes import ROOT, SOON_S, wait_for
 
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
 from cortex.log import Log, LogError, Player, Recorder, TopicStats, open_log
@@ -29,7 +29,7 @@ MakeNode = Callable[..., Node]
 
 
 @pytest.fixture
-def node(make_node: MakeNode) -> Node:
+def node(make_node):
     """A node that knows only itself, so that no registry has to start."""
     return make_node("alone", registry="off")
 
@@ -59,7 +59,7 @@ def write_numbers(path: Path, values: range, *, gap_ns: int = 10_000_000, chunk_
         writer.finish()
 
 
-def test_what_is_recorded_can_be_read(node: Node, tmp_path: Path) -> None:
+def test_what_is_recorded_can_be_read(node, tmp_path):
     """Typed, generic and raw, small and large, with all that is known besides."""
     path = tmp_path / "run.mcap"
     number, block = node.publisher("/number", Number), node.publisher("/block", Large)
@@ -97,7 +97,7 @@ def test_what_is_recorded_can_be_read(node: Node, tmp_path: Path) -> None:
         assert (log.start_ns, log.end_ns) == (times[0], times[-1])
 
 
-def test_other_tools_can_read_the_file(node: Node, tmp_path: Path) -> None:
+def test_other_tools_can_read_the_file(node, tmp_path):
     """The library's own reader, which checks all sums, sees the same messages."""
     from mcap.reader import make_reader
 
@@ -120,7 +120,7 @@ def test_other_tools_can_read_the_file(node: Node, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4"])
-def test_a_busy_topic_is_recorded_without_loss(node: Node, tmp_path: Path, compression: str) -> None:
+def test_a_busy_topic_is_recorded_without_loss(node, tmp_path, compression):
     """Under `reliable`, the default, the publisher is held up rather than a message lost."""
     path = tmp_path / "run.mcap"
     publisher, other = node.publisher("/number", Number), node.publisher("/scan", Scan)
@@ -138,7 +138,7 @@ def test_a_busy_topic_is_recorded_without_loss(node: Node, tmp_path: Path, compr
         assert [info.stamp_ns for info, _, _ in log.raw(["/scan"])] == list(range(0, 20_000, 1000))
 
 
-def test_all_topics_are_recorded_also_those_that_come_later(make_node: MakeNode, tmp_path: Path) -> None:
+def test_all_topics_are_recorded_also_those_that_come_later(make_node, tmp_path):
     path = tmp_path / "run.mcap"
     robot, logger = make_node("robot"), make_node("logger")
     first = robot.publisher("/first", Number)
@@ -172,7 +172,7 @@ def test_all_topics_are_recorded_also_those_that_come_later(make_node: MakeNode,
             list(log.messages(types={"/second": Number}))
 
 
-def test_a_node_that_closes_first_ends_the_recording_in_order(make_node: MakeNode, tmp_path: Path) -> None:
+def test_a_node_that_closes_first_ends_the_recording_in_order(make_node, tmp_path):
     path = tmp_path / "run.mcap"
     node = make_node("alone", registry="off")
     publisher = node.publisher("/number", Number)
@@ -188,7 +188,7 @@ def test_a_node_that_closes_first_ends_the_recording_in_order(make_node: MakeNod
         assert numbers(log) == [1]
 
 
-def test_best_effort_counts_what_it_loses(node: Node, tmp_path: Path) -> None:
+def test_best_effort_counts_what_it_loses(node, tmp_path):
     """Everything that was published is either in the file or counted."""
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
@@ -217,9 +217,7 @@ def test_best_effort_counts_what_it_loses(node: Node, tmp_path: Path) -> None:
         assert ended["written"] + ended["lost"] + ended["overtaken"] == published
 
 
-def test_a_publisher_that_was_killed_is_counted(
-    make_node: MakeNode, tmp_path: Path, start_child: Callable[..., Child]
-) -> None:
+def test_a_publisher_that_was_killed_is_counted(make_node, tmp_path, start_child):
     """The file does not say that all is in it."""
     node = make_node()
     child = start_child("peer")
@@ -262,7 +260,7 @@ with Node("child", registry="off") as node:
 
 
 @pytest.fixture
-def recording_child(runtime: Path, tmp_path: Path) -> Iterator[Callable[[int], subprocess.Popen[str]]]:
+def recording_child(runtime, tmp_path):
     children: list[subprocess.Popen[str]] = []
 
     def start(limit: int) -> subprocess.Popen[str]:
@@ -284,9 +282,7 @@ def recording_child(runtime: Path, tmp_path: Path) -> Iterator[Callable[[int], s
         child.stdout.close()
 
 
-def test_a_killed_recorder_leaves_all_but_the_last_second(
-    recording_child: Callable[[int], subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_a_killed_recorder_leaves_all_but_the_last_second(recording_child, tmp_path):
     path = tmp_path / "run.mcap"
 
     def missing_ns() -> int:
@@ -312,9 +308,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second(
     wait_for(lambda: missing_ns() < 1_000_000_000)  # a machine that stands still makes it more at times
 
 
-def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(
-    recording_child: Callable[[int], subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(recording_child, tmp_path):
     """RLIMIT_FSIZE stands for the full disk: a write fails in the middle."""
     path = tmp_path / "run.mcap"
     child = recording_child(300_000)
@@ -334,9 +328,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(
 
 
 @pytest.mark.parametrize("where", ["_flush_old", "add_message"])
-def test_any_failure_ends_the_recording_with_an_error(
-    node: Node, tmp_path: Path, where: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_any_failure_ends_the_recording_with_an_error(node, tmp_path, where, caplog):
     """Not in silence. The file is finished unless a message is torn within the writer."""
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
@@ -362,14 +354,14 @@ def test_any_failure_ends_the_recording_with_an_error(
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sample(tmp_path_factory):
     """A recording of ten messages in several chunks."""
     path = tmp_path_factory.mktemp("log") / "sample.mcap"
     write_numbers(path, range(10), chunk_size=200)
     return path
 
 
-def test_a_file_can_be_cut_anywhere(sample: Path, tmp_path: Path) -> None:
+def test_a_file_can_be_cut_anywhere(sample, tmp_path):
     """What is read is a beginning of what was written, and never shrinks when more of the file is there."""
     path = tmp_path / "cut.mcap"
     data = sample.read_bytes()
@@ -389,7 +381,7 @@ def test_a_file_can_be_cut_anywhere(sample: Path, tmp_path: Path) -> None:
     assert most == 10
 
 
-def test_a_damaged_summary_is_passed_over(sample: Path, tmp_path: Path) -> None:
+def test_a_damaged_summary_is_passed_over(sample, tmp_path):
     """The messages are still whole; the file is walked through to find them."""
     data = bytearray(sample.read_bytes())
     data[-100] ^= 1
@@ -405,7 +397,7 @@ def test_a_damaged_summary_is_passed_over(sample: Path, tmp_path: Path) -> None:
     changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=4),
     cut=st.booleans(),
 )
-def test_a_damaged_file_is_refused_in_words(sample: Path, changes: list[tuple[int, int]], cut: bool) -> None:
+def test_a_damaged_file_is_refused_in_words(sample, changes, cut):
     """Whatever the bytes are: a `LogError` or messages, nothing else, and nothing that takes long."""
     data = bytearray(sample.read_bytes())
     if cut:
@@ -421,7 +413,7 @@ def test_a_damaged_file_is_refused_in_words(sample: Path, changes: list[tuple[in
         pass
 
 
-def test_other_files_are_refused_and_other_encodings_passed_over(tmp_path: Path) -> None:
+def test_other_files_are_refused_and_other_encodings_passed_over(tmp_path):
     from mcap.writer import CompressionType, Writer
 
     text = tmp_path / "text"
@@ -439,7 +431,7 @@ def test_other_files_are_refused_and_other_encodings_passed_over(tmp_path: Path)
         assert (log.foreign, log.topics, list(log.raw())) == (("/ros",), (), [])
 
 
-def test_a_range_of_time_and_topics_is_read(tmp_path: Path) -> None:
+def test_a_range_of_time_and_topics_is_read(tmp_path):
     path = tmp_path / "run.mcap"
     write_numbers(path, range(100), chunk_size=500)
     with open_log(path) as log:
@@ -456,7 +448,7 @@ def test_a_range_of_time_and_topics_is_read(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Iterator[Log]:
+def recording(tmp_path):
     """50 messages, one every 10 ms."""
     path = tmp_path / "run.mcap"
     write_numbers(path, range(50))
@@ -464,7 +456,7 @@ def recording(tmp_path: Path) -> Iterator[Log]:
         yield log
 
 
-def test_playing_keeps_the_pace_without_drift(node: Node, recording: Log) -> None:
+def test_playing_keeps_the_pace_without_drift(node, recording):
     """Message k is published at k * 10 ms / rate, never earlier, and delays do not add up."""
     subscriber = node.subscriber("/number", Number, policy=reliable(100))
     with Player(node, recording) as player:
@@ -481,7 +473,7 @@ def test_playing_keeps_the_pace_without_drift(node: Node, recording: Log) -> Non
         assert info.publish_ns - first_ns <= k * 5_000_000 + late_ns + 5_000_000
 
 
-def test_a_reliable_subscriber_gets_all_at_full_speed(make_node: MakeNode, tmp_path: Path) -> None:
+def test_a_reliable_subscriber_gets_all_at_full_speed(make_node, tmp_path):
     """The player waits until the subscriber, in another node, is connected, and then for its queue."""
     path = tmp_path / "run.mcap"
     write_numbers(path, range(20_000), gap_ns=1000)
@@ -498,7 +490,7 @@ def test_a_reliable_subscriber_gets_all_at_full_speed(make_node: MakeNode, tmp_p
     assert subscriber.counters.lost == 0
 
 
-def test_what_was_latched_is_latched_again(node: Node, tmp_path: Path) -> None:
+def test_what_was_latched_is_latched_again(node, tmp_path):
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/map", Number, latch=True)
     publisher.publish(Number(7, 7))

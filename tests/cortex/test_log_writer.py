@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
 
 import pytest
 from peer import Number
@@ -13,7 +12,7 @@ from cortex.log import LogWriter, open_log
 from cortex.log.sink import Sink
 
 
-def test_a_message_that_cannot_be_written_leaves_no_trace(tmp_path: Path) -> None:
+def test_a_message_that_cannot_be_written_leaves_no_trace(tmp_path):
     path = tmp_path / "log.mcap"
     with LogWriter(path) as log:
         for topic in ("/numbers", "/others"):
@@ -26,7 +25,7 @@ def test_a_message_that_cannot_be_written_leaves_no_trace(tmp_path: Path) -> Non
     assert (topic, message.value, info.sequence, info.log_ns) == ("/numbers", 1, 0, 10**18)
 
 
-def test_a_file_whose_end_does_not_fit_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_whose_end_does_not_fit_is_closed(tmp_path, monkeypatch):
     """The error is that of the disk, and comes once."""
     before = len(os.listdir("/proc/self/fd"))
     log = LogWriter(tmp_path / "log.mcap")

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,14 +26,14 @@ from cortex.security import AUTHORIZED_FILE, Keys, new_keys
 
 
 @pytest.fixture(scope="module")
-def hosts() -> Iterator[tuple[str, str]]:
+def hosts():
     """The names of two network namespaces with a cable between them."""
     with two_hosts() as names:
         yield names
 
 
 @pytest.fixture
-def place() -> Iterator[Path]:
+def place():
     """A short path, for sockets lie below it."""
     path = Path(tempfile.mkdtemp(prefix="cortex-test-"))
     yield path
@@ -101,7 +101,7 @@ class Keyring:
 
 
 @pytest.fixture
-def keyring(place) -> Keyring:
+def keyring(place):
     ring = Keyring(*(place / name for name in ("registry", "friend", "stranger")))
     registry, friend, _ = (new_keys(directory) for directory in (ring.registry, ring.friend, ring.stranger))
     authorize(ring.registry, friend)
@@ -134,7 +134,7 @@ def serve(start, host: str, *options: str) -> tuple[Process, str]:
 
 
 @pytest.fixture
-def node(start_child, place) -> Callable[..., Child]:
+def node(start_child, place):
     def start_node(host: str, name: str, **options: object) -> Child:
         there = {"prefix": ["ip", "netns", "exec", host], "env": {"CORTEX_RUNTIME_DIR": str(place / host)}}
         return start_child("peer", name=name, **there, **options)

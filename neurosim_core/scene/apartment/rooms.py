@@ -13,7 +13,7 @@ from neurosim_core.scene.apartment.floorplan import Room, Wall
 from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
 from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
-from neurosim_core.scene.apartment.tables import read_table
+from neurosim_core.tables import read_table
 
 _PLACE = ("front", "sides", "window")
 
@@ -57,7 +57,7 @@ class Furnisher:
 
     def furnish(self) -> RoomSpace:
         """Do all steps, and return the furniture, the lamps and what space is left."""
-        for number, step in enumerate(read_table("rooms")[self._room.role]):
+        for number, step in enumerate(read_table(__file__, "rooms")[self._room.role]):
             ((method, options),) = step.items()
             self._do(f"{method} {number}", method, **options)
         self._draws = self._all_draws.under("windows")
