@@ -217,6 +217,7 @@ class RecordingWriter:
         for stream in self._streams.values():
             stream.take()
         self._flushing_bytes, self._pending_bytes = self._pending_bytes, 0
+        self._flushed_bytes += self._flushing_bytes
         self._flushed_s = time.monotonic()
         self._flushing = threading.Thread(
             target=self._flush,
@@ -231,7 +232,6 @@ class RecordingWriter:
         if self._flushing is not None:
             self._flushing.join()
             self._flushing = None
-            self._flushed_bytes += self._flushing_bytes
             self._flushing_bytes = 0
         if self._failure is not None:
             self._is_told = True
@@ -336,7 +336,7 @@ class _Column:
             return
         rows, begin, end, deflated = self._taken
         self._taken = None
-        self._dataset.resize(end, axis=0)
+        self._dataset.id.set_extent((end, *self._shape))
         for first, chunks in deflated:
             for number, chunk in enumerate(chunks.result()):
                 place = (first + number * self._chunk, *[0] * len(self._shape))
