@@ -64,16 +64,9 @@ def launch_split(
 ) -> None:
     """Launch a kernel of one dimension: on CUDA as one launch, on the CPU in slices on all cores.
 
-    The call returns when a CPU has finished; it does not wait for a CUDA device. Threads of the kernel must
-    not depend on each other. Slices begin at multiples of 64.
-
-    Args:
-        kernel: Its first parameter is the index of its first thread, an int.
-        dim: Number of threads.
-        inputs: Parameters after the first.
-        outputs: Parameters after the inputs.
-        device: Where to launch.
-        thread_count: Threads of the pool; None: one for each core.
+    The call returns when a CPU has finished; it does not wait for a CUDA device. The first parameter of the
+    kernel is the index of its first thread, before inputs and outputs; threads must not depend on each other.
+    Slices begin at multiples of 64.
     """
     threads = thread_count or core_count()
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64

@@ -39,13 +39,11 @@ _LABELS = ("semantic", "class", "category", "label")
 
 
 def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> Source:
-    """Read the default scene of a glTF file.
+    """Read the default scene of a glTF file, .gltf or .glb.
 
-    Args:
-        path: The .gltf or .glb file.
-        textures_required: Whether a texture file that is not there is an error, or noted and left out.
-        pictures: Decode textures from now on in threads: the first look at one waits for it, and raises what
-            is wrong with it. Else they are decoded at that first look, if ever.
+    A texture file that is not there is an error if `textures_required`, else noted and left out. With
+    `pictures` textures are decoded from now on in threads: the first look at one waits for it, and raises
+    what is wrong with it. Else they are decoded at that first look, if ever.
 
     Raises:
         SceneError: If the file is truncated, malformed, or needs an extension that is not read.

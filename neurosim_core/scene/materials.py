@@ -46,12 +46,9 @@ def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
 
 
 def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """Return a picture and its averages at half, a quarter, … of the resolution, down to one texel.
+    """Return a linear picture [H, W, C] and its averages at half, a quarter, … of the resolution.
 
     Each level is the exact box average of the one before (odd sizes too), so all levels have the same mean.
-
-    Args:
-        linear: Linear light, shape [H, W, C].
     """
     levels = [linear]
     while max(levels[-1].shape[:2]) > 1:
@@ -223,12 +220,8 @@ def sample_texture(
 ) -> wp.vec3:
     """Return the trilinearly filtered linear light of a texture that repeats in both directions.
 
-    Args:
-        texels: `PackedTextures.texels`.
-        levels: `PackedTextures.levels`.
-        texture: A row of `PackedTextures.material_texture` with at least one level.
-        uv: Texture coordinates; v = 1 is the top.
-        lod: Level that is wanted: log2 of the width of the footprint in texels of level 0.
+    Texels and levels are those of `PackedTextures`, `texture` a row of its `material_texture` with at least
+    one level. v = 1 is the top; `lod` is log2 of the width of the footprint in texels of level 0.
     """
     u = uv[0] - wp.floor(uv[0])
     v = 1.0 - (uv[1] - wp.floor(uv[1]))

@@ -81,13 +81,10 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
 
     Every assumption that was made is a sentence in the scene's `notes`. Transparent and metallic materials
     become opaque Lambertian ones. Vertex and face colours become a texture in which each face has its own two
-    by two texels: bilinear lookup between three texel centres gives the linear blend of its corners.
-    Lights come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings.
-
-    Args:
-        config: The file, and how it is meant.
-        pictures: Decode textures now. Else those of glTF are decoded when they are first looked at, if ever:
-            until then no library is imported for them, and an emissive texture counts as white.
+    by two texels: bilinear lookup between three texel centres gives the linear blend of its corners. Lights
+    come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings. Without `pictures`
+    textures of glTF are decoded when they are first looked at, if ever: until then no library is imported for
+    them, and an emissive texture counts as white.
 
     Raises:
         SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is

@@ -86,13 +86,9 @@ def flight_height_m(space: FreeSpace) -> float:
 def report_scene(
     file: Path | Scene, out: Path | None = None, *, device: str = "cpu", console: Console | None = None
 ) -> None:
-    """Say what is in a scene, and draw it.
+    """Say on a console (None: standard output) what is in a scene, of a file or loaded already, and draw it.
 
-    Args:
-        file: A mesh file, or a scene that is loaded already.
-        out: Where the picture goes; None: the scene's name with .png, in the working directory.
-        device: Where free space is mapped and the picture is rendered.
-        console: Where the table is printed; None: standard output.
+    The picture goes to `out`; None: the scene's name with .png, in the working directory.
 
     Raises:
         SceneError: The file cannot be used.
@@ -171,11 +167,7 @@ def scene_picture(scene: Scene, space: FreeSpace | None, *, device: str = "cpu")
 
 
 def cut_open(scene: Scene, height_m: float) -> Scene:
-    """Return the scene without what is above a height; triangles that cross it are cut.
-
-    Args:
-        scene: Triangles.
-        height_m: Where to cut, z [m].
+    """Return the scene without what is above a height z [m]; triangles that cross it are cut.
 
     Raises:
         ValueError: If nothing is below the height.

@@ -108,15 +108,8 @@ class DisplacementRule:
     ) -> None:
         """Allocate the buffers.
 
-        Args:
-            arrays: The scene.
-            lens: Of the camera.
-            max_displacement_px: How far a point may move between two renders [px].
-            rate: The clock whose ticks are chosen from.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
-            motions: Of the bodies, device array of `scene.bodies.Motion`; None: as the scene has them.
-            spacing_px: Distance between probes [px].
+        `rate` is the clock whose ticks are chosen from; `motions` of the bodies are a device array of
+        `scene.bodies.Motion`, by default as the scene has them; `spacing_px` is the distance between probes.
         """
         self.coarse_count = 0
         self._limit_px = max_displacement_px
@@ -191,12 +184,8 @@ class DisplacementRule:
     ) -> list[int]:
         """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
 
-        Args:
-            states: Where the flight is, as in `Trace.states`, float64, shape [slot, vehicle, >= 13].
-            slots: Slots of consecutive ticks of the clock.
-            stamps_ns: Their stamps [ns], later than those of the call before.
-            forced: Ticks that are rendered in any case; the very first always is.
-            vehicle: Which vehicle carries the camera.
+        Slots are of `states` (`Trace.states`) and of consecutive ticks of the clock, later than those of the
+        call before. Ticks that are `forced` are rendered in any case; the very first always is.
         """
         self.coarse_count = 0
         chosen: list[int] = []

@@ -34,8 +34,7 @@ _SMALL_RAD2 = wp.constant(wp.float64(1.0e-2))
 class AttitudeArrays:
     """The attitudes of paths behind each other, on a device."""
 
-    knots: wp.array[wp.quatd]
-    """q_WB, shape [knot]."""
+    knots: wp.array[wp.quatd]  # q_WB, shape [knot]
     rotation_vectors: wp.array2d[wp.vec3d]
     """Coefficients in rising powers of normalised time [rad], shape [piece, 4]."""
 
@@ -45,10 +44,8 @@ class _Turn:
     """Orientation and its derivatives."""
 
     orientation: wp.quatd
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
-    acceleration: wp.vec3d
-    """dw_WB/dt in B [rad/s^2]."""
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
+    acceleration: wp.vec3d  # dw_WB/dt in B [rad/s^2]
 
 
 @wp.func
@@ -173,15 +170,7 @@ class Carrier:
         device: str,
         max_step_ns: int,
     ) -> None:
-        """Bring paths to the device.
-
-        Args:
-            config: The airframe that the settings name.
-            paths: All with an attitude.
-            path_of_world: Which of them each body follows, shape [N].
-            device: Where to compute.
-            max_step_ns: What counts as a step [ns].
-        """
+        """Bring paths, all with an attitude, to the device; each body follows one, `path_of_world`."""
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)

@@ -8,10 +8,9 @@ import logging
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
-import warp as wp
 from numpy.typing import ArrayLike
 
-from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.control import CommandMode, Controller
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
@@ -21,7 +20,6 @@ from neurosim_core.sensors.sampler_checks import sample_packet
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.reset import begin_batch, end_batch
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
@@ -45,7 +43,7 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
         if mode == "motor_speeds":
             array: Any = state.vehicle.arrays.rotor_speed_command
         else:
-            state.controllers[mode] = make_controller(
+            state.controllers[mode] = Controller(
                 mode,
                 model.airframe,
                 model.config.control.gains,
@@ -110,11 +108,8 @@ def plan_batch(
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
-    Args:
-        state: As of the end of what was launched.
-        stretch: What comes next.
-        closed_loop: Let the path controller command; otherwise the last command is held.
-        begin_ns: Where it begins [ns]; None: at the end of what was launched.
+    It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
+    controller commands; otherwise the last command is held.
     """
     number = state.launched_count
     stamps_ns = [
@@ -173,8 +168,6 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
 
 def integrate(state: State, batch: Batch) -> None:
     """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
-    device, count = state.vehicle.device, state.world_count
-    wp.launch(begin_batch, dim=count, inputs=[state.fleet], device=device)
     elapsed_ns = 0
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
@@ -187,10 +180,17 @@ def integrate(state: State, batch: Batch) -> None:
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
-        state.trace.record(state.surfaces, state.fleet, slot, elapsed_ns)
+        place = slot - batch.slot
+        state.trace.record(
+            state.surfaces,
+            state.fleet,
+            slot,
+            elapsed_ns,
+            first=place == 0,
+            last=place == len(batch.boundaries) - 1,
+        )
         if batch.closed_loop and boundary.control and not isinstance(state.vehicle, Carrier):
             state.path_controller.update(state.vehicle.arrays)
-    wp.launch(end_batch, dim=count, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
 
 
 def _fetch(state: State, batch: Batch) -> None:

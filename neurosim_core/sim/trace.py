@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.runtime.cuda import HostCopy
+from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, room_around
 from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
@@ -22,8 +22,6 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 3
-_ELAPSED_PARAMETER = 4
 _LAUNCHES_MAX = 256
 
 
@@ -31,16 +29,11 @@ _LAUNCHES_MAX = 256
 class Surfaces:
     """What vehicles can touch: the scene that each world is in, and the ground."""
 
-    fields: wp.array[DistanceField]
-    """Distance to each scene, shape [scene]."""
-    scene: wp.array[int]
-    """Which of them a world is in, shape [world]."""
-    radius_m: float
-    """Radius of the vehicle [m]."""
-    ground_height_m: wp.float64
-    """z of the plane that it may land on [m]; -inf: there is none."""
-    holds: int
-    """1: a vehicle that touches something is held until its world is reset."""
+    fields: wp.array[DistanceField]  # Distance to each scene, shape [scene]
+    scene: wp.array[int]  # Which of them a world is in, shape [world]
+    radius_m: float  # Radius of the vehicle [m]
+    ground_height_m: wp.float64  # z of the plane that it may land on [m]; -inf: there is none
+    holds: int  # 1: a vehicle that touches something is held until its world is reset
 
 
 @wp.struct
@@ -57,12 +50,10 @@ class Fleet:
     status: wp.array[wp.int32]
     redone_count: wp.array[wp.int64]
     evaluation_count: wp.array[wp.int64]
-    clock_ns: wp.array[wp.int64]
-    """Time of the world at the beginning of the batch [ns]."""
+    clock_ns: wp.array[wp.int64]  # Time of the world at the beginning of the batch [ns]
     collided: wp.array[wp.int32]
     """1: the vehicle has touched something in this batch, or is held because it did."""
-    active: wp.array[wp.int32]
-    """0: the world is left alone by samplers and collisions."""
+    active: wp.array[wp.int32]  # 0: the world is left alone by samplers and collisions
 
 
 @wp.struct
@@ -74,10 +65,8 @@ class Rows:
     clearance: wp.array2d[wp.float32]
     redone: wp.array2d[wp.int64]
     stamps: wp.array2d[wp.int64]
-    history: History
-    """Of all boundaries, as far back as rays with times of their own need it."""
-    entries: wp.array2d[wp.int64]
-    """Number of the entry of each slot in `history`; empty without one."""
+    history: History  # Of all boundaries, as far back as rays with times of their own need it
+    entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
 
 @wp.kernel
@@ -91,8 +80,12 @@ def _record(
     # In:
     slot: int,
     elapsed_ns: wp.int64,
+    is_first: int,
+    is_last: int,
 ) -> None:
     world = wp.tid()
+    if is_first != 0:  # touches of the batch before are forgotten, except of vehicles that are held by one
+        fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
     position = fleet.position[world]
     for axis in range(3):
         rows_out.states[slot, world, axis] = position[axis]
@@ -125,6 +118,8 @@ def _record(
         fleet.collided[world] = 1
         if surfaces.holds != 0:
             fleet.status[world] = STATUS_COLLISION
+    if is_last != 0:
+        fleet.clock_ns[world] += elapsed_ns
 
 
 @wp.kernel
@@ -277,32 +272,21 @@ class Trace:
         self._is_cuda = wp.get_device(device).is_cuda
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
-        self._recording: tuple[Any, Any] = (None, None)
+        self._record = RecordedLaunch(_record, device, block_dim=BLOCK_DIM)
         self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
 
-    def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
+    def record(
+        self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int, *, first: bool, last: bool
+    ) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
 
-        Args:
-            surfaces: `Surfaces`.
-            fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
-            slot: Where to write, in [0, capacity).
-            elapsed_ns: Time since the beginning of the batch [ns].
+        Vehicles that touch something are marked in `fleet`, and held if so configured; `elapsed_ns` counts
+        from the beginning of the batch. At the `first` slot of a batch vehicles touch nothing yet; at the
+        `last` clocks of worlds move on to it.
         """
-        if self._recording[0] is not fleet:
-            launch = wp.launch(
-                _record,
-                dim=self.states.shape[1],
-                inputs=[surfaces, fleet, self._rows, slot, elapsed_ns],
-                device=self.states.device,
-                block_dim=BLOCK_DIM,
-                record_cmd=True,
-            )
-            self._recording = (fleet, launch)
-        launch = self._recording[1]
-        launch.set_param_at_index(_SLOT_PARAMETER, slot)
-        launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
-        launch.launch()
+        self._record.launch(
+            self.states.shape[1], [surfaces, fleet, self._rows, slot, elapsed_ns, int(first), int(last)]
+        )
 
     def camera_poses(
         self,
@@ -317,14 +301,8 @@ class Trace:
     ) -> None:
         """Write the poses T_WC = T_WB T_BC of a camera at the first `count` of the given slots, in float32.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
-            p_WC: Positions, shape [world K]; overwritten.
-            q_WC: Orientations, shape [world K]; overwritten.
-            stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
+        Where the camera is on the body in each world is given as vec3d [m] and quatd, shape [world].
+        Positions, orientations, [world K], and times [ns], [world K, 1] or empty, are overwritten.
         """
         key = (slots.ptr, count, p_WC.ptr)
         # another list of slots may have the memory of one that is gone
@@ -376,12 +354,7 @@ class Trace:
     def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            twist: spatial_vectord, shape [world K]; overwritten.
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
+        As `camera_poses`; `twist` is of spatial_vectord, shape [world K].
         """
         world_count = self.states.shape[1]
         wp.launch(
@@ -425,14 +398,10 @@ class Trace:
 def make_surfaces(
     fields: Any, scene: Any, *, radius_m: float, ground_height_m: float | None, holds: bool
 ) -> Surfaces:
-    """Return what vehicles can touch.
+    """Return what vehicles of a radius can touch: `DistanceField` of each scene, index of that of each world.
 
-    Args:
-        fields: Distance to each scene, device array of `DistanceField`.
-        scene: Index of the scene of each world, device array of int32.
-        radius_m: Radius of the vehicle [m].
-        ground_height_m: z of the plane that it may land on [m]; None: there is none.
-        holds: A vehicle that touches something is held.
+    `ground_height_m` is z of the plane that they may land on; None: there is none. With `holds` a vehicle
+    that touches something is held.
     """
     surfaces = Surfaces()
     surfaces.fields, surfaces.scene = fields, scene

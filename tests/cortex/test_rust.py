@@ -33,7 +33,7 @@ CARGO = shutil.which(
 OLDEST = (1, 89)
 DEBIAN = Path("/usr/share/cargo/registry")
 """Where `apt install librust-zmq-dev` and the like put crates: they are taken from there, if they are."""
-CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-derive,serde-json,zmq}-dev"
+CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-json,zmq}-dev"
 PATIENCE_S = 900.0
 """After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
 
@@ -86,7 +86,7 @@ def start(runtime):
 
     def run(*arguments: str) -> subprocess.Popen[bytes]:
         pipe = subprocess.PIPE
-        command = [str(TARGET / "debug" / arguments[0]), *arguments[1:]]
+        command = [str(TARGET / "debug" / "cortex-peer"), *arguments]
         started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))
         return started[-1]
 
@@ -104,7 +104,7 @@ def finish(process: subprocess.Popen[bytes]) -> tuple[list[Any], list[str]]:
 
 
 class Publishing:
-    """A running `cortex-pub` that publishes messages of a type."""
+    """A running `cortex-peer pub` that publishes messages of a type."""
 
     def __init__(self, process: subprocess.Popen[bytes], kind: type) -> None:
         assert process.stdin is not None
@@ -134,7 +134,7 @@ class Publishing:
 
 
 class Reading:
-    """A `cortex-sub` that ends by itself, and whose output is read meanwhile: it must not wait for us."""
+    """A `cortex-peer sub` that ends by itself, and whose output is read meanwhile: it must never wait."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._results: list[tuple[list[Any], list[str]]] = []
@@ -148,10 +148,6 @@ class Reading:
         return messages, json.loads(errors[-1])
 
 
-def transport(name: str) -> list[str]:
-    return ["--tcp"] if name == "tcp" else []
-
-
 def test_vectors():
     output = cargo("test")
     assert {"test bodies ... ok", "test frames ... ok", "test types ... ok"} <= set(output.splitlines())
@@ -162,11 +158,10 @@ def blocks_of(count: int) -> list[Block]:
     return [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(count)]
 
 
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_reliable_from_python(start, make_node, over):
+def test_reliable_from_python(start, make_node):
     """More than all queues hold: the subscriber gets each message, and the publisher's end."""
-    publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, max_wait_s=SOON_S)
-    reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
+    publisher = make_node().publisher("/blocks", Block, max_wait_s=SOON_S)
+    reading = Reading(start("sub", "/blocks", "--reliable", "--once"))
     assert publisher.wait_for_subscribers(1, SOON_S)
     blocks = blocks_of(6_000)
     delivered = sum(map(publisher.publish, blocks))
@@ -179,11 +174,10 @@ def test_reliable_from_python(start, make_node, over):
         assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
 
 
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_reliable_from_rust(start, make_node, over):
+def test_reliable_from_rust(start, make_node):
     """As the other way round; every tenth message is a large one."""
     node = make_node()
-    publishing = Publishing(start("cortex-pub", "/blocks", *transport(over)), Block)
+    publishing = Publishing(start("pub", "/blocks"), Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
     publishing.await_subscribers(1)
     count, blocks = 3_000, blocks_of(3_000)
@@ -211,7 +205,7 @@ def test_reliable_from_rust(start, make_node, over):
 
 def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     """It counts what it has lost, learns of the last loss, and gets messages again."""
-    publishing = Publishing(start("cortex-pub", "/blocks"), Block)
+    publishing = Publishing(start("pub", "/blocks"), Block)
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
     publishing.await_subscribers(1)
     count = 2_000  # of a kilobyte: more than lies between the two
@@ -234,7 +228,7 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
 
 def test_several_subscribers_of_rust(start, make_node):
     """Each reader gets its own copy, whatever its policy; who leaves is no subscriber any more."""
-    publishing = Publishing(start("cortex-pub", "/scans"), Scan)
+    publishing = Publishing(start("pub", "/scans"), Scan)
     first, second = make_node("first"), make_node("second")
     lossy = first.subscriber("/scans", Scan, policy=keep_last(8))
     strict = second.subscriber("/scans", Scan, policy=reliable(8))
@@ -252,7 +246,7 @@ def test_several_subscribers_of_rust(start, make_node):
 
 def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     """Connected peers go on; who comes later is found through the registry that takes over."""
-    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
+    publishing = Publishing(start("pub", "/numbers"), Number)
     node = make_node("first")
     first = node.subscriber("/numbers", Number, policy=reliable(8))
     publishing.await_subscribers(1)
@@ -267,9 +261,9 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
 def test_rust_reports_what_it_has_not_heard_the_end_of(runtime, leavers):
     (runtime / "0").mkdir(mode=0o700)
     leavers.router.bind(f"ipc://{runtime}/0/registry")
-    program, pipe = TARGET / "debug" / "cortex-sub", subprocess.PIPE
+    program, pipe = TARGET / "debug" / "cortex-peer", subprocess.PIPE
     readers = [
-        subprocess.Popen([program, f"/cut{number}", "--reliable", "--once"], stdout=pipe, stderr=pipe)
+        subprocess.Popen([program, "sub", f"/cut{number}", "--reliable", "--once"], stdout=pipe, stderr=pipe)
         for number in (0, 1)
     ]
     try:

@@ -68,13 +68,7 @@ class Piece:
 
 
 def make_piece(kind: str, surfaces: Mapping[str, Surface], draws: Draws, **given: Any) -> Piece:
-    """Build a piece of the table.
-
-    Args:
-        kind: Its name in the table.
-        surfaces: What it can be made of, by name.
-        draws: Its random numbers.
-        **given: Variables that replace those of its `let`, or that it asks for.
+    """Build a piece of the table; `given` variables replace those of its `let`, or are those it asks for.
 
     Raises:
         NameError: It asks for a variable that is not given.
