@@ -63,7 +63,7 @@ class SceneReader:
                 at += size
             read, scene = pickle.loads(body, buffers=buffers)
             if read == config:
-                return scene  # type: ignore[no-any-return]
+                return scene
         return config.load()
 
     def __enter__(self) -> SceneReader:
