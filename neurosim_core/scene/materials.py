@@ -3,10 +3,7 @@
 
 A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the
 codes like sRGB does, but is decoded with one multiplication and no table, and with 8 times (blue: 4 times)
-the levels of an 8-bit file, so the error is far below that of the file itself. Of 16-bit floats and of 8-bit
-sRGB with a table, a trilinear lookup on a CPU takes 29 and 26 ns against 35 ns here, 1 % of a pixel; but
-this is one load of 32 bits per texel instead of three, 4 bytes instead of 6, and the averages are not
-rounded to 8 bits.
+the levels of an 8-bit file, so the error is far below that of the file itself; and it is one load of 32 bits.
 """
 
 from __future__ import annotations
