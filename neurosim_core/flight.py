@@ -26,6 +26,7 @@ from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
+from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
@@ -70,6 +71,7 @@ def fly(
     rerun: bool = True,
     console: Console | None = None,
     began_s: float | None = None,
+    scene: Callable[[], Scene] | None = None,
 ) -> FlightReport:
     """Fly a configuration, hand its packets to its sinks, and leave config.yaml and their files in a folder.
 
@@ -84,6 +86,7 @@ def fly(
         rerun: Write flight.rrd, if that is among the sinks.
         console: Where to print; standard output if None.
         began_s: When the command began, as `time.perf_counter` says; None: now.
+        scene: Returns the scene of `config`; None: it is loaded here.
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
@@ -107,6 +110,7 @@ def fly(
     with _new_folder(folder), console.status("preparing") as status:
         model = make_model(
             config,
+            scene=scene,
             on_phase=lambda phase: status.update(f"preparing: {phase}"),
             meanwhile=functools.partial(_load, sinks=sinks),
         )

@@ -26,8 +26,8 @@ from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.renderer import Renderer, RendererConfig, refuse_worlds
 from neurosim_core.scene.bodies import Body, BodyPoses
-from neurosim_core.scene.materials import linear_to_srgb8, srgb_to_linear
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.srgb import linear_to_srgb8, srgb_to_linear
 
 if TYPE_CHECKING:
     from cortex import Node

@@ -14,8 +14,9 @@ from typing import Any
 
 from cortex import Node
 from cortex.messages import Parameters, SimulatorReply, Step
-from neurosim_core.config import ConfigError, SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live.topics import SERVICES, STEP_DEADLINE_S
+from neurosim_core.settings_file import ConfigError
 
 ANSWER_DEADLINE_S = 30.0
 """How long a request waits for its answer [s]."""

@@ -21,10 +21,10 @@ from rich.console import Console
 
 from cortex import Node, Subscriber, TypeMismatch, latest
 from cortex.messages import Simulation
-from neurosim_core.config import ConfigError
 from neurosim_core.live.page import ControlPage
 from neurosim_core.live.session import LiveSession, ViewOptions
 from neurosim_core.live.topics import SIMULATION
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_sdk import import_rerun
 from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file

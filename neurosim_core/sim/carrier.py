@@ -148,15 +148,8 @@ def _carry(
 class Carrier:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still.
-
-    Attributes:
-        config: The parameters of the vehicle that is not there; of gravity, for IMUs.
-        count: Number of bodies.
-        device: Where they are.
-        max_step_ns: What counts as a step [ns].
-        arrays: Their state.
-        terms: Nothing is compiled in.
+    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
+    `config` of the vehicle that is not there IMUs need gravity.
     """
 
     terms: tuple[str, ...] = ()

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from neurosim_core.packets import Packet
 from neurosim_core.scene.bodies import Body, BodyConfig
 from neurosim_core.scene.body_shapes import Solid
-from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.scene import Material, Scene
+from neurosim_core.scene.srgb import linear_to_srgb8
 from neurosim_core.view.pictures import color_picture, picture_of
 from neurosim_core.view.rerun_sdk import import_rerun
 

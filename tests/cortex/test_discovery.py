@@ -150,9 +150,6 @@ def test_a_stopped_registry_disturbs_nobody(make):
     assert not any(node.ever_lost for node in nodes)
 
 
-# What order and loss may do: a registry that the test plays itself
-
-
 class Played:
     """A registry whose words the test chooses."""
 

@@ -19,10 +19,6 @@ def histogram(latencies_ns):
     return counts
 
 
-def test_an_empty_histogram_has_no_quantile():
-    assert math.isnan(quantile_ns(SubscriberCounters().latency, 0.5))
-
-
 @given(st.lists(st.integers(0, 2**39 - 1), min_size=1, max_size=200), st.floats(0.0, 1.0))
 def test_a_quantile_is_right_to_a_factor_of_two(latencies, fraction):
     """It lies in the bucket of the sample with that rank; a bucket spans a factor of two."""
@@ -33,13 +29,8 @@ def test_a_quantile_is_right_to_a_factor_of_two(latencies, fraction):
     assert low <= found <= max(2.0 * low, 1.0)
 
 
-@given(st.lists(st.integers(0, 2**45), min_size=1, max_size=200))
-def test_quantiles_grow(latencies):
-    found = [quantile_ns(histogram(latencies), fraction) for fraction in np.linspace(0.0, 1.0, 11)]
-    assert found == sorted(found)
-
-
 def test_the_extremes():
+    assert math.isnan(quantile_ns(SubscriberCounters().latency, 0.5))
     assert quantile_ns(histogram([0]), 0.5) <= 1.0
     assert quantile_ns(histogram([2**60]), 0.5) >= 2.0 ** (BUCKETS - 2)
     assert quantile_ns([0, 0, 0, 4] + [0] * 36, 0.5) == pytest.approx(6.0)  # the middle of [4, 8)
