@@ -16,7 +16,7 @@ from cortex.context import context, new_socket
 from cortex.host import NodeFiles
 from cortex.pub_socket import PubSockets, open_pub_socket
 from cortex.records import Endpoint, NodeRecord
-from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address, load_keys
+from cortex.security import Authenticator, Keys, apply_client, check_address, load_keys
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
@@ -78,7 +78,7 @@ class Places:
         secure: Secure | None = None
         if keys is not None:
             self._authenticator = Authenticator.acquire(context())
-            secure = partial(apply_server, keys=keys)
+            secure = partial(self._authenticator.secure, keys=keys)
         any_port = [f"tcp://{_bracket(listen)}:*"]
         opened = []
         for strict in (False, True):
