@@ -75,7 +75,7 @@ def generate(types: Sequence[type | Schema], *, namespace: str | None = None) ->
     generator = _Generator(namespace)
     for item in types:
         generator.message(item if isinstance(item, Schema) else schema_of(item))
-    names = ", ".join(block.name for block in generator.blocks)
+    names = ", ".join(generator.blocks)
     standard = "array complex cstddef cstdint limits optional stdexcept string string_view utility vector"
     return "\n".join(
         [
@@ -86,7 +86,7 @@ def generate(types: Sequence[type | Schema], *, namespace: str | None = None) ->
             "",
             "#include <cortex/codec.hpp>",
             "",
-            *(line for block in generator.blocks for line in block.guarded()),
+            *(line for block in generator.blocks.values() for line in block.guarded()),
         ]
     )
 
@@ -137,7 +137,7 @@ class _Generator:
 
     def __init__(self, namespace: str | None) -> None:
         self._namespace = namespace
-        self.blocks: list[_Block] = []
+        self.blocks: dict[str, _Block] = {}
 
     def _qualified(self, name: str) -> tuple[str, str, str]:
         """Namespace, identifier, and both together, of a type's name."""
@@ -145,11 +145,8 @@ class _Generator:
         namespace = self._namespace if self._namespace is not None else "::".join(parts[:-1])
         return namespace, parts[-1], f"{namespace}::{parts[-1]}" if namespace else parts[-1]
 
-    def _add(self, name: str, key: str, lines: Sequence[str]) -> None:
-        self.blocks.append(_Block(name, key, tuple(lines)))
-
     def _is_known(self, name: str, key: str) -> bool:
-        known = next((block for block in self.blocks if block.name == name), None)
+        known = self.blocks.get(name)
         if known is not None and known.key != key:
             raise ValueError(f"two different types would both be {name} in C++; generate them apart")
         return known is not None
@@ -195,7 +192,7 @@ class _Generator:
             "};",
             "}  // namespace cortex",
         ]
-        self._add(qualified, key, lines)
+        self.blocks[qualified] = _Block(qualified, key, tuple(lines))
         return f"::{qualified}"
 
     def message(self, schema: Schema) -> str:
@@ -209,7 +206,8 @@ class _Generator:
             taken = [name, *(member.name for member in members)]
             members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item, offset))
         lines = _within(namespace, _struct(name, members))
-        self._add(qualified, key, lines + self._codec(schema, f"::{qualified}", members))
+        lines += self._codec(schema, f"::{qualified}", members)
+        self.blocks[qualified] = _Block(qualified, key, tuple(lines))
         return f"::{qualified}"
 
     def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
