@@ -130,14 +130,15 @@ class Evt3Encoder:
         count += np.uint8(1)
         count[new_high] += np.uint8(1)
         if vectors is not None:
-            count[vectors.members] -= np.uint8(1)
-            count[vectors.windows] += np.uint8(1)
-            count[vectors.groups] += np.uint8(1)
+            groups, members, windows, bits = vectors
+            count[members] -= np.uint8(1)
+            count[windows] += np.uint8(1)
+            count[groups] += np.uint8(1)
         at_x = np.cumsum(count, dtype=np.intp, out=self._room("at_x", n, np.intp))
         at_x -= 1
         at_y = np.subtract(at_x, new_row, out=self._room("at_y", n, np.intp))
         if vectors is not None:
-            at_y[vectors.groups] -= 1
+            at_y[groups] -= 1
         low &= np.uint16(0xFFF)
         low |= np.uint16(_TIME_LOW << 12)
         out = self._room("out", int(at_x[-1]) + 1, np.uint16)  # what is not to be there is written over
@@ -148,14 +149,18 @@ class Evt3Encoder:
         column |= np.uint16(_ADDR_X << 12)
         out[at_x] = column
         if vectors is not None:
-            out[at_x[vectors.groups] - 1] = column[vectors.groups] & 0xFFF | _BASE_X << 12
-            out[at_x[vectors.windows]] = vectors.bits
+            out[at_x[groups] - 1] = column[groups] & 0xFFF | _BASE_X << 12
+            out[at_x[windows]] = bits
         return out, at_y
 
-    def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> _Vectors | None:
+    def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> tuple[NDArray[np.intp], ...] | None:
         """Find groups of events that are shorter as vectors: neighbours at most 11 columns apart.
 
         `apart` is 0 where an event has time and row of the one before.
+
+        Returns:
+            First events of groups, whose columns are the bases; all events of groups; first events of
+            vectors; the words of these.
         """
         n = len(column)
         gap = np.subtract(column[1:], column[:-1], out=self._room("gap", n - 1, np.uint16))
@@ -180,7 +185,7 @@ class Evt3Encoder:
         is_window[first] = True
         starts = np.flatnonzero(is_window)
         bits = np.bitwise_or.reduceat(np.uint16(1) << step % np.uint16(12), starts)
-        return _Vectors(begins, members, members[starts], bits | np.uint16(_VECT_12 << 12))
+        return begins, members, members[starts], (bits | np.uint16(_VECT_12 << 12)).astype(np.intp)
 
     def _room(self, name: str, count: int, dtype: Any) -> NDArray[Any]:
         """Return an array that is kept under a name; its content is of the packet before."""
@@ -308,17 +313,6 @@ def check_pixels(
         )
     if len(x) and polarity.max() > 1:
         raise EventCodecError(f"polarity is 0 or 1, got {polarity.max()}")
-
-
-class _Vectors(NamedTuple):
-    """Events that become vectors, by their numbers."""
-
-    groups: NDArray[np.intp]
-    """First events of groups: their columns are the bases."""
-    members: NDArray[np.intp]
-    windows: NDArray[np.intp]
-    """First events of vectors."""
-    bits: Words
 
 
 def _changes(values: NDArray[Any], out: NDArray[np.bool_]) -> NDArray[np.bool_]:
