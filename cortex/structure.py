@@ -99,7 +99,7 @@ def _copy_value(value: Any) -> Any:
     return copy_message(value) if hasattr(value, "__cortex_names__") else value
 
 
-def _equal(self: Any, other: object) -> Any:
+def _equal(self: Any, other: Any) -> Any:
     if type(other) is not type(self):
         return NotImplemented
     return all(_same(getattr(self, name), getattr(other, name)) for name in self.__cortex_names__)
