@@ -601,7 +601,8 @@ def _deflate_column(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
     chunks = []
     for first in range(0, len(octets), size):
         chunk = octets[first : first + size]
-        planes = np.zeros((chunk.shape[1], size), np.uint8)
+        planes = np.empty((chunk.shape[1], size), np.uint8)
         planes[:, : len(chunk)] = chunk.T
+        planes[:, len(chunk) :] = 0
         chunks.append(compress(planes, 1))
     return chunks

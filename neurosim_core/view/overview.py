@@ -18,7 +18,7 @@ from neurosim_core.view.rerun_layout import PICTURES
 _ROWS_MAX = 20_000
 _LINES_MAX = 12
 _CONSIDER_NS = 200_000_000
-"""A moment is compared with the best so far if the one compared before is as long ago, or if it is the last."""
+"""A moment is compared with the best so far if the one compared before is that long ago, or at the end."""
 _STEP_PX = 4
 """Every so many rows and columns tell how much there is to see in a picture."""
 
