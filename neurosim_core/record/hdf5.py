@@ -74,6 +74,7 @@ _PARTS_MAX = 64
 _FIRST_FLUSH_BYTES = 65536
 _ATTRIBUTE_MAX_BYTES = 60000
 _DEFLATE_THREADS = 8
+_scratch = threading.local()
 
 
 class RecordingWriter:
@@ -376,6 +377,8 @@ class _Stream:
         self._written = self._taken_count = 0
         schema = schema_of(self._type)
         self._fields = schema.fields
+        self._varying = {field.name: field.varying for field in schema.fields}
+        """Name of the length of each field that differs from packet to packet; empty if none does."""
         for name in (field.name for field in schema.fields):
             if name in (*HEADER_COLUMNS, "packet_count") or name.endswith("_end"):
                 raise ValueError(f"a field of a packet cannot be called {name!r}: recordings use this name")
@@ -425,10 +428,9 @@ class _Stream:
         for field in self._fields:
             if not field.constant:
                 value = values[field.name]
-                size += self._columns[field.name].append(value if field.varying else value[None])
-        lengths = {field.varying: len(values[field.name]) for field in self._fields if field.varying}
-        for name, length in lengths.items():
-            self._ends[name] += length
+                size += self._columns[field.name].append(value if self._varying[field.name] else value[None])
+        for length, count in {v: len(values[name]) for name, v in self._varying.items() if v}.items():
+            self._ends[length] += count
         self._numbers.append((packet.stamp_ns, packet.sequence, order, *self._ends.values()))
         self._last_ns = packet.stamp_ns
         self._written += 1
@@ -493,10 +495,9 @@ class _Stream:
         values = {field.name: as_numpy(getattr(packet, field.name)) for field in self._fields}
         lengths: dict[str, int] = {}
         for field in self._fields:
-            found, wanted = values[field.name].shape, field.shape
-            if field.varying and found:
-                lengths.setdefault(field.varying, found[0])
-                wanted = (lengths[field.varying], *wanted[1:])
+            found, wanted, varying = values[field.name].shape, field.shape, self._varying[field.name]
+            if varying and found:
+                wanted = (lengths.setdefault(varying, found[0]), *wanted[1:])
             fits = len(found) == len(wanted) or "..." in wanted
             if not fits or any(isinstance(n, int) and n != m for n, m in zip(wanted, found, strict=False)):
                 raise ValueError(
@@ -513,7 +514,7 @@ class _Stream:
             if field.constant:
                 fixed[field.name] = value.item()
             elif field.dtype == "any" or any(isinstance(length, str) for length in field.shape):
-                fixed[field.name] = value.shape[1:] if field.varying else value.shape
+                fixed[field.name] = value.shape[1:] if self._varying[field.name] else value.shape
                 if field.dtype == "any":
                     fixed[field.name] = (*fixed[field.name], value.dtype.name)
         return fixed
@@ -594,15 +595,23 @@ def _deflate(columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list
 
 
 def _deflate_column(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
-    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    octets = np.ascontiguousarray(rows).reshape(-1, 1).view(np.uint8)
-    size = length * (rows.size // len(rows))
     compress = (import_isal() or zlib).compress
-    chunks = []
-    for first in range(0, len(octets), size):
-        chunk = octets[first : first + size]
-        planes = np.empty((chunk.shape[1], size), np.uint8)
-        planes[:, : len(chunk)] = chunk.T
-        planes[:, len(chunk) :] = 0
+    size, width = length * int(np.prod(parts[0].shape[1:])), parts[0].itemsize
+    # Memory that comes and goes is mapped under the interpreter's lock, on which the flight waits.
+    if getattr(_scratch, "octets", np.empty(0)).size < size * width:
+        _scratch.octets = np.empty(size * width, np.uint8)
+    planes = _scratch.octets[: size * width].reshape(width, size)
+    chunks, filled = [], 0
+    for part in parts:
+        octets = np.ascontiguousarray(part).reshape(-1, 1).view(np.uint8)
+        while len(octets):
+            taken = octets[: size - filled]
+            planes[:, filled : filled + len(taken)] = taken.T
+            octets, filled = octets[len(taken) :], filled + len(taken)
+            if filled == size:
+                chunks.append(compress(planes, 1))
+                filled = 0
+    if filled:
+        planes[:, filled:] = 0
         chunks.append(compress(planes, 1))
     return chunks
