@@ -42,13 +42,10 @@ _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
 _AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 6.0e-3))
 """Least number of instants, and largest pixel [rad] for which lists pay: with fewer instants, or with fewer
-tiles of larger pixels, the search takes as long as it saves. Measured on an H200, 240x180 to 1280x720, in a
-house of 145,844 triangles, and with tests of a third more time in halls of 20,000 to 2 million."""
+tiles of larger pixels, the search takes as long as it saves."""
 _AUTO_FACES_MAX = 7.0
 """Largest product of the number of triangles, as cut for the light, and the solid angle of a pixel [sr] for
-which lists pay. In that house it is 6.6 at 346x260, where a frame's first pass takes 11.7 us with lists and
-13.1 without, and with each triangle cut into four 5.6 at 640x480 (24 and 39 us) and 19 at 346x260 (14.3 and
-13.3)."""
+which lists pay."""
 _UNRESOLVED_SHARE = 8
 """One in so many pixels may be unresolved; if there are more, the fallback kernel renders all pixels."""
 _THREADS_PER_MULTIPROCESSOR = 1280

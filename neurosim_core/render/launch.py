@@ -10,9 +10,11 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
+
+Part = TypeVar("Part")
 
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
@@ -44,6 +46,14 @@ def single_threaded_blas() -> dict[str, str]:
 def _pool(thread_count: int) -> ThreadPoolExecutor:
     """Return the threads that share a launch."""
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
+
+
+def share(work: Callable[[Part], object], parts: Sequence[Part]) -> None:
+    """Do all parts of a work side by side, the first of them in this thread."""
+    others = [_pool(core_count()).submit(work, part) for part in parts[1:]]
+    work(parts[0])
+    for other in others:
+        other.result()
 
 
 def kernel_variant(name: str, *terms: str) -> Callable[[Callable[..., Any]], Any]:

@@ -173,12 +173,9 @@ def _texture(pyrender: Any, srgb: NDArray[np.uint8]) -> Any:
 
 
 class PyrenderRenderer:
-    """Renders rgb and depth, one pose after another, through OpenGL.
+    """Renders rgb and depth of `renderer.Renderer` on the host, one pose after another, through OpenGL.
 
-    Attributes:
-        rgb: uint8 on the host, shape [M, H, W, 3]; the display curve is a power of 1 / 2.2, not sRGB.
-        depth: float32 on the host, shape [M, H, W].
-        log_radiance: None; so are normal and instance.
+    The display curve of rgb is a power of 1 / 2.2, not sRGB.
     """
 
     def __init__(

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.scene.bodies import BodyPoses
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.srgb import srgb_to_linear
 
 wp.set_module_options({"enable_backward": False})
 
@@ -147,14 +147,9 @@ def _draw(
 
 
 class SyntheticRenderer:
-    """Draws test cards. `render` neither allocates nor waits for a CUDA device.
+    """Draws test cards: log radiance without the pose, rgb and depth of `renderer.Renderer`.
 
-    Outputs that were not asked for are None; so are normal and instance.
-
-    Attributes:
-        log_radiance: float32, shape [K, H, W]; without the pose.
-        rgb: uint8, shape [M, H, W, 3].
-        depth: float32, shape [M, H, W].
+    `render` neither allocates nor waits for a CUDA device.
     """
 
     def __init__(

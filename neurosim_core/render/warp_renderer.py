@@ -80,18 +80,10 @@ class WarpRenderer:
 
     Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
     are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
-    triangles, run side by side. `render` neither allocates nor waits for a device. Outputs that are not
-    requested are None. See `outputs.RenderOutputs` for what they are.
+    triangles, run side by side. `render` neither allocates nor waits for a device. Outputs are those of
+    `renderer.Renderer`.
 
     Attributes:
-        log_radiance: float32, shape [N K, H, W].
-        rgb: uint8, shape [M, H, W, 3].
-        radiance: vec3, shape [M, H, W].
-        depth: float32, shape [M, H, W].
-        range: float32, shape [M, H, W].
-        normal: vec3, shape [M, H, W].
-        instance: int32, shape [M, H, W].
-        returns: vec3, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W]; of several
             lenses, one after the other.
         candidates: Candidate lists of tiles; None: rays traverse the tree.

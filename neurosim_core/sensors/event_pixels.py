@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.launch import core_count
+from neurosim_core.render.launch import core_count, share
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.sensors import event_worlds_scan
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
@@ -134,7 +133,6 @@ class Pixels:
         self._bounds = self._chunk_bounds()
         self._key_room = _KEYS_PER_PIXEL * width * height
         self._scan_number = itertools.count()
-        self._pool: ThreadPoolExecutor | None = None
 
     @property
     def noise(self) -> PixelNoise | None:
@@ -236,7 +234,8 @@ class Pixels:
             )
             chunk.counters_on_host.fetch(0, _COUNTERS)
 
-        self._share(launch, scan.chunks)
+        refuse_forked_process()
+        share(launch, scan.chunks)  # several on a CPU, one for each core
 
     def _stack(self, scan: Scan, chunk: Chunk) -> Any:
         """Return what the kernels take for a chunk of a scan: the arrays of one world."""
@@ -250,16 +249,6 @@ class Pixels:
         stack.keys = chunk.keys.reshape((1, -1))
         stack.counters = chunk.counters.reshape((1, -1))
         return stack
-
-    def _share(self, launch: Callable[[Chunk], None], chunks: list[Chunk]) -> None:
-        """Launch for all chunks; there are several on a CPU, which go to its cores."""
-        refuse_forked_process()
-        if len(chunks) > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
-        futures = [self._pool.submit(launch, chunk) for chunk in chunks[1:]] if self._pool else []
-        launch(chunks[0])
-        for future in futures:
-            future.result()
 
     def _chunk_bounds(self) -> list[tuple[int, int]]:
         pixel_count = self._width * self._height

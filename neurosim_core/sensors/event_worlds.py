@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from neurosim_core.render.launch import core_count
+from neurosim_core.render.launch import core_count, share
 from neurosim_core.sensors import event_worlds_scan as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
@@ -132,7 +131,6 @@ class WorldEventCamera:
             width=width,
             height=height,
         )
-        self._pool: ThreadPoolExecutor | None = None
 
     @property
     def thresholds(self) -> Any:
@@ -223,8 +221,8 @@ class WorldEventCamera:
             return
         keys, counts = self.stack.keys.numpy(), self.stack.counters.numpy()[:, 0]
 
-        def sort(first: int, end: int) -> None:
-            for world in range(first, end):
+        def sort(worlds: tuple[int, int]) -> None:
+            for world in range(*worlds):
                 keys[world, : counts[world]].sort()  # several times as fast as the network on a CPU
 
         self._share(sort)
@@ -232,8 +230,7 @@ class WorldEventCamera:
     def take_frames(self, frame_count: int, part: int, parity: int) -> None:
         """Scan all pixels: on a CUDA device at once, on the CPU some worlds on each core."""
 
-        def take(first: int, end: int) -> None:
-            worlds = (first, end)
+        def take(worlds: tuple[int, int]) -> None:
             self._states.launch(
                 self.stack, parity, 1 - parity, frame_count=frame_count, part=part, worlds=worlds
             )
@@ -258,19 +255,11 @@ class WorldEventCamera:
             record_cmd=True,
         )
 
-    def _share(self, work: Callable[[int, int], None]) -> None:
+    def _share(self, work: Callable[[tuple[int, int]], None]) -> None:
         """Do some worlds on each core of a CPU; on a CUDA device all at once."""
         world_count = self._shape[0]
         parts = min(core_count(), world_count) if self.device.is_cpu else 1
-        edges = [world_count * part // parts for part in range(parts + 1)]
-        if parts > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(parts - 1, thread_name_prefix="world-events")
-        futures = [
-            self._pool.submit(work, first, end) for first, end in itertools.pairwise(edges[1:]) if self._pool
-        ]
-        work(edges[0], edges[1])
-        for future in futures:
-            future.result()
+        share(work, list(itertools.pairwise(world_count * part // parts for part in range(parts + 1))))
 
     def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

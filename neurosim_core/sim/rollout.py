@@ -275,17 +275,17 @@ def start(model: Model, state: State) -> list[Packet]:
     return read(model, state)
 
 
-def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> list[Packet]:
+def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
     """Fly one batch, at most to what `batch_end_ns` gives, and return what the sensors yield in it.
 
     The state moves on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
-    (`failure`). With `closed_loop` the path controller commands; otherwise the last command is held.
+    (`failure`). The path controller commands.
 
     Raises:
         RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
     """
     _check_all_read(state)
-    launch_until(model, state, end_ns, closed_loop=closed_loop)
+    launch_until(model, state, end_ns)
     return read(model, state)
 
 

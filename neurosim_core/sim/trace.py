@@ -60,11 +60,11 @@ class Fleet:
 class Rows:
     """The slots of a trace."""
 
-    states: wp.array3d[wp.float64]
-    status: wp.array2d[wp.int32]
-    clearance: wp.array2d[wp.float32]
-    redone: wp.array2d[wp.int64]
-    stamps: wp.array2d[wp.int64]
+    states: wp.array3d[wp.float64]  # Shape [slot, world, 13 + R]; the others: [slot, world]
+    status: wp.array2d[wp.int32]  # Why a vehicle is held (`MultirotorArrays.status`)
+    clearance: wp.array2d[wp.float32]  # From the vehicle to the nearest surface [m], <= 0 where it touches
+    redone: wp.array2d[wp.int64]  # Intervals redone so far (`MultirotorArrays.redone_count`)
+    stamps: wp.array2d[wp.int64]  # Time since the reset of the world [ns]
     history: History  # Of all boundaries, as far back as rays with times of their own need it
     entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
@@ -244,13 +244,7 @@ class TraceRows(NamedTuple):
 class Trace:
     """Device buffers with one slot for each boundary of the batches in flight, and their copies on the host.
 
-    Attributes:
-        states: States, float64, shape [slot, world, 13 + R].
-        status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, world].
-        stamps: Time of each slot since the reset of the world [ns], int64, shape [slot, world].
-        redone: Intervals redone so far (`MultirotorArrays.redone_count`), shape [slot, world].
-        clearance: Distance from the vehicle to the nearest surface [m], <= 0 where it touches, float32, shape
-            [slot, world].
+    Its arrays are those of `Rows`.
     """
 
     def __init__(
