@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
@@ -25,7 +25,7 @@ from neurosim_core.sim.reset import begin_batch, end_batch
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
-from neurosim_core.vehicle import DynamicsError
+from neurosim_core.vehicle import DynamicsError, Multirotor
 from neurosim_core.vehicle.host_vehicle import Vehicle
 from neurosim_core.vehicle.status import STATUS_COLLISION
 
@@ -173,24 +173,42 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
 
 def integrate(state: State, batch: Batch) -> None:
     """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
-    device, count = state.vehicle.device, state.world_count
-    wp.launch(begin_batch, dim=count, inputs=[state.fleet], device=device)
+    device, worlds = state.vehicle.device, state.world_count
+    wp.launch(begin_batch, dim=worlds, inputs=[state.fleet], device=device)
     elapsed_ns = 0
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
-    for slot, (boundary, span_ns) in enumerate(
-        zip(batch.boundaries, batch.elapsed_ns, strict=True), batch.slot
-    ):
-        if span_ns > 0:
-            state.vehicle.advance(span_ns)
-        elapsed_ns += span_ns
+    vehicle, trace, slot = state.vehicle, state.trace, batch.slot
+    for boundary, span_ns, count in _stretches(batch):
+        if isinstance(vehicle, Multirotor) and span_ns > 0:
+            recorder = trace.recorder(state.surfaces, state.fleet)
+            vehicle.advance(span_ns, count=count, recorder=recorder, slot=slot, elapsed_ns=elapsed_ns)
+        else:
+            for place in range(count):
+                if span_ns > 0:
+                    vehicle.advance(span_ns)
+                since_ns = elapsed_ns + (place + 1) * span_ns
+                trace.record(state.surfaces, state.fleet, slot + place, since_ns)
+        slot += count
+        elapsed_ns += count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
-        state.trace.record(state.surfaces, state.fleet, slot, elapsed_ns)
-        if batch.closed_loop and boundary.control and not isinstance(state.vehicle, Carrier):
-            state.path_controller.update(state.vehicle.arrays)
-    wp.launch(end_batch, dim=count, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
+        if batch.closed_loop and boundary.control and not isinstance(vehicle, Carrier):
+            state.path_controller.update(vehicle.arrays)
+    wp.launch(end_batch, dim=worlds, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
+
+
+def _stretches(batch: Batch) -> Iterator[tuple[Boundary, int, int]]:
+    """Yield equal spans before whose last boundary nothing is due: that boundary, span [ns], how many."""
+    count = 0
+    for boundary, span_ns, next_ns in zip(
+        batch.boundaries, batch.elapsed_ns, [*batch.elapsed_ns[1:], None], strict=True
+    ):
+        count += 1
+        if boundary.samplers or boundary.control or next_ns != span_ns:
+            yield boundary, span_ns, count
+            count = 0
 
 
 def _fetch(state: State, batch: Batch) -> None:

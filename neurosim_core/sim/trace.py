@@ -12,6 +12,7 @@ from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
 from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
+from neurosim_core.vehicle.integrator import Recorder
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -22,8 +23,8 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 3
-_ELAPSED_PARAMETER = 4
+_SLOT_PARAMETER = 1
+_ELAPSED_PARAMETER = 2
 _LAUNCHES_MAX = 256
 
 
@@ -80,19 +81,21 @@ class Rows:
     """Number of the entry of each slot in `history`; empty without one."""
 
 
-@wp.kernel
-def _record(
-    # Model:
-    surfaces: Surfaces,
-    # In/out:
-    fleet: Fleet,
-    # Out:
-    rows_out: Rows,
-    # In:
-    slot: int,
-    elapsed_ns: wp.int64,
-) -> None:
-    world = wp.tid()
+@wp.struct
+class _Record:
+    """What is read and written where states are recorded."""
+
+    surfaces: Surfaces
+    fleet: Fleet
+    rows: Rows
+
+
+@wp.func
+def note_state(record: _Record, world: int, slot: int, elapsed_ns: wp.int64):
+    """Copy the state of a vehicle into a slot, and note whether it touches something."""
+    surfaces = record.surfaces
+    fleet = record.fleet
+    rows_out = record.rows
     position = fleet.position[world]
     for axis in range(3):
         rows_out.states[slot, world, axis] = position[axis]
@@ -125,6 +128,11 @@ def _record(
         fleet.collided[world] = 1
         if surfaces.holds != 0:
             fleet.status[world] = STATUS_COLLISION
+
+
+@wp.kernel
+def _note_states(record: _Record, slot: int, elapsed_ns: wp.int64) -> None:
+    note_state(record, wp.tid(), slot, elapsed_ns)
 
 
 @wp.kernel
@@ -277,8 +285,25 @@ class Trace:
         self._is_cuda = wp.get_device(device).is_cuda
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
-        self._recording: tuple[Any, Any] = (None, None)
+        self._recording: tuple[Any, Any, Any] = (None, None, None)
         self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
+
+    def recorder(self, surfaces: Any, fleet: Any) -> Recorder:
+        """Return what does `record` for one vehicle, within a kernel."""
+        if self._recording[0] is not fleet:
+            record = _Record()
+            record.surfaces, record.fleet, record.rows = surfaces, fleet, self._rows
+            launch = wp.launch(
+                _note_states,
+                dim=self.states.shape[1],
+                inputs=[record, 0, 0],
+                device=self.states.device,
+                block_dim=BLOCK_DIM,
+                record_cmd=True,
+            )
+            self._recording = (fleet, Recorder(note_state, record), launch)
+        recorder: Recorder = self._recording[1]
+        return recorder
 
     def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
@@ -289,17 +314,8 @@ class Trace:
             slot: Where to write, in [0, capacity).
             elapsed_ns: Time since the beginning of the batch [ns].
         """
-        if self._recording[0] is not fleet:
-            launch = wp.launch(
-                _record,
-                dim=self.states.shape[1],
-                inputs=[surfaces, fleet, self._rows, slot, elapsed_ns],
-                device=self.states.device,
-                block_dim=BLOCK_DIM,
-                record_cmd=True,
-            )
-            self._recording = (fleet, launch)
-        launch = self._recording[1]
+        self.recorder(surfaces, fleet)
+        launch = self._recording[2]
         launch.set_param_at_index(_SLOT_PARAMETER, slot)
         launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
         launch.launch()

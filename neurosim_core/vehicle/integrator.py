@@ -55,11 +55,20 @@ class Batch:
     evaluation_count: wp.array(dtype=wp.int64)
 
 
+class Recorder(NamedTuple):
+    """Notes the states of vehicles while they move."""
+
+    note: Any
+    """Warp function of: `model`; the vehicle; the slot; time since the beginning of the batch [ns]."""
+    model: Any
+    """What it reads and writes."""
+
+
 class Kernels(NamedTuple):
     """The kernels of one set of terms."""
 
-    advance: Any
-    """Moves every vehicle by a duration."""
+    move: Any
+    """Device function that moves one vehicle by an interval; see `make_advance`."""
     accelerate: Any
     """Evaluates linear and angular acceleration at the current state."""
     begin: Any
@@ -182,17 +191,9 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
                 airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0)
             )
 
-    @wp.kernel(module=module, enable_backward=False)
-    def advance(
-        # Model:
-        airframes: wp.array[Airframe],
-        around: Surroundings,
-        interval: Interval,
-        # In/out:
-        batch: Batch,
-    ):
-        vehicle = wp.tid()
-        airframe = airframes[vehicle]
+    @wp.func
+    def move(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
+        """Move one vehicle by an interval, unless it is held."""
         if batch.status[vehicle] != STATUS_OK:
             return
         for rotor in range(batch.rotor_speed_command.shape[1]):
@@ -268,4 +269,36 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
                 airframes[vehicle], around.wind, vehicle, wp.int64(0), wp.float64(0.0)
             )
 
-    return Kernels(advance, accelerate, begin if windy else None)
+    return Kernels(move, accelerate, begin if windy else None)
+
+
+@functools.cache
+def make_advance(terms: frozenset[str], note: Any) -> Any:
+    """Return the kernel that moves every vehicle by equal intervals; after each, `note` (see `Recorder`)."""
+    move = make_kernels(terms).move
+    model_type = wp.int32 if note is None else next(iter(note.input_types.values()))
+    name = ".".join(("_".join(sorted(terms)) or "rigid", "alone" if note is None else note.key))
+
+    @wp.kernel(module=wp.get_module(f"{__name__}.{name}"), enable_backward=False)
+    def advance(
+        # Model:
+        airframes: wp.array[Airframe],
+        around: Surroundings,
+        interval: Interval,
+        # In/out:
+        batch: Batch,
+        recorder: model_type,
+        # In:
+        interval_count: wp.int32,
+        slot: wp.int32,
+        elapsed_ns: wp.int64,
+    ):
+        vehicle = wp.tid()
+        airframe = airframes[vehicle]
+        for index in range(interval_count):
+            move(airframe, around, interval, batch, vehicle)
+            if wp.static(note is not None):
+                since_ns = elapsed_ns + wp.int64(index + 1) * interval.duration_ns
+                note(recorder, vehicle, slot + index, since_ns)
+
+    return advance
