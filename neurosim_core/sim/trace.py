@@ -91,7 +91,7 @@ class _Record:
 
 
 @wp.func
-def note_state(record: _Record, world: int, slot: int, elapsed_ns: wp.int64):
+def note_state(record: _Record, world: int, slot: int, elapsed_ns: wp.int64) -> None:
     """Copy the state of a vehicle into a slot, and note whether it touches something."""
     surfaces = record.surfaces
     fleet = record.fleet
