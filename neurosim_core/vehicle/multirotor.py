@@ -25,8 +25,9 @@ Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
 
 _STEP_MAX_NS = 10**12
-_LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
-_COUNT_PARAMETER = 5  # of `make_advance`; slot and elapsed time follow
+_LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration and count
+_SLOT_PARAMETER = 6  # of `make_advance`
+_ELAPSED_PARAMETER = 7
 
 
 class MultirotorState(NamedTuple):
@@ -198,7 +199,7 @@ class Multirotor:
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
             self._begin = self._record(self._kernels.begin, self.airframes, self._around, None, self._batch)
-        self._launches: dict[tuple[int, Recorder | None], wp.Launch] = {}
+        self._launches: dict[tuple[int, int, Recorder | None], wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self.reset()
 
@@ -301,11 +302,12 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        launch = self._launches.get((duration_ns, recorder))
+        launch = self._launches.get((duration_ns, count, recorder))
         if launch is None:
-            launch = self._record_advance(duration_ns, recorder)
-        for index, value in enumerate((count, slot, elapsed_ns), _COUNT_PARAMETER):
-            launch.set_param_at_index(index, value)
+            launch = self._record_advance(duration_ns, count, recorder)
+        if recorder is not None:
+            launch.set_param_at_index(_SLOT_PARAMETER, slot)
+            launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
         launch.launch()
         self._stamp_ns += count * duration_ns
 
@@ -394,19 +396,19 @@ class Multirotor:
         )
         return launch
 
-    def _record_advance(self, duration_ns: int, recorder: Recorder | None) -> wp.Launch:
+    def _record_advance(self, duration_ns: int, count: int, recorder: Recorder | None) -> wp.Launch:
         """Prepare the launch for one duration, and keep it."""
         if duration_ns <= 0:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
         if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
             raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
-        launch = self._record_interval(duration_ns, recorder)
+        launch = self._record_interval(duration_ns, count, recorder)
         if len(self._launches) >= _LAUNCH_COUNT_MAX:
             del self._launches[next(iter(self._launches))]
-        self._launches[duration_ns, recorder] = launch
+        self._launches[duration_ns, count, recorder] = launch
         return launch
 
-    def _record_interval(self, duration_ns: int, recorder: Recorder | None) -> wp.Launch:
+    def _record_interval(self, duration_ns: int, count: int, recorder: Recorder | None) -> wp.Launch:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lag = lag_constants(step_s, self.config.motor_time_constant_s)
@@ -428,7 +430,7 @@ class Multirotor:
         )
         note, model = recorder or (None, 0)
         kernel = make_advance(frozenset(self.terms), note)
-        return self._record(kernel, self.airframes, self._around, interval, self._batch, model, 1, 0, 0)
+        return self._record(kernel, self.airframes, self._around, interval, self._batch, model, count, 0, 0)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:
