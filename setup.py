@@ -12,7 +12,6 @@ SUBJECTS = [
     "construct",
     "fast_send",
     "fast_receive",
-    "items",
     "native",
     "pack",
     "ring_reader",

@@ -20,7 +20,7 @@ import warp as wp
 
 import neurosim_core
 from neurosim_core import run
-from neurosim_core.control import MODES, make_controller, mode_kernel
+from neurosim_core.control import MODES, Controller, mode_kernel
 from neurosim_core.render.antialias import antialiasing_kernels
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
@@ -38,7 +38,7 @@ from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS
-from neurosim_core.vehicle.integrator import make_advance
+from neurosim_core.vehicle.integrator import make_advance, make_flight
 
 ARCHITECTURES = (80, 90)
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
@@ -113,14 +113,14 @@ def make_kernels() -> None:
     make_begin(signal_terms(TERMS))
     for errors in ((), IMU_TERMS):
         make_imu(frozenset(errors))
-    make_advance(frozenset(VEHICLE_TERMS), note_state)
+    make_flight(frozenset(VEHICLE_TERMS), note_state)
     mode_kernel("path", frozenset(AIR_TERMS))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
-        make_advance(frozenset(vehicle.terms), None)
+        make_advance(frozenset(vehicle.terms))
         for mode in MODES:
             paths = hover(HoverConfig(), position=[0.0, 0.0, 1.0]) if mode == "path" else None
-            make_controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)
+            Controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)
 
 
 def build(module: wp.Module) -> tuple[str, float]:

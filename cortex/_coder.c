@@ -142,11 +142,15 @@ static PyObject *coder_decode(Coder *coder, PyObject *const *arguments, Py_ssize
 /* The type */
 
 static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"block", "stamp", "head", NULL};
-    PyObject *block, *head;
+    static char *names[] = {"rows", "objects", "stamp", "head", NULL};
+    PyObject *rows, *objects, *head;
     Py_ssize_t stamp;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!nS:Coder", names, &PyTuple_Type, &block, &stamp, &head))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "SO!nS:Coder", names, &rows, &PyTuple_Type, &objects, &stamp, &head))
         return NULL;
+    if (PyBytes_GET_SIZE(rows) == 0 || PyBytes_GET_SIZE(rows) % (Py_ssize_t)sizeof(Item)) {
+        PyErr_Format(PyExc_ValueError, "a row has %zu bytes, got %zd", sizeof(Item), PyBytes_GET_SIZE(rows));
+        return NULL;
+    }
     const Py_ssize_t head_size = PyBytes_GET_SIZE(head);
     if (head_size != 0 && head_size != HEAD_SIZE) {
         PyErr_Format(PyExc_ValueError, "a head has %d bytes, got %zd", HEAD_SIZE, head_size);
@@ -157,25 +161,17 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
     memcpy(coder->head, PyBytes_AS_STRING(head), (size_t)head_size);
     coder->has_head = head_size != 0;
     coder->stamp = stamp;
-    if (!take_block(&coder->block, block)) {
-        Py_DECREF(coder);
-        return NULL;
-    }
-    if (stamp >= coder->block.count || (stamp >= 0 && coder->block.fields[stamp].kind != NUMBER)) {
-        PyErr_Format(PyExc_ValueError, "field %zd is no stamp", stamp);
-        Py_DECREF(coder);
-        return NULL;
-    }
+    coder->table = (Table){Py_NewRef(rows), Py_NewRef(objects), (const Item *)(const void *)PyBytes_AS_STRING(rows)};
     return (PyObject *)coder;
 }
 
 static int coder_traverse(Coder *coder, visitproc visit, void *arg) {
     Py_VISIT(coder->slots);
-    Py_VISIT(coder->block.row);
+    Py_VISIT(coder->table.objects);
     return 0;
 }
 
-/* What keeps the block in a cycle is its class, which breaks it. */
+/* What keeps the table in a cycle is its class, which breaks it. */
 static int coder_clear(Coder *coder) {
     Py_CLEAR(coder->slots);
     return 0;
@@ -184,7 +180,8 @@ static int coder_clear(Coder *coder) {
 static void coder_dealloc(Coder *coder) {
     PyObject_GC_UnTrack(coder);
     coder_clear(coder);
-    free_block(&coder->block);
+    Py_XDECREF(coder->table.rows);
+    Py_XDECREF(coder->table.objects);
     Py_TYPE(coder)->tp_free((PyObject *)coder);
 }
 
@@ -200,11 +197,12 @@ static PyMemberDef coder_members[] = {
 };
 
 PyDoc_STRVAR(coder_doc,
-"Coder(block, stamp, head)\n--\n\n"
+"Coder(rows, objects, stamp, head)\n--\n\n"
 "Writes and reads the messages of one type.\n\n"
 "Args:\n"
-"    block: What `native.py` says of the type.\n"
-"    stamp: Index of the field that is the stamp, -1: none.\n"
+"    rows: The table that `native.py` makes of the type: what it says is not checked.\n"
+"    objects: What the rows name.\n"
+"    stamp: Number of the row of the field that is the stamp, -1: none.\n"
 "    head: What frames begin with, 24 bytes; empty: this one makes and reads no frames.\n");
 
 PyTypeObject CoderType = {

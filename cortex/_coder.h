@@ -9,8 +9,8 @@ enum { DEFERRED_MAX = 16 };
 
 typedef struct {
     PyObject_HEAD
-    Block block;
-    Py_ssize_t stamp; /* field that is the stamp, -1: none */
+    Table table;
+    Py_ssize_t stamp; /* row of the field that is the stamp, -1: none */
     int has_head;
     char head[HEAD_SIZE];
     PyObject *slots; /* a RingReader, which has the bodies that are in slots; NULL or None: they are not read here */
@@ -27,6 +27,7 @@ typedef struct {
 
 /* One message on its way to bytes. */
 typedef struct {
+    const Table *table;
     char *out;        /* NULL: it is only measured */
     Py_ssize_t end;   /* where the next item of the tail may begin */
     Py_ssize_t limit; /* where the body must end */

@@ -23,7 +23,8 @@ typedef struct {
 static PyObject *maker_name, *init_name;
 static PyTypeObject MakerType;
 
-Py_ssize_t slot_of(PyTypeObject *cls, PyObject *name) {
+/* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
+static Py_ssize_t slot_of(PyTypeObject *cls, PyObject *name) {
     PyObject *descriptor = PyObject_GetAttr((PyObject *)cls, name);
     if (descriptor == NULL) return -1;
     Py_ssize_t slot = -1;
@@ -179,7 +180,17 @@ static PyObject *hasten(PyObject *module, PyObject *arguments) {
     Py_RETURN_NONE;
 }
 
+static PyObject *find_slot(PyObject *module, PyObject *arguments) {
+    (void)module;
+    PyTypeObject *cls;
+    PyObject *name;
+    if (!PyArg_ParseTuple(arguments, "O!U:slot_of", &PyType_Type, &cls, &name)) return NULL;
+    const Py_ssize_t slot = slot_of(cls, name);
+    return slot < 0 ? NULL : PyLong_FromSsize_t(slot);
+}
+
 static PyMethodDef functions[] = {
+    {"slot_of", find_slot, METH_VARARGS, "Where objects of a class keep a field that is one of its slots."},
     {"hasten", hasten, METH_VARARGS, hasten_doc},
     {NULL, NULL, 0, NULL},
 };

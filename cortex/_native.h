@@ -24,9 +24,6 @@ int add_fast_receive(PyObject *module);
 int add_ring_reader(PyObject *module);
 int add_socket(PyObject *module);
 
-/* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
-Py_ssize_t slot_of(PyTypeObject *cls, PyObject *name);
-
 extern PyTypeObject SocketType;
 
 /* The next frame of a `Socket` as bytes; NULL if there is none, perhaps with an error set. If it may wait, it does so

@@ -91,16 +91,17 @@ static int write_bool(PyObject *value, char *out) {
     return 1;
 }
 
-static int write_member(const Members *members, PyObject *value, char *out) {
-    Py_ssize_t low = 0, high = members->count;
+static int write_member(const Table *table, const Item *item, PyObject *value, char *out) {
+    int64_t low = item->first + item->count, high = low + item->count; /* behind those by number are those by address */
     while (low < high) {
-        const Py_ssize_t middle = (low + high) / 2;
-        const Member *member = &members->by_member[middle];
-        if (member->member == value) {
-            memcpy(out, &member->number, 4);
+        const int64_t middle = (low + high) / 2;
+        PyObject *member = object_of(table, &table->items[middle]);
+        if (member == value) {
+            const int32_t number = (int32_t)table->items[middle].code;
+            memcpy(out, &number, 4);
             return 1;
         }
-        if ((uintptr_t)member->member < (uintptr_t)value) low = middle + 1;
+        if ((uintptr_t)member < (uintptr_t)value) low = middle + 1;
         else high = middle;
     }
     return 0;
@@ -145,17 +146,18 @@ static int pack_str(Pack *pack, PyObject *value, Py_ssize_t at) {
 /* Arrays */
 
 /* Index of an array's dtype; -1 if the array is not of the usual class, of a right dtype and shape. */
-static Py_ssize_t find_dtype(const Array *known, PyObject *value, npy_intp *dimensions) {
+static int64_t find_dtype(const Table *table, const Item *item, PyObject *value, npy_intp *dimensions) {
     if (!PyArray_CheckExact(value)) return -1;
     PyArrayObject *array = (PyArrayObject *)value;
-    if (PyArray_NDIM(array) != known->rank || !PyArray_IS_C_CONTIGUOUS(array)) return -1;
+    if (PyArray_NDIM(array) != item->count || !PyArray_IS_C_CONTIGUOUS(array)) return -1;
+    const Item *axes = table->items + item->first, *dtypes = axes + item->count;
     const npy_intp *shape = PyArray_DIMS(array);
-    for (int axis = 0; axis < known->rank; ++axis) {
-        if (shape[axis] > UINT32_MAX || !fits_axis(&known->axes[axis], shape[axis], dimensions)) return -1;
+    for (int64_t axis = 0; axis < item->count; ++axis) {
+        if (shape[axis] > UINT32_MAX || !fits_axis(&axes[axis], shape[axis], dimensions)) return -1;
     }
     const PyArray_Descr *descr = PyArray_DESCR(array);
-    for (Py_ssize_t index = 0; index < known->dtype_count; ++index) {
-        if (known->dtypes[index].descr == descr) return index;
+    for (int64_t index = 0; index < item->dtypes; ++index) {
+        if (descr_of(table, &dtypes[index]) == descr) return index;
     }
     return -1;
 }
@@ -176,16 +178,16 @@ static void put_items(Pack *pack, PyArrayObject *array, Py_ssize_t start) {
     }
 }
 
-static int pack_variable(Pack *pack, const Array *known, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
-    const Py_ssize_t dtype = find_dtype(known, value, dimensions);
+static int pack_variable(Pack *pack, const Item *item, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
+    const int64_t dtype = find_dtype(pack->table, item, value, dimensions);
     if (dtype < 0) return 0;
     PyArrayObject *array = (PyArrayObject *)value;
     const Py_ssize_t size = PyArray_NBYTES(array);
     const Py_ssize_t start = claim(pack, size, size >= LARGE_ARRAY_BYTES ? 64 : 8);
     if (start < 0) return 0;
     if (pack->out == NULL) return pack->place == NULL || is_placed(pack, array, start);
-    describe(pack, at, start, known->head + dtype);
-    for (int axis = 0; axis < known->rank; ++axis) {
+    describe(pack, at, start, item->code + dtype);
+    for (int axis = 0; axis < item->count; ++axis) {
         const uint32_t length = (uint32_t)PyArray_DIM(array, axis);
         memcpy(pack->out + at + 8 + 4 * axis, &length, 4);
     }
@@ -193,15 +195,16 @@ static int pack_variable(Pack *pack, const Array *known, PyObject *value, Py_ssi
     return 1;
 }
 
-static int pack_fixed(Pack *pack, const Array *known, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
-    if (find_dtype(known, value, dimensions) < 0) return 0;
+static int pack_fixed(Pack *pack, const Item *item, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
+    if (find_dtype(pack->table, item, value, dimensions) < 0) return 0;
     put_items(pack, (PyArrayObject *)value, at);
     return 1;
 }
 
 /* What has others within */
 
-static int pack_list(Pack *pack, const List *list, PyObject *value, Py_ssize_t at) {
+static int pack_list(Pack *pack, const Item *list, PyObject *value, Py_ssize_t at) {
+    const Item *item = pack->table->items + list->first;
     if (!PyList_CheckExact(value) && !PyTuple_CheckExact(value)) return 0;
     const Py_ssize_t count = PySequence_Fast_GET_SIZE(value);
     if (count > pack->values_left / list->values) return 0;
@@ -211,24 +214,28 @@ static int pack_list(Pack *pack, const List *list, PyObject *value, Py_ssize_t a
     if (pack->out != NULL) {
         describe(pack, at, start, count);
         memset(pack->out + start, 0, (size_t)(count * list->stride));
-    } else if (!list->item->has_tail) {
+    } else if (!item->has_tail) {
         return 1;
     }
     PyObject **elements = PySequence_Fast_ITEMS(value);
     npy_intp dimensions[DIMENSIONS_MAX];
     for (Py_ssize_t index = 0; index < count; ++index) {
-        begin_scope(dimensions, list->dimension_count);
-        if (!pack_item(pack, list->item, elements[index], start + index * list->stride, dimensions)) return 0;
+        begin_scope(dimensions, list->scope);
+        if (!pack_item(pack, item, elements[index], start + index * list->stride, dimensions)) return 0;
     }
     return 1;
 }
 
-static int pack_message(Pack *pack, const Block *block, PyObject *message, Py_ssize_t at) {
-    if (Py_TYPE(message) != block->cls) return 0;
+static int is_of_class(const Table *table, const Item *item, PyObject *message) {
+    return (PyObject *)Py_TYPE(message) == object_of(table, item);
+}
+
+static int pack_message(Pack *pack, const Item *item, PyObject *message, Py_ssize_t at) {
+    if (!is_of_class(pack->table, item, message)) return 0;
     npy_intp dimensions[DIMENSIONS_MAX];
-    begin_scope(dimensions, block->dimension_count);
-    const Item *end = block->fields + block->count;
-    for (const Item *field = block->fields; field < end; ++field) {
+    begin_scope(dimensions, item->scope);
+    const Item *field = pack->table->items + item->first, *end = field + item->count;
+    for (; field < end; ++field) {
         if (pack->out == NULL && !field->has_tail) continue;
         PyObject *value = *place_of(field, message);
         if (value == NULL || !pack_item(pack, field, value, at + field->offset, dimensions)) return 0;
@@ -238,72 +245,75 @@ static int pack_message(Pack *pack, const Block *block, PyObject *message, Py_ss
 
 /* Put a value whose block is at `at` and has been filled with zeros; 0 without error if it is not as usual. */
 static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
-    switch (item->kind) {
+    switch ((Kind)item->kind) {
         case NUMBER:
-            return write_number(item->code, value, pack->out + at);
+            return write_number((char)item->code, value, pack->out + at);
         case BOOL:
             return write_bool(value, pack->out + at);
         case ENUM:
-            return write_member(&item->members, value, pack->out + at);
+            return write_member(pack->table, item, value, pack->out + at);
         case FIXED:
-            return pack_fixed(pack, &item->array, value, at, dimensions);
+            return pack_fixed(pack, item, value, at, dimensions);
         case VARIABLE:
-            return pack_variable(pack, &item->array, value, at, dimensions);
+            return pack_variable(pack, item, value, at, dimensions);
         case STR:
             return pack_str(pack, value, at);
         case BYTES:
             return PyBytes_CheckExact(value) && pack_bytes(pack, PyBytes_AS_STRING(value), PyBytes_GET_SIZE(value), at);
-        case OPTIONAL:
+        case OPTIONAL: {
+            const Item *inner = pack->table->items + item->first;
             if (value == Py_None) return 1;
             if (pack->out != NULL) pack->out[at] = 1;
-            return pack_item(pack, item->inner, value, at + item->inner->offset, dimensions);
+            return pack_item(pack, inner, value, at + inner->offset, dimensions);
+        }
         case LIST:
-            return pack_list(pack, &item->list, value, at);
+            return pack_list(pack, item, value, at);
         case MESSAGE:
-            return pack_message(pack, &item->block, value, at);
+            return pack_message(pack, item, value, at);
+        case DIMENSION:
+        case DTYPE:
+        case MEMBER:
+            break;
     }
     Py_UNREACHABLE();
 }
 
 /* Bodies */
 
+static void begin_pack(Pack *pack, const Coder *coder, char *out, const char *place, Py_ssize_t limit) {
+    pack->table = &coder->table;
+    pack->out = out;
+    pack->end = coder->table.items->size;
+    pack->limit = limit < BODY_LIMIT ? limit : BODY_LIMIT - 1;
+    pack->place = place;
+    pack->values_left = VALUES_MAX;
+}
+
 Py_ssize_t measure_body(const Coder *coder, PyObject *message) {
-    const Block *block = &coder->block;
-    if (!block->has_tail) return Py_TYPE(message) == block->cls ? block->size : -1;
+    const Item *outermost = coder->table.items;
+    if (!outermost->has_tail) return is_of_class(&coder->table, outermost, message) ? outermost->size : -1;
     Pack pack;
-    pack.out = NULL;
-    pack.end = block->size;
-    pack.limit = BODY_LIMIT - 1;
-    pack.place = NULL;
-    pack.values_left = VALUES_MAX;
-    return pack_message(&pack, block, message, 0) ? pack.end : -1;
+    begin_pack(&pack, coder, NULL, NULL, BODY_LIMIT);
+    return pack_message(&pack, outermost, message, 0) ? pack.end : -1;
 }
 
 Py_ssize_t measure_in_place(const Coder *coder, PyObject *message, const char *place, Py_ssize_t room) {
-    const Block *block = &coder->block;
+    const Item *outermost = coder->table.items;
     Pack pack;
-    pack.out = NULL;
-    pack.end = block->size;
-    pack.limit = room < BODY_LIMIT ? room : BODY_LIMIT - 1;
-    pack.place = place;
-    pack.values_left = VALUES_MAX;
-    return block->has_tail && block->size <= room && pack_message(&pack, block, message, 0) ? pack.end : -1;
+    begin_pack(&pack, coder, NULL, place, room);
+    return outermost->has_tail && outermost->size <= room && pack_message(&pack, outermost, message, 0) ? pack.end : -1;
 }
 
 int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers) {
-    const Block *block = &coder->block;
-    pack->out = out;
-    pack->end = block->size;
-    pack->limit = size;
-    pack->place = NULL;
-    pack->values_left = VALUES_MAX;
+    const Item *outermost = coder->table.items;
+    begin_pack(pack, coder, out, NULL, size);
     pack->stamp_ns = 0;
     pack->defers = defers;
     pack->deferred_count = 0;
-    memset(out, 0, (size_t)block->size);
-    if (!pack_message(pack, block, message, 0) || pack->end != size) return 0;
+    memset(out, 0, (size_t)outermost->size);
+    if (!pack_message(pack, outermost, message, 0) || pack->end != size) return 0;
     if (coder->stamp < 0) return 1;
-    pack->stamp_ns = PyLong_AsLongLong(*place_of(&block->fields[coder->stamp], message)); /* it was written */
+    pack->stamp_ns = PyLong_AsLongLong(*place_of(&coder->table.items[coder->stamp], message)); /* it was written */
     if (pack->stamp_ns != -1 || !PyErr_Occurred()) return 1;
     PyErr_Clear();
     return 0;

@@ -8,6 +8,7 @@
 
 /* A body being read. */
 typedef struct {
+    const Table *table;
     PyObject *owner; /* of its memory */
     const char *data;
     Py_ssize_t size;
@@ -40,15 +41,15 @@ static PyObject *read_number(char code, const char *in) {
     Py_UNREACHABLE();
 }
 
-static PyObject *read_member(const Members *members, const char *in) {
+static PyObject *read_member(const Table *table, const Item *item, const char *in) {
     int32_t number;
     memcpy(&number, in, 4);
-    Py_ssize_t low = 0, high = members->count;
+    int64_t low = item->first, high = low + item->count;
     while (low < high) {
-        const Py_ssize_t middle = (low + high) / 2;
-        const Member *member = &members->by_number[middle];
-        if (member->number == number) return Py_NewRef(member->member);
-        if (member->number < number) low = middle + 1;
+        const int64_t middle = (low + high) / 2;
+        const Item *member = &table->items[middle];
+        if (member->code == number) return Py_NewRef(object_of(table, member));
+        if (member->code < number) low = middle + 1;
         else high = middle;
     }
     return NULL;
@@ -74,24 +75,26 @@ static PyObject *view_of(const Body *body, PyArray_Descr *descr, int rank, const
     return array;
 }
 
-static PyObject *unpack_fixed(const Body *body, const Array *known, Py_ssize_t at) {
+static PyObject *unpack_fixed(const Body *body, const Item *item, Py_ssize_t at) {
+    const Item *axes = body->table->items + item->first;
     npy_intp shape[RANK_MAX];
-    for (int axis = 0; axis < known->rank; ++axis) shape[axis] = known->axes[axis].size;
-    return view_of(body, known->dtypes[0].descr, known->rank, shape, at);
+    for (int64_t axis = 0; axis < item->count; ++axis) shape[axis] = axes[axis].size;
+    return view_of(body, descr_of(body->table, &axes[item->count]), (int)item->count, shape, at);
 }
 
-static PyObject *unpack_variable(Body *body, const Array *known, Py_ssize_t at, npy_intp *dimensions) {
+static PyObject *unpack_variable(Body *body, const Item *item, Py_ssize_t at, npy_intp *dimensions) {
+    const Item *axes = body->table->items + item->first;
     uint32_t numbers[2 + RANK_MAX];
-    memcpy(numbers, body->data + at, 4 * (size_t)(2 + known->rank));
-    const uint32_t index = numbers[1] - known->head;
-    if (index >= known->dtype_count) return NULL;
-    const Dtype *dtype = &known->dtypes[index];
+    memcpy(numbers, body->data + at, 4 * (size_t)(2 + item->count));
+    const uint32_t index = numbers[1] - (uint32_t)item->code;
+    if (index >= item->dtypes) return NULL;
+    const Item *dtype = axes + item->count + index;
     npy_intp shape[RANK_MAX];
-    Py_ssize_t bytes = dtype->itemsize; /* of the array as if no dimension were 0 */
+    Py_ssize_t bytes = dtype->size; /* of the array as if no dimension were 0 */
     int is_empty = 0;
-    for (int axis = 0; axis < known->rank; ++axis) {
+    for (int64_t axis = 0; axis < item->count; ++axis) {
         shape[axis] = numbers[2 + axis];
-        if (!fits_axis(&known->axes[axis], shape[axis], dimensions)) return NULL;
+        if (!fits_axis(&axes[axis], shape[axis], dimensions)) return NULL;
         if (shape[axis] == 0) {
             is_empty = 1;
         } else {
@@ -100,7 +103,7 @@ static PyObject *unpack_variable(Body *body, const Array *known, Py_ssize_t at, 
         }
     }
     if (!claim(body, numbers[0], is_empty ? 0 : bytes)) return NULL;
-    return view_of(body, dtype->descr, known->rank, shape, numbers[0]);
+    return view_of(body, descr_of(body->table, dtype), (int)item->count, shape, numbers[0]);
 }
 
 /* A str, or bytes. */
@@ -115,7 +118,8 @@ static PyObject *unpack_text(Body *body, Kind kind, Py_ssize_t at) {
     return text;
 }
 
-static PyObject *unpack_list(Body *body, const List *list, Py_ssize_t at) {
+static PyObject *unpack_list(Body *body, const Item *list, Py_ssize_t at) {
+    const Item *item = body->table->items + list->first;
     uint32_t numbers[2];
     memcpy(numbers, body->data + at, sizeof numbers);
     const Py_ssize_t start = numbers[0], count = numbers[1];
@@ -126,8 +130,8 @@ static PyObject *unpack_list(Body *body, const List *list, Py_ssize_t at) {
     if (elements == NULL) return NULL;
     npy_intp dimensions[DIMENSIONS_MAX];
     for (Py_ssize_t index = 0; index < count; ++index) {
-        begin_scope(dimensions, list->dimension_count);
-        PyObject *element = unpack_item(body, list->item, start + index * list->stride, dimensions);
+        begin_scope(dimensions, list->scope);
+        PyObject *element = unpack_item(body, item, start + index * list->stride, dimensions);
         if (element == NULL) {
             Py_DECREF(elements);
             return NULL;
@@ -137,13 +141,14 @@ static PyObject *unpack_list(Body *body, const List *list, Py_ssize_t at) {
     return elements;
 }
 
-static PyObject *unpack_message(Body *body, const Block *block, Py_ssize_t at) {
-    PyObject *message = block->cls->tp_alloc(block->cls, 0);
+static PyObject *unpack_message(Body *body, const Item *item, Py_ssize_t at) {
+    PyTypeObject *cls = (PyTypeObject *)object_of(body->table, item);
+    PyObject *message = cls->tp_alloc(cls, 0);
     if (message == NULL) return NULL;
     npy_intp dimensions[DIMENSIONS_MAX];
-    begin_scope(dimensions, block->dimension_count);
-    const Item *end = block->fields + block->count;
-    for (const Item *field = block->fields; field < end; ++field) {
+    begin_scope(dimensions, item->scope);
+    const Item *field = body->table->items + item->first, *end = field + item->count;
+    for (; field < end; ++field) {
         PyObject *value = unpack_item(body, field, at + field->offset, dimensions);
         if (value == NULL) {
             Py_DECREF(message);
@@ -157,38 +162,43 @@ static PyObject *unpack_message(Body *body, const Block *block, Py_ssize_t at) {
 /* The value whose block is at `at`; NULL without error if the body is malformed. */
 static PyObject *unpack_item(Body *body, const Item *item, Py_ssize_t at, npy_intp *dimensions) {
     const char *in = body->data + at;
-    switch (item->kind) {
+    switch ((Kind)item->kind) {
         case NUMBER:
-            return read_number(item->code, in);
+            return read_number((char)item->code, in);
         case BOOL: {
             const unsigned char truth = (unsigned char)*in;
             return truth > 1 ? NULL : PyBool_FromLong(truth);
         }
         case ENUM:
-            return read_member(&item->members, in);
+            return read_member(body->table, item, in);
         case FIXED:
-            return unpack_fixed(body, &item->array, at);
+            return unpack_fixed(body, item, at);
         case VARIABLE:
-            return unpack_variable(body, &item->array, at, dimensions);
+            return unpack_variable(body, item, at, dimensions);
         case STR:
         case BYTES:
-            return unpack_text(body, item->kind, at);
+            return unpack_text(body, (Kind)item->kind, at);
         case OPTIONAL: {
             const unsigned char present = (unsigned char)*in;
+            const Item *inner = body->table->items + item->first;
             if (present > 1) return NULL;
-            return present ? unpack_item(body, item->inner, at + item->inner->offset, dimensions) : Py_NewRef(Py_None);
+            return present ? unpack_item(body, inner, at + inner->offset, dimensions) : Py_NewRef(Py_None);
         }
         case LIST:
-            return unpack_list(body, &item->list, at);
+            return unpack_list(body, item, at);
         case MESSAGE:
-            return unpack_message(body, &item->block, at);
+            return unpack_message(body, item, at);
+        case DIMENSION:
+        case DTYPE:
+        case MEMBER:
+            break;
     }
     Py_UNREACHABLE();
 }
 
 PyObject *read_body(const Coder *coder, PyObject *owner, const char *data, Py_ssize_t size) {
-    const Block *block = &coder->block;
-    if (size < block->size || size >= BODY_LIMIT || (size > block->size && !block->has_tail)) return NULL;
-    Body body = {owner, data, size, size - block->size, VALUES_MAX};
-    return unpack_message(&body, block, 0);
+    const Item *outermost = coder->table.items;
+    if (size < outermost->size || size >= BODY_LIMIT || (size > outermost->size && !outermost->has_tail)) return NULL;
+    Body body = {&coder->table, owner, data, size, size - outermost->size, VALUES_MAX};
+    return unpack_message(&body, outermost, 0);
 }

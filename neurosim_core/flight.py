@@ -96,6 +96,8 @@ def fly(
     began_s = begin if began_s is None else began_s
     report.libraries_s = begin - began_s
     sinks = {name: sink for name, sink in config.sinks.items() if rerun or sink.kind != "rerun"}
+    for name, sink in sinks.items():
+        sink.check(name, config.sensors)
     if not has_kernels():
         console.print(
             "first flight here: its kernels are compiled, which takes 10 s to a minute, and kept in "

@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import math
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,9 @@ from neurosim_core.registry import register
 from neurosim_core.settings import Settings
 
 if TYPE_CHECKING:
+    from neurosim_core.io.event_file import EventWriter
     from neurosim_core.record.header import RecordingHeader
+    from neurosim_core.sensors.base import SensorConfig
     from neurosim_core.sim.model import Model
 
 _ROOM_BYTES = 32_000_000
@@ -90,6 +93,18 @@ class SinkConfig(Settings):
 
     def load(self) -> None:
         """Import what it needs, beside other work."""
+
+    def check(self, name: str, sensors: Mapping[str, SensorConfig]) -> None:
+        """Refuse what `open` would refuse of a flight with these sensors; before anything else is done.
+
+        Args:
+            name: The sink's name in the settings.
+            sensors: Of the flight, by name.
+
+        Raises:
+            ValueError: It lacks a sensor.
+            ImportError: A library that it cannot do without is not installed.
+        """
 
     def open(self, context: SinkContext) -> Sink:
         """Return the sink of one flight.
@@ -213,29 +228,39 @@ class EventFileSinkConfig(SinkConfig):
         """Return the name of the file."""
         return self.name if stem == "flight" else f"{stem}-{self.name}"
 
-    def open(self, context: SinkContext) -> Sink:
-        """Return the writer.
+    def check(self, name: str, sensors: Mapping[str, SensorConfig]) -> None:
+        """Write a file without events elsewhere.
 
         Raises:
-            ValueError: There is no such camera, or no such format.
+            ValueError: There is no such camera, or the format cannot hold its pixels.
+            ImportError: A library of the format is not installed.
         """
-        return _EventFileSink(self, context)
+        with tempfile.TemporaryDirectory() as folder:
+            self.create(name, sensors, Path(folder) / self.name)[1].close()
+
+    def create(self, name: str, sensors: Mapping[str, SensorConfig], file: Path) -> tuple[str, EventWriter]:
+        """Return the name of the camera and the writer of its events; arguments and errors as for `check`."""
+        from neurosim_core.io import create_events
+        from neurosim_core.sensors.event_camera import EventSensorConfig
+
+        cameras = {key: each.lens for key, each in sensors.items() if isinstance(each, EventSensorConfig)}
+        camera = self.sensor or next(iter(cameras), "")
+        if camera not in cameras:
+            known = ", ".join(cameras) or "there is none"
+            raise ValueError(f"sinks.{name}: no event camera {camera!r}, known: {known}")
+        return camera, create_events(file, width=cameras[camera].width, height=cameras[camera].height)
+
+    def open(self, context: SinkContext) -> Sink:
+        """Return the writer; errors as for `check`."""
+        file = context.folder / self.file(context.stem)
+        return _EventFileSink(*self.create(context.name, context.model.config.sensors, file))
 
 
 class _EventFileSink:
     """Writes the events of a camera, and other packets where the format has a place for them."""
 
-    def __init__(self, config: EventFileSinkConfig, context: SinkContext) -> None:
-        from neurosim_core.io import create_events
-
-        cameras = {s.name: s.intrinsics for s in context.header.sensors if s.kind == "event_camera"}
-        self._sensor = config.sensor or next(iter(cameras), "")
-        lens = cameras.get(self._sensor)
-        if lens is None:
-            known = ", ".join(cameras) or "there is none"
-            raise ValueError(f"sinks.{context.name}: no event camera {self._sensor!r}, known: {known}")
-        file = context.folder / config.file(context.stem)
-        self._writer = create_events(file, width=lens.width, height=lens.height)
+    def __init__(self, sensor: str, writer: EventWriter) -> None:
+        self._sensor, self._writer = sensor, writer
 
     def write(self, packet: Packet) -> None:
         """Append a packet."""

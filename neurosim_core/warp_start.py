@@ -37,7 +37,7 @@ def start_warp() -> None:
     with tempfile.TemporaryFile() as held:
         os.dup2(held.fileno(), 2)
         try:
-            wp.init()  # type: ignore[no-untyped-call]
+            wp.init()
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

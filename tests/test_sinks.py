@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -126,8 +127,9 @@ def test_one_that_fails_ends_the_flight_and_the_others_are_whole(
 
 
 def test_one_that_cannot_be_opened_leaves_no_flight_that_seems_complete(scene, tmp_path):
-    mine = {"kind": "event_file", "name": "events.raw", "sensor": "left"}
-    with pytest.raises(ValueError, match="no event camera 'left'"):
+    (tmp_path / "events.raw").mkdir()
+    mine = {"kind": "event_file", "name": "events.raw"}
+    with pytest.raises(IsADirectoryError):
         ns.fly(settings(scene, overview={"kind": "overview"}, mine=mine), tmp_path)
     assert not (tmp_path / "overview.png").exists()
     with ns.Recording(tmp_path / "flight.h5") as recording:
@@ -197,10 +199,16 @@ def test_events_go_to_files_of_other_tools(scene, tmp_path, name):
         assert (found == np.concatenate([events[column] for events in wanted])).all()
 
 
-def test_an_event_file_needs_an_event_camera(scene, tmp_path):
-    other = {"kind": "event_file", "name": "events.raw", "sensor": "left"}
+def test_an_event_file_that_cannot_be_written_is_refused_at_once(scene, tmp_path, monkeypatch):
+    """Before the set-up, and no folder is left behind."""
+    monkeypatch.setattr("neurosim_core.flight.make_model", None)
+    left = {"kind": "event_file", "name": "events.raw", "sensor": "left"}
     with pytest.raises(ValueError, match=r"sinks\.other: no event camera 'left', known: events"):
-        ns.fly(settings(scene, other=other), tmp_path)
+        ns.fly(settings(scene, other=left), tmp_path / "flight")
+    monkeypatch.setitem(sys.modules, "cortex_ros2_bridge.bag_file", None)  # as where rosbags is missing
+    with pytest.raises(ImportError, match="bags of ROS 2 need rosbags"):
+        ns.fly(settings(scene, other={"kind": "event_file", "name": "bag.mcap"}), tmp_path / "flight")
+    assert not (tmp_path / "flight").exists()
 
 
 def test_a_flight_is_published(scene, tmp_path, monkeypatch):

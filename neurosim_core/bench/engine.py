@@ -29,8 +29,7 @@ from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Ambient, Light, Material, Scene, Texture
 from neurosim_core.sensors.displacement import DisplacementRule
-from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.sensors.event_config import EventCameraConfig, event_presets
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sim.model import Model, find_device, make_model, refit
 from neurosim_core.sim.rollout import run_model, step

@@ -77,7 +77,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         ),
     ]
     met = sum(claim.met is True for claim in claims)
-    noise = "Rates are means over the pixels of a still scene [Hz]; sources are in event_presets.py."
+    noise = "Rates are means over the pixels of a still scene [Hz]; sources are in event_presets.yaml."
     worst = "The largest of the points; at or below 1 the claim is met."
     return Chapter(
         name="pixel",
@@ -335,26 +335,24 @@ def _sine_gain(
 
 def measure_noise_figures(bench: TestBench) -> list[Row]:
     """Return a row for each figure that the source of a preset has of noise, beside what the preset does."""
-    names = (
-        ("davis346", "gen3")
-        if bench.quick
-        else tuple(name for name in engine.PRESETS if engine.PRESETS[name].noise)
-    )
+    figures = {name: preset["noise"] for name, preset in engine.event_presets().items() if "noise" in preset}
+    names = ("davis346", "gen3") if bench.quick else tuple(figures)
     side, seconds = bench.pick(96, 48), bench.pick(60, 20)
     rows: list[Row] = []
     for name in names:
         found: dict[float, dict[str, float]] = {}
         config = make_preset(name, readout=None)
         white_lux = config.measured_noise.white_lux if config.measured_noise else 1000.0
-        for figure in engine.PRESETS[name].noise:
-            if figure.lux not in found:
-                log = still(math.log(config.white_radiance * figure.lux / white_lux), side)
+        for figure in figures[name]:
+            lux, quantity, given, spread = (figure[key] for key in ("lux", "quantity", "value", "spread"))
+            if lux not in found:
+                log = still(math.log(config.white_radiance * lux / white_lux), side)
                 events = bench.expose(config, log, [0.0, float(seconds)])
-                found[figure.lux] = _noise_statistics(events, side, seconds)
-            value = found[figure.lux][figure.quantity]
-            row: Row = {"preset": name, "light [lux]": figure.lux, "quantity": figure.quantity}
-            row |= {"preset's": value, "source's": figure.value, "its spread": figure.spread}
-            rows.append({**row, "within": abs(value - figure.value) <= figure.spread})
+                found[lux] = _noise_statistics(events, side, seconds)
+            value = found[lux][quantity]
+            row: Row = {"preset": name, "light [lux]": lux, "quantity": quantity}
+            row |= {"preset's": value, "source's": given, "its spread": spread}
+            rows.append({**row, "within": abs(value - given) <= spread})
     return rows
 
 

@@ -37,8 +37,7 @@ from neurosim_core.io.event_file import check_new
 from neurosim_core.packets import Events
 from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescription
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.sensors.event_config import EventCameraConfig, event_presets
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.settings import Settings
 
@@ -322,8 +321,8 @@ def _wanted_size(config: ConversionConfig, crop: Crop) -> tuple[int, int]:
     elif config.pixel.preset is None:
         raise ValueError("size preset needs a preset: --preset davis346, or another")
     else:
-        sensor = PRESETS[config.pixel.preset]
-        size = sensor.width, sensor.height
+        sensor = event_presets()[config.pixel.preset]
+        size = sensor["width"], sensor["height"]
     if size[0] > _ENLARGE_MAX * crop.width or size[1] > _ENLARGE_MAX * crop.height:
         raise ValueError(
             f"size must be at most {_ENLARGE_MAX} times the {crop.width}x{crop.height} pixels there are, "

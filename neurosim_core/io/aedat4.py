@@ -132,7 +132,7 @@ def _import_faery() -> ModuleType:
         import faery
     except ImportError as error:
         raise ImportError(f"AEDAT4 and Event Stream files need faery: {install_hint('formats')}") from error
-    return faery  # type: ignore[no-any-return]
+    return faery
 
 
 def _damage(path: Path, error: BaseException) -> BaseException:

@@ -83,9 +83,11 @@ class Recorder:
         """
         if not any(_live_sinks(model) for model in models.values()):
             raise ValueError("none of `sinks` records a live run: add one, such as {recording: {kind: hdf5}}")
-        for sink in (sink for model in models.values() for sink in _live_sinks(model).values()):
-            if sink.library is not None and importlib.util.find_spec(sink.library[0]) is None:
-                raise ImportError(f"{sink.library[0]} is not installed: {install_hint(sink.library[1])}")
+        for model in models.values():
+            for sink_name, sink in _live_sinks(model).items():
+                if sink.library is not None and importlib.util.find_spec(sink.library[0]) is None:
+                    raise ImportError(f"{sink.library[0]} is not installed: {install_hint(sink.library[1])}")
+                sink.check(sink_name, model.config.sensors)
         for name, folder in folders.items():
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "config.yaml").write_text(to_yaml(models[name].config, comments=True), "utf-8")

@@ -1,6 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
-# mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc,valid-type"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,assignment,return-value"
+# mypy: disable-error-code="call-overload,empty-body,misc,valid-type"
 # ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
 """Antialiasing on CUDA: what `antialias.py` describes, in three kernels.
 
@@ -148,16 +147,12 @@ class PixelPlace:
     world: int
     instant: int
     slot: int
-    left: int
-    """Column of the first pixel of the block."""
-    top: int
-    """Row of the first pixel of the block."""
+    left: int  # Column of the first pixel of the block
+    top: int  # Row of the first pixel of the block
     row: int
     col: int
-    outside: wp.bool
-    """The pixel is not in the picture."""
-    ray: int
-    """Index of its ray in a layer."""
+    outside: wp.bool  # The pixel is not in the picture
+    ray: int  # Index of its ray in a layer
 
 
 def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:

@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-call"
 """Does a renderer see what the simulator means? Checks for any renderer, foreign ones included.
 
 They need no scene that is known: one view of it must agree with another through the poses and the lens.

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="empty-body,untyped-decorator,no-any-return"
-# mypy: allow-untyped-calls
+# mypy: disable-error-code="empty-body"
 """The points of a pixel that antialiasing tests; see `antialias.py`."""
 
 import warp as wp

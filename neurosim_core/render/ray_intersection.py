@@ -1,6 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,arg-type,assignment,call-overload"
-# mypy: disable-error-code="no-untyped-def,empty-body"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,arg-type,assignment,call-overload,no-untyped-def,empty-body"
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """Intersection of a ray with the scene, with a face of a candidate list, and with moving bodies."""
 
@@ -26,16 +24,11 @@ UNFUSED = {"fuse_fp": False}
 class Hit:
     """The first intersection of a ray."""
 
-    face: int
-    """-1: the ray hits nothing, and the other fields have no meaning."""
-    t: float
-    """Distance along the ray [m]."""
-    u: float
-    """Weight of the first corner."""
-    v: float
-    """Weight of the second corner."""
-    normal: wp.vec3
-    """Unit normal of the face's front."""
+    face: int  # -1: the ray hits nothing, and the other fields have no meaning
+    t: float  # Distance along the ray [m]
+    u: float  # Weight of the first corner
+    v: float  # Weight of the second corner
+    normal: wp.vec3  # Unit normal of the face's front
 
 
 @wp.func_native(read_native(__file__, "intersect_face"))

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,misc,operator"
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """The ray caster of a CPU: a thread is a packet of pixels, of which four are a tile, or a tile.
 

@@ -1,6 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def"
-# mypy: disable-error-code="return-value"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,return-value"
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """The ray caster whose threads are pixels: of one instant, or, with candidate lists, of a few.
 

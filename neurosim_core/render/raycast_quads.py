@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,empty-body,return-value"
-# mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals: they have a meaning)
 """The program of the ray caster where four threads side by side cast the rays of a pixel, on CUDA.
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment,no-any-return"
+# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment"
 """A scene on a device, ready to be cast at: triangles, light, textures and trees, shared by all cameras."""
 
 from __future__ import annotations
@@ -66,12 +66,6 @@ def upload_scene(
     scene: Scene, config: RenderConfig, device: str, *, bodies: Sequence[Body] = ()
 ) -> SceneArrays:
     """Bring a scene to a device: refine and light it, pack its textures, build its tree.
-
-    Args:
-        scene: What to render.
-        config: How to light it, and who casts rays on a CPU.
-        device: "cpu", "cuda:0", …
-        bodies: What moves in the scene.
 
     Raises:
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.

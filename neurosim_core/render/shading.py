@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,misc,no-any-return,operator,arg-type,return-value,empty-body"
-# mypy: allow-untyped-calls, allow-untyped-decorators
+# mypy: disable-error-code="index,misc,operator,arg-type,return-value,empty-body"
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
 
@@ -60,10 +59,8 @@ def pixel_shader(terms: RenderTerms) -> wp.Function:
 def surface_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
     """Return the function that says what light comes from what stands still, or from the sky.
 
-    Args:
-        terms: Of the kernel.
-        beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not. The
-            texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
+    With `beyond` a hit may lie beyond the edges of its face: the texture goes on there, the light does not.
+    The texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
     """
     if terms.baked and not (beyond or terms.finest_level):
         return _baked_shader(textured=terms.textured, emissive=terms.emissive)

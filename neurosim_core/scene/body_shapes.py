@@ -127,12 +127,7 @@ class Solid:
 
 
 def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) -> Solid:
-    """Return the triangles of a shape.
-
-    Args:
-        shape: What it is.
-        surface: How it looks; None: grey, and a mesh as its file says.
-        name: Of the body, for messages and materials.
+    """Return the triangles of a shape; without a surface it is grey, and a mesh as its file says.
 
     Raises:
         SceneError: A file cannot be used, or a mesh is asked to wear a pattern.

@@ -63,12 +63,7 @@ class _TextureStore:
 
 
 def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> Source:
-    """Read a file.
-
-    Args:
-        path: Of the file.
-        suffix: Its format; one of `formats`.
-        textures_required: A picture that is not there is an error.
+    """Read a file of one of `formats`; a picture that is not there is an error if `textures_required`.
 
     Raises:
         SceneError: It cannot be read.

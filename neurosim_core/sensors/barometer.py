@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator,no-any-return"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,no-untyped-def"
 """The barometer: the pressure of the standard atmosphere at its place, up to 20 km, and its errors.
 
 Reference: ICAO Doc 7488 (1993), Manual of the standard atmosphere, eq. (8) to (13); ISO 2533.

@@ -1,5 +1,4 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-call,untyped-decorator"
 """The contact switch: closed where its tip touches the scene or the ground; moving bodies are not felt."""
 
 from dataclasses import dataclass

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 # ruff: noqa: UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
 """Corners of the geometry as a list: where they are in the picture, exactly, under numbers that stay.
 

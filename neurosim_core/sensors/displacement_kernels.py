@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="valid-type,call-overload,assignment,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,valid-type,call-overload,assignment"
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """Kernels of adaptive sampling: probes that look for what moves, and how far it moves in the picture."""
 
@@ -45,12 +44,9 @@ class Poses:
 class Bodies:
     """What moves by itself; empty if nothing does. Row 0: at the last render; a row more than in `Poses`."""
 
-    mesh: wp.array[wp.uint64]
-    """Trees in the frames of the bodies, shape [B]."""
-    corners: wp.array2d[wp.vec3d]
-    """Of the bounding boxes, in the frames of the bodies [m], shape [B, 8]."""
-    p_WO: wp.array2d[wp.vec3d]
-    """Shape [row, B]."""
+    mesh: wp.array[wp.uint64]  # Trees in the frames of the bodies, shape [B]
+    corners: wp.array2d[wp.vec3d]  # Of the bounding boxes, in the frames of the bodies [m], shape [B, 8]
+    p_WO: wp.array2d[wp.vec3d]  # Shape [row, B]
     q_WO: wp.array2d[wp.quatd]
 
 

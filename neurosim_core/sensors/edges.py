@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,valid-type"
-# mypy: disable-error-code="untyped-decorator,operator,arg-type"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,valid-type,operator,arg-type"
 # ruff: noqa: UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
 """Geometric edges: where depth jumps, another object begins, or a surface bends, whatever the light."""
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,arg-type"
+# mypy: disable-error-code="attr-defined,arg-type"
 """Event cameras that are fed one frame per call: a drop-in where frames come from elsewhere.
 
 A call launches the scan of one frame of all cameras and waits for the number of events. Events stay on the

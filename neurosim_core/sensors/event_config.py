@@ -13,41 +13,38 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from neurosim_core.registry import register
-from neurosim_core.sensors.event_presets import PRESETS
 from neurosim_core.sensors.event_terms import NoiseTermConfig, parse_terms
 from neurosim_core.settings import Settings, fill_from_preset
+from neurosim_core.tables import read_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, Field(ge=0.0, le=1e6)]
 Decades = Annotated[float, Field(ge=0.0, le=2.0)]
 
 
+class _ThresholdNoiseConfig(NoiseTermConfig):
+    """Thresholds that differ from the nominal ones by normal numbers."""
+
+    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold upwards, in log radiance."""
+    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold downwards, in log radiance."""
+    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
+    """Smaller thresholds are raised to this one."""
+
+
 @register("noise", "threshold_spread")
-class ThresholdSpreadConfig(NoiseTermConfig):
+class ThresholdSpreadConfig(_ThresholdNoiseConfig):
     """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
 
     compiled = ("spread",)
 
-    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold upwards, in log radiance."""
-    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold downwards, in log radiance."""
-    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
-    """Smaller thresholds are raised to this one."""
-
 
 @register("noise", "threshold_jitter")
-class ThresholdJitterConfig(NoiseTermConfig):
+class ThresholdJitterConfig(_ThresholdNoiseConfig):
     """Thresholds that are drawn anew after each event, around those of the pixel, as in ESIM."""
 
     compiled = ("jitter",)
-
-    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold upwards, in log radiance."""
-    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold downwards, in log radiance."""
-    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
-    """Smaller thresholds are raised to this one."""
 
 
 @register("noise", "lin_log")
@@ -254,6 +251,11 @@ class ReadoutConfig(Settings):
         return self
 
 
+def event_presets() -> dict[str, Any]:
+    """Return what is known of each sensor that is a preset: the table `event_presets.yaml`."""
+    return read_table(__file__, "event_presets")
+
+
 def describe_pixel(pixel: EventCameraConfig) -> str:
     """Return preset, thresholds and everything that departs from the ideal, by the keys that set it."""
     parts = [] if pixel.preset is None else [pixel.preset]
@@ -277,7 +279,7 @@ class EventCameraConfig(Settings):
 
     preset: str | None = None
     """A sensor whose settings these are, unless given here: dvs128, davis240c, davis346, gen3, gen4, imx636,
-    v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources in event_presets.py). Single keys win,
+    v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources: event_presets.yaml). Single keys win,
     and null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}. In a file that
     lists every key, take out those that the preset is to give."""
     threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
@@ -325,7 +327,7 @@ class EventCameraConfig(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:
-        filled = fill_from_preset(given, {name: preset.pixel for name, preset in PRESETS.items()})
+        filled = fill_from_preset(given, {name: preset["pixel"] for name, preset in event_presets().items()})
         if "preset" in given and "shot_noise" in given and "measured_noise" not in given:
             filled["measured_noise"] = None  # the user has said which noise there is
         return filled

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
 """The scan of one frame by ideal pixels, on CUDA: where frames come one by one, there is no stack to hide in.
 
 Each thread looks at four pixels. Those of a block that fire, few of them, gather in shared memory, and its

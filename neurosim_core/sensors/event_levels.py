@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
 """Levels of log radiance that a pixel compares its samples with, and the 64-bit keys of crossings.
 
 A pixel holds the log radiance it was reset to (`base`), and how many levels it crossed upwards and downwards

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,arg-type,no-any-return,no-untyped-call,call-overload,untyped-decorator"
-# mypy: disable-error-code="assignment,no-untyped-def,attr-defined"
+# mypy: disable-error-code="index,arg-type,call-overload,assignment,no-untyped-def,attr-defined"
 """The pixels of an event camera that are not ideal: their parameters as drawn, and their states.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
@@ -156,16 +155,9 @@ def read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
 
 
 class PixelNoise:
-    """The pixels of an event camera that are not ideal: what stays, what they remember, and their scan.
+    """The pixels of an event camera that are not ideal: what stays, and what they remember, in a ring.
 
-    Args:
-        config: What they are like.
-        pixel_count: How many there are.
-        ring_size: How many states are kept.
-        seed: Seed of the run, 0 <= seed < 2^64.
-        sensor: Name of the camera; two of them with different names have independent noise.
-        device: Warp device.
-        terms: The terms to compile in; by default those that the configuration asks for.
+    Cameras with different names have independent noise.
 
     Attributes:
         terms: The terms that are compiled in.

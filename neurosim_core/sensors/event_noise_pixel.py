@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var,no-untyped-def"
+# mypy: disable-error-code="index,arg-type,operator,call-overload,assignment,attr-defined,misc,return-value"
+# mypy: disable-error-code="type-var,no-untyped-def"
 """One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="no-untyped-def,return-value"
+# mypy: disable-error-code="index,arg-type,operator,call-overload,assignment,no-untyped-def,return-value"
 """The scan of an event pixel that is not ideal, made to measure: only the terms that are asked for.
 
 The signal of a pixel, its log radiance through the photoreceptor plus what its reference has leaked, is known

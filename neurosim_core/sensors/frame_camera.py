@@ -1,6 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-
+# mypy: disable-error-code="no-untyped-def"
 """Pictures as a camera makes them: exposure, electrons and their noise, colour filters, bits and a curve.
 
 The electrons of a pixel are full_well gain L, with L the linear radiance times the exposure of the scene, of
@@ -113,8 +112,7 @@ class _Model:
     read_noise: float
     top: float
     gamma: float
-    filter: wp.vec4i
-    """Colour of the pixels of a square of 2 x 2."""
+    filter: wp.vec4i  # Colour of the pixels of a square of 2 x 2
 
 
 @kernel_variant(__name__, "meter")

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-any-return,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,no-untyped-def"
 """The GPS receiver: geodetic position and velocity, late, with errors that come and go.
 
 The world W is a tangent plane of the WGS84 ellipsoid: east, north, up at an origin.
@@ -112,11 +111,7 @@ def geodetic(
 ) -> tuple[float, float, float]:
     """Return latitude [rad], longitude [rad] and altitude [m] of a place in W, to 1e-9 m.
 
-    Args:
-        position: East, north, up of the origin [m], shape [3].
-        latitude_rad: Of the origin, likewise the others.
-        longitude_rad: See above.
-        altitude_m: See above.
+    The place is east, north, up of an origin [m], shape [3], of which the others are given.
     """
     sin, cos = math.sin(latitude_rad), math.cos(latitude_rad)
     east, north, up = (float(value) for value in position)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """Inertial measurement unit: specific force and angular rate at its mount, and their errors.
 
 Without errors the reading is the exact kinematics of the state: with r the mount in B and w the body rate,
@@ -28,9 +28,9 @@ from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
-from neurosim_core.sensors.imu_presets import PRESETS
 from neurosim_core.sensors.state_sampler import NonNegative, Sampling, StateSampler
 from neurosim_core.settings import fill_from_preset
+from neurosim_core.tables import read_table
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
@@ -52,7 +52,7 @@ class ImuConfig(StateSensorConfig):
     kind: Literal["imu"] = "imu"
     preset: str | None = None
     """A sensor whose errors these are, unless given here: bmi088, icm20948, adis16448 (sources in
-    imu_presets.py)."""
+    imu_presets.yaml)."""
     mount: Mount = Mount()
     """Pose on the body."""
     rate_hz: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
@@ -83,7 +83,7 @@ class ImuConfig(StateSensorConfig):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:
-        return fill_from_preset(given, PRESETS)
+        return fill_from_preset(given, read_table(__file__, "imu_presets"))
 
     packet_type = ImuSample
 

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """LiDAR: points along the rays of a scan, each cast at a time of its own.
 
@@ -31,14 +31,26 @@ from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.render.ray_times import SweepTiming
 from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
-from neurosim_core.sensors.lidar_presets import PRESETS
 from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 from neurosim_core.settings import Settings, fill_from_preset
+from neurosim_core.tables import read_table
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 _RAY = np.complex128  # the four numbers of a ray as one: NumPy moves those three times as fast
 _NEVER = -10.0  # |z| is at most 5.77
+
+
+@functools.cache
+def lidar_presets() -> dict[str, dict[str, Any]]:
+    """Return the settings of each preset: the table `lidar_presets.yaml`, with all rings."""
+    presets = {}
+    for name, preset in read_table(__file__, "lidar_presets").items():
+        scan = dict(preset["scan"])
+        if (rings := scan.pop("elevations_deg", None)) is not None:
+            scan["elevations_rad"] = np.radians(np.linspace(*rings)).round(6).tolist()
+        presets[name] = {**preset, "scan": scan}
+    return presets
 
 
 class DetectionConfig(Settings):
@@ -59,7 +71,7 @@ class LidarConfig(PictureSensorConfig):
     kind: Literal["lidar"] = "lidar"
     preset: str | None = None
     """A sensor whose settings these are, unless given here: velodyne_vlp16, ouster_os1_128, hesai_xt32,
-    livox_mid40 (sources in lidar_presets.py). Single keys win."""
+    livox_mid40 (sources in lidar_presets.yaml). Single keys win."""
     scan: AnyScan = SpinningScan(elevations_rad=tuple(round(-0.26 + 0.52 * k / 15.0, 6) for k in range(16)))
     """Which way rays go, and when: {kind: spinning, elevations_rad: [...], columns: 1024}, {kind: pattern,
     file: rays.npy}, {kind: rosette, ...}."""
@@ -92,7 +104,7 @@ class LidarConfig(PictureSensorConfig):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:
-        return fill_from_preset(given, PRESETS)
+        return fill_from_preset(given, lidar_presets())
 
     @model_validator(mode="after")
     def _ranges_and_times_are_in_order(self) -> "LidarConfig":
@@ -178,8 +190,7 @@ def _rings_and_times(scan: AnyScan, span_ns: int) -> tuple[NDArray[np.uint16], N
 @wp.struct
 class _Model:
     rays: wp.array[wp.vec3]
-    part: wp.array[int]
-    """Which of the times of a sweep each ray has."""
+    part: wp.array[int]  # Which of the times of a sweep each ray has
     stream: wp.uint32
     range_min: float
     range_max: float

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-any-return,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,no-untyped-def"
 """The magnetometer: the field of the Earth, as the settings give it, bent by the iron of the vehicle.
 
     m_S = A R_SW b_W + h + errors, with A the soft iron and h the hard iron.

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload"
 """The true state of the vehicle, as a sensor."""
 
 from collections.abc import Mapping
@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import Odometry
 from neurosim_core.registry import register
+from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.sensors.base import RateHz, Sampler, SamplerContext, StateSensorConfig
 
 wp.set_module_options({"enable_backward": False})
-
-_SLOT_PARAMETER = 5
 
 
 @register("sensor", "odometry")
@@ -61,32 +60,18 @@ class OdometrySampler(Sampler):
 
     def __init__(self, context: SamplerContext) -> None:
         state = context.vehicle.arrays
-        sources: tuple[Any, ...] = (
-            state.position,
-            state.orientation,
-            state.velocity,
-            state.body_rate,
-            state.rotor_speed,
-        )
-        copies: list[Any] = [
-            wp.zeros((context.slot_count, *source.shape), dtype=source.dtype, device=source.device)
-            for source in sources
-        ]
         names = ("position", "orientation", "velocity", "body_rate", "rotor_speed")
-        self.arrays = dict(zip(names, copies, strict=True))
-        self._launch: Any = wp.launch(
-            _copy_state,
-            dim=context.vehicle.count,
-            inputs=[*sources, 0],
-            outputs=copies,
-            device=context.vehicle.device,
-            record_cmd=True,
-        )
+        self._sources: list[Any] = [getattr(state, name) for name in names]
+        self.arrays = {
+            name: wp.zeros((context.slot_count, *source.shape), dtype=source.dtype, device=source.device)
+            for name, source in zip(names, self._sources, strict=True)
+        }
+        self._count = context.vehicle.count
+        self._launch = RecordedLaunch(_copy_state, context.vehicle.device)
 
     def measure(self, slot: int) -> None:
         """Copy the present states into a slot."""
-        self._launch.set_param_at_index(_SLOT_PARAMETER, slot)
-        self._launch.launch()
+        self._launch.launch(self._count, [*self._sources, slot, *self.arrays.values()])
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Odometry:
         """Return one sample as a packet."""

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 # ruff: noqa: SIM102, UP018  (nested wp.static branches and typed literals have a meaning in kernels)
 """Optical flow: where in the picture what each pixel sees was, will be, or how fast it moves there.
 

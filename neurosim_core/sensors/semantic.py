@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,valid-type"
-# mypy: disable-error-code="untyped-decorator,operator"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,valid-type,operator"
 """Semantic segmentation: what each pixel sees is."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,no-untyped-def"
 """The state as an estimator gives it: noisy, drifting, late, and at times not at all.
 
 What drifts are position and yaw, as in visual-inertial odometry, where they are not observable (Kelly and

@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,no-any-return,arg-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,assignment,no-untyped-def"
 """What carries the sensors where no vehicle does: a body that follows a motion exactly.
 
 With phi the rotation vector of a piece and t its length, R_WB = R(knot) exp(phi), and with the right Jacobian
@@ -35,8 +34,7 @@ _SMALL_RAD2 = wp.constant(wp.float64(1.0e-2))
 class AttitudeArrays:
     """The attitudes of paths behind each other, on a device."""
 
-    knots: wp.array[wp.quatd]
-    """q_WB, shape [knot]."""
+    knots: wp.array[wp.quatd]  # q_WB, shape [knot]
     rotation_vectors: wp.array2d[wp.vec3d]
     """Coefficients in rising powers of normalised time [rad], shape [piece, 4]."""
 
@@ -46,10 +44,8 @@ class _Turn:
     """Orientation and its derivatives."""
 
     orientation: wp.quatd
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
-    acceleration: wp.vec3d
-    """dw_WB/dt in B [rad/s^2]."""
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
+    acceleration: wp.vec3d  # dw_WB/dt in B [rad/s^2]
 
 
 @wp.func
@@ -152,15 +148,8 @@ def _carry(
 class Carrier:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still.
-
-    Attributes:
-        config: The parameters of the vehicle that is not there; of gravity, for IMUs.
-        count: Number of bodies.
-        device: Where they are.
-        max_step_ns: What counts as a step [ns].
-        arrays: Their state.
-        terms: Nothing is compiled in.
+    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
+    `config` of the vehicle that is not there IMUs need gravity.
     """
 
     terms: tuple[str, ...] = ()
@@ -174,15 +163,7 @@ class Carrier:
         device: str,
         max_step_ns: int,
     ) -> None:
-        """Bring paths to the device.
-
-        Args:
-            config: The airframe that the settings name.
-            paths: All with an attitude.
-            path_of_world: Which of them each body follows, shape [N].
-            device: Where to compute.
-            max_step_ns: What counts as a step [ns].
-        """
+        """Bring paths, all with an attitude, to the device; each body follows one, `path_of_world`."""
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """The flight of one batch: commands in, the motion from boundary to boundary, what was sampled there out."""
 
 from __future__ import annotations
@@ -8,10 +8,9 @@ import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
-import warp as wp
 from numpy.typing import ArrayLike
 
-from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.control import CommandMode, Controller
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
@@ -21,7 +20,6 @@ from neurosim_core.sensors.sampler_checks import sample_packet
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.reset import begin_batch, end_batch
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
@@ -45,7 +43,7 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
         if mode == "motor_speeds":
             array: Any = state.vehicle.arrays.rotor_speed_command
         else:
-            state.controllers[mode] = make_controller(
+            state.controllers[mode] = Controller(
                 mode,
                 model.airframe,
                 model.config.control.gains,
@@ -110,11 +108,8 @@ def plan_batch(
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
-    Args:
-        state: As of the end of what was launched.
-        stretch: What comes next.
-        closed_loop: Let the path controller command; otherwise the last command is held.
-        begin_ns: Where it begins [ns]; None: at the end of what was launched.
+    It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
+    controller commands; otherwise the last command is held.
     """
     number = state.launched_count
     stamps_ns = [
@@ -173,40 +168,38 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
 
 def integrate(state: State, batch: Batch) -> None:
     """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
-    device, worlds = state.vehicle.device, state.world_count
-    wp.launch(begin_batch, dim=worlds, inputs=[state.fleet], device=device)
     elapsed_ns = 0
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
     vehicle, trace, slot = state.vehicle, state.trace, batch.slot
-    for boundary, span_ns, count in _stretches(batch):
+    for boundary, span_ns, count in _stretches(batch, joined=isinstance(vehicle, Multirotor)):
+        end = slot + count
+        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
         if isinstance(vehicle, Multirotor) and span_ns > 0:
-            recorder = trace.recorder(state.surfaces, state.fleet)
-            vehicle.advance(span_ns, count=count, recorder=recorder, slot=slot, elapsed_ns=elapsed_ns)
+            span = {"span_ns": span_ns, "count": count}
+            trace.fly(vehicle, state.surfaces, state.fleet, slot, elapsed_ns, **span, **record)
         else:
-            for place in range(count):
-                if span_ns > 0:
-                    vehicle.advance(span_ns)
-                since_ns = elapsed_ns + (place + 1) * span_ns
-                trace.record(state.surfaces, state.fleet, slot + place, since_ns)
-        slot += count
-        elapsed_ns += count * span_ns
+            if span_ns > 0:
+                vehicle.advance(span_ns)
+            trace.record(state.surfaces, state.fleet, slot, elapsed_ns + span_ns, **record)
+        slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
         if batch.closed_loop and boundary.control and not isinstance(vehicle, Carrier):
             state.path_controller.update(vehicle.arrays)
-    wp.launch(end_batch, dim=worlds, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
 
 
-def _stretches(batch: Batch) -> Iterator[tuple[Boundary, int, int]]:
-    """Yield equal spans before whose last boundary nothing is due: that boundary, span [ns], how many."""
+def _stretches(batch: Batch, *, joined: bool) -> Iterator[tuple[Boundary, int, int]]:
+    """Yield spans between boundaries: the boundary at the end, the length [ns] and how many are `joined`.
+
+    Those are joined that are equal, and between which nothing is due.
+    """
     count = 0
-    for boundary, span_ns, next_ns in zip(
-        batch.boundaries, batch.elapsed_ns, [*batch.elapsed_ns[1:], None], strict=True
-    ):
+    following = [*batch.elapsed_ns[1:], 0]
+    for boundary, span_ns, next_ns in zip(batch.boundaries, batch.elapsed_ns, following, strict=True):
         count += 1
-        if boundary.samplers or boundary.control or next_ns != span_ns:
+        if not joined or boundary.samplers or boundary.control or next_ns != span_ns:
             yield boundary, span_ns, count
             count = 0
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined"
 """What does not change during a run: the scene, the path, and what has to be computed of them."""
 
 from __future__ import annotations
@@ -90,10 +90,8 @@ def make_model(
 def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
     """Return a model with other sensors, rates and launches in the same scene and light.
 
-    Args:
-        model: What was made before.
-        config: Its vehicle, device and renderer are those of `model`; its scene is not looked at.
-        replan: Fly the path of `config`; else that of `model`.
+    Vehicle, device and renderer of `config` are those of `model`; its scene is not looked at, and its path is
+    flown if it is to `replan`.
 
     Raises:
         ValueError: No path exists.
@@ -162,11 +160,7 @@ def make_fleet(
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
-    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
-
-    Args:
-        config: What to fly.
-        vehicles: Names; None: all.
+    """Return the paths of vehicles (None: of all) by name, as `make_fleet` plans them.
 
     Raises:
         KeyError: There is no such vehicle.

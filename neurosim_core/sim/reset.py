@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
-# mypy: disable-error-code="no-untyped-call"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type"
 """Where vehicles begin, and the kernels that put them there and take masks and rows of any type."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from neurosim_core.frames import normalised
 from neurosim_core.sim.scene_table import SceneTable
 from neurosim_core.sim.trace import Fleet
-from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
+from neurosim_core.vehicle.status import STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,14 +21,10 @@ wp.set_module_options({"enable_backward": False})
 class Start:
     """Where vehicles begin, one row for each world."""
 
-    position: wp.array2d[wp.float64]
-    """p_WB [m], [N, 3]."""
-    velocity: wp.array2d[wp.float64]
-    """v_WB in W [m/s], [N, 3]."""
-    orientation: wp.array2d[wp.float64]
-    """q_WB, xyzw, [N, 4], of unit length."""
-    body_rate: wp.array2d[wp.float64]
-    """w_WB in B [rad/s], [N, 3]."""
+    position: wp.array2d[wp.float64]  # p_WB [m], [N, 3]
+    velocity: wp.array2d[wp.float64]  # v_WB in W [m/s], [N, 3]
+    orientation: wp.array2d[wp.float64]  # q_WB, xyzw, [N, 4], of unit length
+    body_rate: wp.array2d[wp.float64]  # w_WB in B [rad/s], [N, 3]
 
 
 def begin_of_paths(scenes: SceneTable) -> dict[str, NDArray[np.float64]]:
@@ -98,28 +93,6 @@ def normalise(
         total += orientation[world, part] * orientation[world, part]
     for part in range(4):
         orientation[world, part] = orientation[world, part] / wp.sqrt(total)
-
-
-@wp.kernel
-def begin_batch(
-    # In/out:
-    fleet: Fleet,
-) -> None:
-    """Forget touches of the batch before, except of vehicles that are held because of one."""
-    world = wp.tid()
-    fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
-
-
-@wp.kernel
-def end_batch(
-    # Model:
-    duration_ns: wp.int64,
-    # In/out:
-    clock_ns: wp.array[wp.int64],
-) -> None:
-    """Let time pass in all worlds."""
-    world = wp.tid()
-    clock_ns[world] += duration_ns
 
 
 @wp.kernel

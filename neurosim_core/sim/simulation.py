@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,union-attr"
+# mypy: disable-error-code="attr-defined,call-overload,union-attr"
 """N worlds, one vehicle each, stepped together; everything stays on the device.
 
 On a CUDA device a step is one graph: flight, poses, one render of all instants of all worlds, one scan of all

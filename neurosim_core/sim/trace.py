@@ -8,11 +8,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.runtime.cuda import HostCopy
+from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.vehicle import Multirotor
 from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
-from neurosim_core.vehicle.integrator import Recorder
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -23,8 +23,6 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 1
-_ELAPSED_PARAMETER = 2
 _LAUNCHES_MAX = 256
 
 
@@ -32,16 +30,11 @@ _LAUNCHES_MAX = 256
 class Surfaces:
     """What vehicles can touch: the scene that each world is in, and the ground."""
 
-    fields: wp.array[DistanceField]
-    """Distance to each scene, shape [scene]."""
-    scene: wp.array[int]
-    """Which of them a world is in, shape [world]."""
-    radius_m: float
-    """Radius of the vehicle [m]."""
-    ground_height_m: wp.float64
-    """z of the plane that it may land on [m]; -inf: there is none."""
-    holds: int
-    """1: a vehicle that touches something is held until its world is reset."""
+    fields: wp.array[DistanceField]  # Distance to each scene, shape [scene]
+    scene: wp.array[int]  # Which of them a world is in, shape [world]
+    radius_m: float  # Radius of the vehicle [m]
+    ground_height_m: wp.float64  # z of the plane that it may land on [m]; -inf: there is none
+    holds: int  # 1: a vehicle that touches something is held until its world is reset
 
 
 @wp.struct
@@ -58,32 +51,28 @@ class Fleet:
     status: wp.array[wp.int32]
     redone_count: wp.array[wp.int64]
     evaluation_count: wp.array[wp.int64]
-    clock_ns: wp.array[wp.int64]
-    """Time of the world at the beginning of the batch [ns]."""
+    clock_ns: wp.array[wp.int64]  # Time of the world at the beginning of the batch [ns]
     collided: wp.array[wp.int32]
     """1: the vehicle has touched something in this batch, or is held because it did."""
-    active: wp.array[wp.int32]
-    """0: the world is left alone by samplers and collisions."""
+    active: wp.array[wp.int32]  # 0: the world is left alone by samplers and collisions
 
 
 @wp.struct
 class Rows:
     """The slots of a trace."""
 
-    states: wp.array3d[wp.float64]
-    status: wp.array2d[wp.int32]
-    clearance: wp.array2d[wp.float32]
-    redone: wp.array2d[wp.int64]
-    stamps: wp.array2d[wp.int64]
-    history: History
-    """Of all boundaries, as far back as rays with times of their own need it."""
-    entries: wp.array2d[wp.int64]
-    """Number of the entry of each slot in `history`; empty without one."""
+    states: wp.array3d[wp.float64]  # Shape [slot, world, 13 + R]; the others: [slot, world]
+    status: wp.array2d[wp.int32]  # Why a vehicle is held (`MultirotorArrays.status`)
+    clearance: wp.array2d[wp.float32]  # From the vehicle to the nearest surface [m], <= 0 where it touches
+    redone: wp.array2d[wp.int64]  # Intervals redone so far (`MultirotorArrays.redone_count`)
+    stamps: wp.array2d[wp.int64]  # Time since the reset of the world [ns]
+    history: History  # Of all boundaries, as far back as rays with times of their own need it
+    entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
 
 @wp.struct
-class _Record:
-    """What is read and written where states are recorded."""
+class Log:
+    """Where states are recorded, and what vehicles touch meanwhile."""
 
     surfaces: Surfaces
     fleet: Fleet
@@ -91,11 +80,15 @@ class _Record:
 
 
 @wp.func
-def note_state(record: _Record, world: int, slot: int, elapsed_ns: wp.int64) -> None:
-    """Copy the state of a vehicle into a slot, and note whether it touches something."""
-    surfaces = record.surfaces
-    fleet = record.fleet
-    rows_out = record.rows
+def note_state(
+    log: Log, world: int, slot: int, elapsed_ns: wp.int64, is_first: wp.bool, is_last: wp.bool
+) -> None:
+    """Do for one vehicle what `Trace.record` does."""
+    surfaces = log.surfaces
+    fleet = log.fleet
+    rows_out = log.rows
+    if is_first:  # touches of the batch before are forgotten, except of vehicles that are held by one
+        fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
     position = fleet.position[world]
     for axis in range(3):
         rows_out.states[slot, world, axis] = position[axis]
@@ -128,11 +121,13 @@ def note_state(record: _Record, world: int, slot: int, elapsed_ns: wp.int64) -> 
         fleet.collided[world] = 1
         if surfaces.holds != 0:
             fleet.status[world] = STATUS_COLLISION
+    if is_last:
+        fleet.clock_ns[world] += elapsed_ns
 
 
 @wp.kernel
-def _note_states(record: _Record, slot: int, elapsed_ns: wp.int64) -> None:
-    note_state(record, wp.tid(), slot, elapsed_ns)
+def _record(log: Log, slot: int, elapsed_ns: wp.int64, is_first: int, is_last: int) -> None:
+    note_state(log, wp.tid(), slot, elapsed_ns, is_first != 0, is_last != 0)
 
 
 @wp.kernel
@@ -257,13 +252,7 @@ class TraceRows(NamedTuple):
 class Trace:
     """Device buffers with one slot for each boundary of the batches in flight, and their copies on the host.
 
-    Attributes:
-        states: States, float64, shape [slot, world, 13 + R].
-        status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, world].
-        stamps: Time of each slot since the reset of the world [ns], int64, shape [slot, world].
-        redone: Intervals redone so far (`MultirotorArrays.redone_count`), shape [slot, world].
-        clearance: Distance from the vehicle to the nearest surface [m], <= 0 where it touches, float32, shape
-            [slot, world].
+    Its arrays are those of `Rows`.
     """
 
     def __init__(
@@ -285,40 +274,57 @@ class Trace:
         self._is_cuda = wp.get_device(device).is_cuda
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
-        self._recording: tuple[Any, Any, Any] = (None, None, None)
+        self._record = RecordedLaunch(_record, device, block_dim=BLOCK_DIM)
+        self._flights: dict[int, tuple[RecordedLaunch, list[Any]]] = {}
+        self._log: tuple[Any, Any, Any] = (None, None, None)
         self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
 
-    def recorder(self, surfaces: Any, fleet: Any) -> Recorder:
-        """Return what does `record` for one vehicle, within a kernel."""
-        if self._recording[0] is not fleet:
-            record = _Record()
-            record.surfaces, record.fleet, record.rows = surfaces, fleet, self._rows
-            launch = wp.launch(
-                _note_states,
-                dim=self.states.shape[1],
-                inputs=[record, 0, 0],
-                device=self.states.device,
-                block_dim=BLOCK_DIM,
-                record_cmd=True,
-            )
-            self._recording = (fleet, Recorder(note_state, record), launch)
-        recorder: Recorder = self._recording[1]
-        return recorder
-
-    def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
+    def record(
+        self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int, *, first: bool, last: bool
+    ) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
 
-        Args:
-            surfaces: `Surfaces`.
-            fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
-            slot: Where to write, in [0, capacity).
-            elapsed_ns: Time since the beginning of the batch [ns].
+        Vehicles that touch something are marked in `fleet`, and held if so configured; `elapsed_ns` counts
+        from the beginning of the batch. At the `first` slot of a batch vehicles touch nothing yet; at the
+        `last` clocks of worlds move on to it.
         """
-        self.recorder(surfaces, fleet)
-        launch = self._recording[2]
-        launch.set_param_at_index(_SLOT_PARAMETER, slot)
-        launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
-        launch.launch()
+        log = self._log_of(surfaces, fleet)
+        self._record.launch(self.states.shape[1], [log, slot, elapsed_ns, int(first), int(last)])
+
+    def fly(
+        self,
+        vehicle: Multirotor,
+        surfaces: Any,
+        fleet: Any,
+        slot: int,
+        elapsed_ns: int,
+        *,
+        span_ns: int,
+        count: int,
+        first: bool,
+        last: bool,
+    ) -> None:
+        """Move all vehicles through equal spans, and do what `record` does after each, in one launch.
+
+        Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. The first span may
+        be the `first` of a batch, and the last one its `last`.
+        """
+        if span_ns not in self._flights:
+            if len(self._flights) >= _LAUNCHES_MAX:
+                self._flights.clear()
+            kernel, model = vehicle.flight(span_ns, note_state)
+            self._flights[span_ns] = RecordedLaunch(kernel, vehicle.device, block_dim=BLOCK_DIM), model
+        launch, model = self._flights[span_ns]
+        log = self._log_of(surfaces, fleet)
+        launch.launch(vehicle.count, [*model, log, count, slot, elapsed_ns, int(first), int(last)])
+
+    def _log_of(self, surfaces: Any, fleet: Any) -> Any:
+        """Return the log of vehicles, the same each time."""
+        if self._log[:2] != (surfaces, fleet):
+            log = Log()
+            log.surfaces, log.fleet, log.rows = surfaces, fleet, self._rows
+            self._log = surfaces, fleet, log
+        return self._log[2]
 
     def camera_poses(
         self,
@@ -333,14 +339,8 @@ class Trace:
     ) -> None:
         """Write the poses T_WC = T_WB T_BC of a camera at the first `count` of the given slots, in float32.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
-            p_WC: Positions, shape [world K]; overwritten.
-            q_WC: Orientations, shape [world K]; overwritten.
-            stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
+        Where the camera is on the body in each world is given as vec3d [m] and quatd, shape [world].
+        Positions, orientations, [world K], and times [ns], [world K, 1] or empty, are overwritten.
         """
         key = (slots.ptr, count, p_WC.ptr)
         # another list of slots may have the memory of one that is gone
@@ -392,12 +392,7 @@ class Trace:
     def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            twist: spatial_vectord, shape [world K]; overwritten.
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
+        As `camera_poses`; `twist` is of spatial_vectord, shape [world K].
         """
         world_count = self.states.shape[1]
         wp.launch(
@@ -441,14 +436,10 @@ class Trace:
 def make_surfaces(
     fields: Any, scene: Any, *, radius_m: float, ground_height_m: float | None, holds: bool
 ) -> Surfaces:
-    """Return what vehicles can touch.
+    """Return what vehicles of a radius can touch: `DistanceField` of each scene, index of that of each world.
 
-    Args:
-        fields: Distance to each scene, device array of `DistanceField`.
-        scene: Index of the scene of each world, device array of int32.
-        radius_m: Radius of the vehicle [m].
-        ground_height_m: z of the plane that it may land on [m]; None: there is none.
-        holds: A vehicle that touches something is held.
+    `ground_height_m` is z of the plane that they may land on; None: there is none. With `holds` a vehicle
+    that touches something is held.
     """
     surfaces = Surfaces()
     surfaces.fields, surfaces.scene = fields, scene

@@ -1,6 +1,6 @@
 """Multirotor dynamics: `Multirotor(preset("hummingbird"))` is a vehicle to fly."""
 
-from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig
+from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, preset
 from neurosim_core.vehicle.arrays import MultirotorArrays
 from neurosim_core.vehicle.config import VehicleConfig, VehicleContext
 from neurosim_core.vehicle.ground import GroundConfig
@@ -13,7 +13,6 @@ from neurosim_core.vehicle.multirotor import (
     Multirotor,
     MultirotorState,
 )
-from neurosim_core.vehicle.presets import preset
 from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig
 
 __all__ = [

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,assignment"
+# mypy: disable-error-code="attr-defined,call-overload,assignment"
 """The parameters of a multirotor: as settings, and on a device as the kernels read them."""
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from neurosim_core.frames import Vector3
 from neurosim_core.settings import Settings
+from neurosim_core.tables import read_table
 from neurosim_core.vehicle.aerodynamics import (
     AIR_TERMS,
     Airframe,
@@ -191,6 +192,22 @@ class MultirotorConfig(Settings):
         windy = any(self.wind_m_s) or bool(self.gusts) or needed["turbulence"]
         needed["wind"] = needed["gusts"] = windy
         return tuple(term for term in TERMS if needed[term])
+
+
+def preset(name: str, **overrides: Any) -> MultirotorConfig:
+    """Return the parameters of an airframe of `presets.yaml`.
+
+    Args:
+        name: crazyflie, hummingbird or racer.
+        **overrides: Parameters to change, such as `mass_kg=0.6`; checked like all others.
+
+    Raises:
+        ValueError: The name or a parameter is unknown, or a value is out of range.
+    """
+    airframes = read_table(__file__, "presets")
+    if name not in airframes:
+        raise ValueError(f"unknown airframe {name!r}, known: {sorted(airframes)}")
+    return MultirotorConfig(**{**airframes[name], **overrides})
 
 
 class AirframeArrays(NamedTuple):

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,valid-type"
+# mypy: disable-error-code="valid-type"
 """The state of a batch of vehicles as it lies on the device."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """The exponential chart of SO(3): within a step the attitude is R = R_0 exp(u), and u' = dexp^-1_u(w).
 
 Reference: Munthe-Kaas (1998), Runge-Kutta methods on Lie groups; Iserles, Munthe-Kaas, Norsett, Zanna (2000),

@@ -10,9 +10,8 @@ from pydantic import Field, ValidationError, model_validator
 from neurosim_core.config_errors import explain
 from neurosim_core.registry import register
 from neurosim_core.settings import Settings
-from neurosim_core.vehicle.airframe import MultirotorConfig
+from neurosim_core.vehicle.airframe import MultirotorConfig, preset
 from neurosim_core.vehicle.multirotor import Integrator, Multirotor
-from neurosim_core.vehicle.presets import preset
 
 if TYPE_CHECKING:
     from neurosim_core.vehicle.host_vehicle import Vehicle

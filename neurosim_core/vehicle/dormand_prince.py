@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """Dormand-Prince 5(4) with adaptive steps, in the exponential chart of SO(3), with the exact motor lag.
 
 Each step begins in a new chart, u = 0. What is controlled is the largest of the embedded errors of

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """The equations of motion with only the terms that a vehicle needs: one right-hand side, all integrators."""
 
 from typing import Any, NamedTuple

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """A horizontal ground: feet that press into it and slip on it, and rotors that push harder above it.
 
 A foot at depth d > 0 that sinks at a speed s is pushed up by k d (1 + c s), never pulled down: a spring with
@@ -78,13 +78,7 @@ def make_ground(config: GroundConfig | None, rotor_position_m: tuple[Vector3, ..
 
 @wp.func
 def touches(ground: Ground, height: wp.float64, up: wp.vec3d) -> wp.bool:
-    """Return whether a foot is in the ground.
-
-    Args:
-        ground: Parameters.
-        height: Of the centre of mass above the plane [m].
-        up: Direction of world z, in the frame of the feet.
-    """
+    """Return whether a foot is in the ground; height is that of the centre of mass, up is world z in B."""
     for foot in range(ground.feet.shape[0]):
         if height + wp.dot(up, ground.feet[foot]) < wp.float64(0.0):
             return wp.bool(True)
@@ -95,12 +89,8 @@ def touches(ground: Ground, height: wp.float64, up: wp.vec3d) -> wp.bool:
 def contact_wrench(ground: Ground, height: wp.float64, up: wp.vec3d, velocity: wp.vec3d, w: wp.vec3d):
     """Return force [N] and torque [N m] of the ground on the vehicle, in B.
 
-    Args:
-        ground: Parameters.
-        height: Of the centre of mass above the plane [m].
-        up: Direction of world z, in B.
-        velocity: Of the centre of mass over ground, in B [m/s].
-        w: Body rate [rad/s].
+    Height is that of the centre of mass above the plane [m]; world z, its velocity over ground [m/s] and the
+    body rate [rad/s] are in B.
     """
     force = wp.vec3d()
     torque = wp.vec3d()

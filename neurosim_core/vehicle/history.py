@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,no-any-return,arg-type,assignment"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,valid-type,return-value"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,assignment,no-untyped-def"
+# mypy: disable-error-code="valid-type,return-value"
 """The history of a flight, and the motion between its entries.
 
 The history has the state at every boundary of the integration, on the device, as far back as somebody needs.
@@ -21,10 +21,8 @@ wp.set_module_options({"enable_backward": False})
 class History:
     """The states of vehicles at boundaries, in a ring of L entries; all of shape [world, L] but `count`."""
 
-    count: wp.array[wp.int64]
-    """Entries since the reset of a world, shape [world]."""
-    stamp_ns: wp.array2d[wp.int64]
-    """Time since the reset of the world [ns]."""
+    count: wp.array[wp.int64]  # Entries since the reset of a world, shape [world]
+    stamp_ns: wp.array2d[wp.int64]  # Time since the reset of the world [ns]
     position: wp.array2d[wp.vec3d]
     velocity: wp.array2d[wp.vec3d]
     orientation: wp.array2d[wp.quatd]

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call,attr-defined"
+# mypy: disable-error-code="attr-defined"
 """What the engine asks of a vehicle, and the base of those that are computed in Python on the host."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """The kernels of a batch: fixed steps first, and adaptive ones for the vehicles where those do not do."""
 
 import functools
@@ -55,20 +55,11 @@ class Batch:
     evaluation_count: wp.array(dtype=wp.int64)
 
 
-class Recorder(NamedTuple):
-    """Notes the states of vehicles while they move."""
-
-    note: Any
-    """Warp function of: `model`; the vehicle; the slot; time since the beginning of the batch [ns]."""
-    model: Any
-    """What it reads and writes."""
-
-
 class Kernels(NamedTuple):
     """The kernels of one set of terms."""
 
     move: Any
-    """Device function that moves one vehicle by an interval; see `make_advance`."""
+    """Device function that moves one vehicle by an interval, unless it is held."""
     accelerate: Any
     """Evaluates linear and angular acceleration at the current state."""
     begin: Any
@@ -112,8 +103,7 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
     forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
     fly_fixed = make_rkmk4(equations)
     fly_adaptive = make_dormand_prince(equations)
-    name = "_".join(sorted(terms)) or "rigid"
-    module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}")
+    module = _module(terms)
 
     @wp.func
     def fly(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
@@ -273,13 +263,11 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
 
 
 @functools.cache
-def make_advance(terms: frozenset[str], note: Any) -> Any:
-    """Return the kernel that moves every vehicle by equal intervals; after each, `note` (see `Recorder`)."""
+def make_advance(terms: frozenset[str]) -> Any:
+    """Return the kernel that moves every vehicle by an interval."""
     move = make_kernels(terms).move
-    model_type = wp.int32 if note is None else next(iter(note.input_types.values()))
-    name = ".".join(("_".join(sorted(terms)) or "rigid", "alone" if note is None else note.key))
 
-    @wp.kernel(module=wp.get_module(f"{__name__}.{name}"), enable_backward=False)
+    @wp.kernel(module=_module(terms, "advance"), enable_backward=False)
     def advance(
         # Model:
         airframes: wp.array[Airframe],
@@ -287,18 +275,57 @@ def make_advance(terms: frozenset[str], note: Any) -> Any:
         interval: Interval,
         # In/out:
         batch: Batch,
-        recorder: model_type,
+    ):
+        vehicle = wp.tid()
+        move(airframes[vehicle], around, interval, batch, vehicle)
+
+    return advance
+
+
+@functools.cache
+def make_flight(terms: frozenset[str], note: Any) -> Any:
+    """Return the kernel that moves every vehicle by equal intervals, and notes its state after each.
+
+    Args:
+        terms: As of `make_kernels`.
+        note: Warp function of a `log` of any type; the vehicle; the slot; time since the beginning of the
+            batch [ns]; whether the state is the first and the last of the batch.
+    """
+    move = make_kernels(terms).move
+    log_type = next(iter(note.input_types.values()))
+
+    @wp.kernel(module=_module(terms, note.key), enable_backward=False)
+    def fly(
+        # Model:
+        airframes: wp.array[Airframe],
+        around: Surroundings,
+        interval: Interval,
+        # In/out:
+        batch: Batch,
+        log: log_type,
         # In:
         interval_count: wp.int32,
         slot: wp.int32,
         elapsed_ns: wp.int64,
+        is_first: wp.int32,
+        is_last: wp.int32,
     ):
         vehicle = wp.tid()
         airframe = airframes[vehicle]
         for index in range(interval_count):
             move(airframe, around, interval, batch, vehicle)
-            if wp.static(note is not None):
-                since_ns = elapsed_ns + wp.int64(index + 1) * interval.duration_ns
-                note(recorder, vehicle, slot + index, since_ns)
+            note(
+                log,
+                vehicle,
+                slot + index,
+                elapsed_ns + wp.int64(index + 1) * interval.duration_ns,
+                is_first != 0 and index == 0,
+                is_last != 0 and index == interval_count - 1,
+            )
 
-    return advance
+    return fly
+
+
+def _module(terms: frozenset[str], *more: str) -> wp.Module:
+    """Return the module of kernels with some terms."""
+    return wp.get_module(".".join((__name__, "_".join(sorted(terms)) or "rigid", *more)))

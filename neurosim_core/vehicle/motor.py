@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-def,untyped-decorator,operator"
+# mypy: disable-error-code="no-untyped-def,operator"
 """Rotor speed dynamics: a first-order lag towards the command, in closed form.
 
 With a command c held over a step of h seconds, Omega(s) = c + (Omega_0 - c) exp(-z s), s = t / h in [0, 1]

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,union-attr,assignment"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,union-attr,assignment"
 """Rigid multirotors: state, and stepping in integer time, for one vehicle or thousands."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from neurosim_core.frames import as_rows, normalised
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
 from neurosim_core.vehicle.arrays import BLOCK_DIM, allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
-from neurosim_core.vehicle.integrator import Batch, Interval, Recorder, make_advance, make_kernels
+from neurosim_core.vehicle.integrator import Batch, Interval, make_advance, make_flight, make_kernels
 from neurosim_core.vehicle.motor import lag_constants
 from neurosim_core.vehicle.rotors import Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
@@ -25,9 +25,7 @@ Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
 
 _STEP_MAX_NS = 10**12
-_LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration and count
-_SLOT_PARAMETER = 6  # of `make_advance`
-_ELAPSED_PARAMETER = 7
+_LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
 
 
 class MultirotorState(NamedTuple):
@@ -199,7 +197,7 @@ class Multirotor:
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
             self._begin = self._record(self._kernels.begin, self.airframes, self._around, None, self._batch)
-        self._launches: dict[tuple[int, int, Recorder | None], wp.Launch] = {}
+        self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self.reset()
 
@@ -278,23 +276,8 @@ class Multirotor:
         rows = self._rows(rotor_speed_command, "rotor_speed_command", self.config.rotor_count)
         self.arrays.rotor_speed_command.assign(rows)
 
-    def advance(
-        self,
-        duration_ns: int,
-        *,
-        count: int = 1,
-        recorder: Recorder | None = None,
-        slot: int = 0,
-        elapsed_ns: int = 0,
-    ) -> None:
+    def advance(self, duration_ns: int) -> None:
         """Move all vehicles with the command in `arrays`; device form of `step`, without checks.
-
-        Args:
-            duration_ns: How long an interval is [ns], > 0.
-            count: How many intervals, one after the other.
-            recorder: Notes the states after each; None: nobody does.
-            slot: Where it notes the first of them.
-            elapsed_ns: Time since the beginning of the batch, as it counts it [ns].
 
         Raises:
             TypeError: The duration is not an integer.
@@ -302,14 +285,21 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        launch = self._launches.get((duration_ns, count, recorder))
+        launch = self._launches.get(duration_ns)
         if launch is None:
-            launch = self._record_advance(duration_ns, count, recorder)
-        if recorder is not None:
-            launch.set_param_at_index(_SLOT_PARAMETER, slot)
-            launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
+            launch = self._record_advance(duration_ns)
         launch.launch()
-        self._stamp_ns += count * duration_ns
+        self._stamp_ns += duration_ns
+
+    def flight(self, duration_ns: int, note: Any) -> tuple[Any, list[Any]]:
+        """Return the kernel that moves all vehicles by equal intervals, and its first parameters.
+
+        Args:
+            duration_ns: Length of an interval [ns].
+            note: Notes the state of a vehicle after each; see `integrator.make_flight`.
+        """
+        model = [self.airframes, self._around, self._interval(duration_ns), self._batch]
+        return make_flight(frozenset(self.terms), note), model
 
     def begin(self, mask: Any) -> None:
         """Take up the wind at time 0 for some vehicles, whose state was set in `arrays`; device form.
@@ -396,24 +386,25 @@ class Multirotor:
         )
         return launch
 
-    def _record_advance(self, duration_ns: int, count: int, recorder: Recorder | None) -> wp.Launch:
+    def _record_advance(self, duration_ns: int) -> wp.Launch:
         """Prepare the launch for one duration, and keep it."""
         if duration_ns <= 0:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
         if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
             raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
-        launch = self._record_interval(duration_ns, count, recorder)
+        model = (self.airframes, self._around, self._interval(duration_ns), self._batch)
+        launch = self._record(make_advance(frozenset(self.terms)), *model)
         if len(self._launches) >= _LAUNCH_COUNT_MAX:
             del self._launches[next(iter(self._launches))]
-        self._launches[duration_ns, count, recorder] = launch
+        self._launches[duration_ns] = launch
         return launch
 
-    def _record_interval(self, duration_ns: int, count: int, recorder: Recorder | None) -> wp.Launch:
+    def _interval(self, duration_ns: int) -> Any:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lag = lag_constants(step_s, self.config.motor_time_constant_s)
         is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
-        interval = _struct(
+        return _struct(
             Interval,
             duration_ns=duration_ns,
             max_step_ns=self.max_step_ns,
@@ -428,9 +419,6 @@ class Multirotor:
             atol=atol,
             evaluation_count_max=evaluation_count_max,
         )
-        note, model = recorder or (None, 0)
-        kernel = make_advance(frozenset(self.terms), note)
-        return self._record(kernel, self.airframes, self._around, interval, self._batch, model, count, 0, 0)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

@@ -36,7 +36,7 @@ _G_M_S2 = 9.80665  # the unit of the log's accelerometer
 _STEP_S = 1e-3
 _STRIDE = 50  # samples from the beginning of a window to that of the next
 _PAST_S = 0.15  # flight before a window that tells the thrust for a command
-_DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.CRAZYFLIE
+_DELAY_S = 0.009  # output, flow and gyro filter; identified with the lag of the motors, see presets.yaml
 _TILT_S = 10.0  # how slowly the mean direction of the specific force corrects the integrated attitude
 _ROOM_S = 1.0  # over longer, the mean velocity of a flight in a room is nought
 _FILTER_STEP_S = 0.01
@@ -173,7 +173,7 @@ def replay(
         load = _load(config, vehicle.state.rotor_speed)
         if missing_torque:
             turned = _STEP_S * calibration.missing((sample + 0.5) * _STEP_S, load)
-            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)  # type: ignore[no-untyped-call]
+            vehicle.arrays.body_rate.assign(vehicle.state.body_rate + turned)
     unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
     pushed, felt = np.array(forces), np.array(measured_forces)
     return Replay(
@@ -290,15 +290,12 @@ def _calibrate(
 def _missing(body_rate: Array, turning: Array, load: Array, flying: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Tell what the model misses, by a Kalman filter of rate, steady and fading part for each axis.
 
-    Args:
-        body_rate: Measured at every sample [rad/s], shape [n, 3].
-        turning: Angular acceleration of the model there [rad/s^2], shape [n, 3].
-        load: By which the steady part is multiplied there, shape [n, 3].
-        flying: Which samples count, shape [n].
+    Of n samples: measured rate [rad/s], angular acceleration of the model [rad/s^2] and load by which the
+    steady part is multiplied, [n, 3] each, and which of them count, [n].
 
     Returns:
-        The steady part under a load of 1 and the fading part at samples 0, 10, 20, ... [rad/s^2], shape
-        [n / 10, 3] each.
+        The steady part under a load of 1 and the fading part at samples 0, 10, 20, ... [rad/s^2], shape [n /
+        10, 3] each.
     """
     step = round(_FILTER_STEP_S / _STEP_S)
     count = len(turning) // step

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """RKMK4: the classical Runge-Kutta method in the exponential chart of SO(3), with a moment-matched motor lag.
 
 Rotations about a fixed axis are exact. Forces are computed in the body frame B0 of the start of the step;

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
-# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# mypy: disable-error-code="no-untyped-def"
 """What the airframe sees of its rotors: sums over them of Omega and Omega^2, as functions of time.
 
 Within an interval Omega = c + d exp(-t / tau), c the command held and d = Omega_0 - c, so three sums hold for

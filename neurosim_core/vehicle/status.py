@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-call"
 """Why a vehicle is held: the codes in `MultirotorArrays.status`."""
 
 import warp as wp

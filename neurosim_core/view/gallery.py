@@ -21,7 +21,7 @@ from neurosim_core.flight import saved_flight
 from neurosim_core.learn.pilot import fly_policy
 from neurosim_core.packets import Events, Packet, PointCloud, as_numpy, join_events, schema_of
 from neurosim_core.sensors.corners import Corners
-from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.sensors.event_config import event_presets
 from neurosim_core.sim.model import make_model
 from neurosim_core.sim.rollout import run, run_model
 from neurosim_core.sim.state import make_state
@@ -114,7 +114,7 @@ def sensors() -> dict[str, Any]:
 def _pixels() -> dict[str, Any]:
     """One event camera with each preset of pixels."""
     ideal = {"kind": "event_camera", "lens": _LENS}
-    return {"ideal": ideal} | {name: {**ideal, "pixel": {"preset": name}} for name in PRESETS}
+    return {"ideal": ideal} | {name: {**ideal, "pixel": {"preset": name}} for name in event_presets()}
 
 
 def _views() -> dict[str, Any]:

@@ -187,8 +187,8 @@ class FlightSummary:
                 elif kind == "depth":
                     depth_m = min(depth_m, float(np.median(data)))
         for view in snapshot.events.values():
-            seen = np.zeros((view.height, view.width), dtype=np.bool_)
-            seen[view.events.y, view.events.x] = True
+            seen = np.zeros(view.height * view.width, dtype=np.bool_)
+            seen[np.multiply(view.events.y, view.width, dtype=np.intp) + view.events.x] = True
             covered = max(covered, float(seen.mean()))
         # most at a third: more is a thicket
         interest = (1.0 + contrast) * (0.01 + covered * (1.0 - covered) ** 2) * (0.1 + depth_m)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from peer import Number, connect
@@ -13,14 +11,12 @@ from runtime_directory import runtime
 
 from cortex.node import Node
 from cortex.policy import reliable
-from cortex.publisher import Publisher
-from cortex.subscriber import Subscriber
 
 __all__ = ["runtime"]
 
 
 @pytest.fixture
-def make_node(runtime: Path) -> Iterator[Callable[..., Node]]:
+def make_node(runtime):
     """Makes nodes, and closes them."""
     with contextlib.ExitStack() as stack:
 
@@ -31,20 +27,20 @@ def make_node(runtime: Path) -> Iterator[Callable[..., Node]]:
 
 
 @pytest.fixture
-def node(make_node: Callable[..., Node]) -> Node:
+def node(make_node):
     """A node that knows only itself, so that no registry has to start."""
     return make_node(registry="off")
 
 
 @pytest.fixture
-def numbers(node: Node) -> tuple[Publisher[Number], Subscriber[Number]]:
+def numbers(node):
     """A publisher and its reliable subscriber."""
     publisher, subscriber = connect(node, "/numbers", Number, reliable(256, 60.0))
     return publisher, subscriber
 
 
 @pytest.fixture
-def start_child(runtime: Path) -> Iterator[Callable[..., Child]]:
+def start_child(runtime):
     """Starts processes of `peer.py` in a role, and ends them."""
     with contextlib.ExitStack() as stack:
 

@@ -9,7 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -91,7 +90,7 @@ def _fingerprint() -> str:
 
 
 @pytest.fixture(scope="session")
-def programs() -> Path:
+def programs():
     """The directory of the programs: as Warp's kernels, they are kept for later sessions."""
     folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "neurosim" / "cpp_tests"
     folder.mkdir(parents=True, exist_ok=True)
@@ -107,7 +106,7 @@ def programs() -> Path:
 
 
 @pytest.fixture
-def start(programs: Path, runtime: Path) -> Iterator[Callable[..., Peer]]:
+def start(programs, runtime):
     """Starts `peer` in a role, with a registry for it to find, and ends it."""
     ensure_registry(0)
     with contextlib.ExitStack() as stack:

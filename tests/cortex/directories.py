@@ -61,11 +61,7 @@ class Node:
         self.changes: list[frozenset[int]] = []
         self.ever_lost: set[int] = set()
         self.directory = Directory(
-            context,
-            domain=0,
-            record=lambda: self.record,
-            on_change=self._on_change,
-            **options,
+            context, domain=0, record=lambda: self.record, on_change=self._on_change, **options
         )
         registered = options.get("registry") != "off"
         # The sign of life of a node whose process lives: it is given time when this process stands still.

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -80,48 +81,36 @@ def everything(size: int = 1000, label: str = "a\x1b[31mb") -> Everything:
     )
 
 
-def start(
-    *arguments: object, columns: int = 120, environment: dict[str, str] | None = None, **options: object
-) -> subprocess.Popen[str]:
+def start(*arguments, columns=120, environment=None, **options) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(columns), **(environment or {})}
     command = [sys.executable, "-m", "cortex", *map(str, arguments)]
-    child: subprocess.Popen[str] = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **options
-    )  # type: ignore[call-overload]
-    _children.append(child)
-    return child
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    _children.append(subprocess.Popen(command, env=environment, **pipes, **options))
+    return _children[-1]
 
 
 _children: list[subprocess.Popen[str]] = []
 
 
 @pytest.fixture(autouse=True)
-def no_child_left() -> Iterator[None]:
+def no_child_left():
     """End what a test that failed has left running."""
     yield
     while _children:
-        child = _children.pop()
-        child.kill()
-        child.wait(SOON_S)
-        for stream in (child.stdout, child.stderr):
-            if stream is not None:
-                stream.close()
+        with _children.pop() as child:
+            child.kill()
 
 
 def finish(child: subprocess.Popen[str], timeout_s: float = SOON_S) -> tuple[int, str, str]:
     """Wait for a command: status, output, complaints."""
-    try:
-        output, errors = child.communicate(timeout=timeout_s)
-    finally:
-        child.kill()
-        child.wait(SOON_S)
+    output, errors = child.communicate(timeout=timeout_s)
     return child.returncode, output, errors
 
 
-def cortex(*arguments: object, columns: int = 120, **options: object) -> tuple[int, str, str]:
+def cortex(*arguments, columns=120, **options) -> tuple[int, str, str]:
     """Run a command that ends by itself: in this process, if it needs no directory, environment or log."""
     if options or arguments[0] == "discovery":
-        return finish(start(*arguments, columns=columns, **options))  # type: ignore[arg-type]
+        return finish(start(*arguments, columns=columns, **options))
     output, errors = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, signals_kept():
         patch.setenv("COLUMNS", str(columns))
@@ -171,17 +160,12 @@ def publishing(publisher: Publisher[Number], period_s: float) -> Iterator[None]:
 
 def column(output: str, name: str, line: int = -1) -> str:
     """What stands under a title, the columns being separated by two blanks or more."""
-    import re
-
     lines = output.splitlines()
     titles, cells = (re.split(r" {2,}", text.strip()) for text in (lines[0], lines[line]))
     return cells[titles.index(name)]
 
 
-# Looking
-
-
-def test_where_nothing_runs_it_says_what_to_do(runtime: Path) -> None:
+def test_where_nothing_runs_it_says_what_to_do(runtime):
     for command in ("topics", "nodes"):
         status, output, errors = cortex(command)
         assert (status, output) == (0, "")
@@ -190,7 +174,7 @@ def test_where_nothing_runs_it_says_what_to_do(runtime: Path) -> None:
     assert not list(runtime.glob("*/registry*"))  # looking has started nothing
 
 
-def test_topics_and_nodes_are_listed(make_node: MakeNode) -> None:
+def test_topics_and_nodes_are_listed(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     robot.publisher("/number", Number)
     robot.publisher("/scan", Scan)
@@ -221,7 +205,7 @@ def whole_info(topic: str, **options: int) -> tuple[int, str, str]:
     return next(answer for answer in answers if "did not answer" not in answer[1])
 
 
-def test_two_types_on_one_topic_are_told_apart(make_node: MakeNode) -> None:
+def test_two_types_on_one_topic_are_told_apart(make_node):
     one, other = make_node("one"), make_node("other")
     one.publisher("/scan", Scan)
     other.publisher("/scan", Number)
@@ -235,7 +219,7 @@ def test_two_types_on_one_topic_are_told_apart(make_node: MakeNode) -> None:
     assert {f"one  {marks[0]}", f"other  {marks[1]}", "other  any  keep_last(64)"} <= set(output.splitlines())
 
 
-def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
+def test_info_shows_counters_policies_and_the_type(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     publisher = robot.publisher("/scan", Scan, latch=True)
     received: list[Scan] = []
@@ -264,7 +248,7 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
     assert errors == "cortex info: there is no topic /nothing; there are /scan\n"
 
 
-def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None:
+def test_top_shows_all_topics_with_rates_and_losses(make_node):
     robot, viewer = make_node("robot"), make_node("viewer")
     publisher = robot.publisher("/number", Number)
     robot.publisher("/scan", Scan)
@@ -287,7 +271,7 @@ def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None
         wait_for(is_right)
 
 
-def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> None:
+def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path):
     environment = {"XDG_CONFIG_HOME": str(tmp_path)}
     status, output, _ = cortex("doctor", environment=environment)
     assert status == 0, output
@@ -306,7 +290,7 @@ def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> Non
     assert "chmod 700" in output.splitlines()[0]
 
 
-def test_types_are_compared(make_node: MakeNode, tmp_path: Path) -> None:
+def test_types_are_compared(make_node, tmp_path):
     make_node().publisher("/number", Number)
     wait_for(lambda: "/number" in cortex("topics")[1])
     (tmp_path / "robot.py").write_text(
@@ -325,10 +309,7 @@ def test_types_are_compared(make_node: MakeNode, tmp_path: Path) -> None:
     assert "there are /number" in errors
 
 
-# Watching
-
-
-def test_echo_fits_the_terminal(make_node: MakeNode) -> None:
+def test_echo_fits_the_terminal(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything())
     status, output, errors = cortex("echo", "/all", "-n", 1, columns=72)
@@ -353,7 +334,7 @@ def test_echo_fits_the_terminal(make_node: MakeNode) -> None:
     assert "…" not in output
 
 
-def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
+def test_echo_as_json_holds_everything(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything(3))
     status, output, _ = cortex("echo", "/all", "-n", 1, "--json")
@@ -367,7 +348,7 @@ def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
     }  # fmt: skip
 
 
-def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
+def test_rate_bandwidth_and_delay_are_measured(make_node):
     """100 messages of 16 bytes each second; a machine that stands still for a while is asked again."""
     publisher = make_node("robot").publisher("/number", Number)
     with publishing(publisher, 0.01):
@@ -398,11 +379,8 @@ def rates_and_delays_are_right() -> bool:
     )
 
 
-# Files
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path, number: int) -> None:
+def test_record_until_told_to_stop_then_play(make_node, tmp_path, number):
     path = tmp_path / "run.mcap"
     robot = make_node("robot")
     publisher = robot.publisher("/number", Number)
@@ -429,9 +407,7 @@ def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_before_recording_has_begun_leaves_a_whole_file(
-    runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
+def test_a_signal_before_recording_has_begun_leaves_a_whole_file(runtime, tmp_path, monkeypatch, number):
     def interrupted(*arguments: Any, **options: Any) -> Recorder:
         recorder = Recorder(*arguments, **options)
         signal.raise_signal(number)
@@ -446,7 +422,7 @@ def test_a_signal_before_recording_has_begun_leaves_a_whole_file(
         assert (log.cut, log.message_count) == ("", 0)
 
 
-def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) -> None:
+def test_a_file_is_not_overwritten_unless_told(runtime, tmp_path):
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     status, output, errors = cortex("record", "-o", path, "/number")
@@ -477,13 +453,7 @@ def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) ->
         ("cpp no_such_module:Scan", "cortex cpp: there is no module no_such_module here or on the "),
     ],
 )
-def test_errors_are_one_line(
-    runtime: Path,
-    tmp_path: Path,
-    arguments: str,
-    complaint: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_errors_are_one_line(runtime, tmp_path, arguments, complaint, capsys):
     from test_log import write_numbers
 
     write_numbers(tmp_path / "run.mcap", range(5))
@@ -500,42 +470,35 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["fly"], "invalid choice: 'fly'"),
-        (["echo", "scan"], "got 'scan'"),
-        (["hz", "/scan", "--window", "0"], "must be a number > 0, got '0'"),
-        (["echo", "/scan", "-n", "-3"], "must be an integer > 0, got '-3'"),
-        (["play", "x.mcap", "--rate", "fast"], "must be a number > 0, or \"max\", got 'fast'"),
-        (["record", "/scan"], "-o"),
-        (["record", "-o", "x.mcap"], "say which topics to record, or --all"),
-        (["record", "-o", "x.mcap", "--all", "/scan"], "leave out /scan"),
-        (["cpp", "Scan"], "a type is named like robot.messages:Scan, got 'Scan'"),
-        (["cpp"], "name message types"),
-        (["cpp", "--include-dir", "a:B"], "--include-dir takes no type"),
-        (["keys", "old"], "invalid choice: 'old'"),
+        ("fly", "invalid choice: 'fly'"),
+        ("echo scan", "got 'scan'"),
+        ("hz /scan --window 0", "must be a number > 0, got '0'"),
+        ("echo /scan -n -3", "must be an integer > 0, got '-3'"),
+        ("play x.mcap --rate fast", "must be a number > 0, or \"max\", got 'fast'"),
+        ("record /scan", "-o"),
+        ("record -o x.mcap", "say which topics to record, or --all"),
+        ("record -o x.mcap --all /scan", "leave out /scan"),
+        ("cpp Scan", "a type is named like robot.messages:Scan, got 'Scan'"),
+        ("cpp", "name message types"),
+        ("cpp --include-dir a:B", "--include-dir takes no type"),
+        ("keys old", "invalid choice: 'old'"),
     ],
 )
-def test_wrong_use_is_told_from_failure(
-    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_use_is_told_from_failure(arguments, complaint, capsys):
     with signals_kept():
         try:
-            status = main(arguments)
+            status = main(arguments.split())
         except SystemExit as exit_of_the_parser:
-            status = exit_of_the_parser.code  # type: ignore[assignment]
+            status = exit_of_the_parser.code
     assert status == 2
     assert complaint in capsys.readouterr().err
-
-
-# Tools
 
 
 COMMANDS = "topics nodes top info echo hz bw delay record play keys doctor schema cpp bench discovery"
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS.split()])
-def test_every_command_has_help(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_command_has_help(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as end, signals_kept():
         main([*command.split(), "--help"])
@@ -545,14 +508,12 @@ def test_every_command_has_help(
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_help_loads_no_sockets() -> None:
-    code = "import sys, cortex.cli; assert 'zmq' not in sys.modules; assert 'cortex.node' not in sys.modules"
-    subprocess.run(
-        [sys.executable, "-c", code], check=True, timeout=SOON_S, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
+def test_help_loads_no_sockets():
+    code = "import sys, cortex.cli; assert not {'zmq', 'cortex.node'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=SOON_S, cwd=ROOT)
 
 
-def test_keys_are_made_once(tmp_path: Path) -> None:
+def test_keys_are_made_once(tmp_path):
     folder = tmp_path / "keys"
     status, output, errors = cortex("keys", "new", "--dir", folder)
     assert status == 0
@@ -568,7 +529,7 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
     assert (folder / "key.secret").read_text() == secret
 
 
-def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) -> None:
+def test_discovery_serves_until_interrupted(runtime, make_node):
     child = start("discovery")
     wait_for(lambda: (runtime / "0" / "registry").exists())
     make_node("robot").publisher("/number", Number)
@@ -581,32 +542,21 @@ def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) 
     assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
 
 
-# Text
-
-
 @pytest.mark.parametrize(
-    ("shown", "expected"),
+    ("show", "values", "expected"),
     [
-        (seconds(0.0), "0 ns"),
-        (seconds(123e-9), "123.0 ns"),
-        (seconds(9.99996e-3), "10.00 ms"),
-        (seconds(0.999999), "1.000 s"),
-        (seconds(12345.0), "12,345 s"),
-        (seconds(math.nan), "-"),
-        (bytes_of(16), "16 B"),
-        (number_of(1, "topic"), "1 topic"),
-        (number_of(2345, "message"), "2,345 messages"),
-        (bytes_of(999.99), "1.000 kB"),
-        (bytes_of(23.7e6), "23.70 MB"),
-        (rate(99.98), "99.98 Hz"),
-        (rate(123456.0), "123.5 kHz"),
+        (seconds, (0.0, 123e-9, 9.99996e-3, 0.999999, math.nan), "0 ns|123.0 ns|10.00 ms|1.000 s|-"),
+        (seconds, (12345.0,), "12,345 s"),
+        (bytes_of, (16, 999.99, 23.7e6), "16 B|1.000 kB|23.70 MB"),
+        (rate, (99.98, 123456.0), "99.98 Hz|123.5 kHz"),
+        (lambda count: number_of(count, "topic"), (1, 2345), "1 topic|2,345 topics"),
     ],
 )
-def test_numbers_have_units(shown: str, expected: str) -> None:
-    assert shown == expected
+def test_numbers_have_units(show, values, expected):
+    assert [show(value) for value in values] == expected.split("|")
 
 
-def test_names_of_others_command_no_terminal() -> None:
+def test_names_of_others_command_no_terminal():
     assert plain("robot") == "robot"
     assert plain("a\x1b[31m\n\x9b1mü\u202e") == "a\\x1b[31m\\x0a\\x9b1mü\\x202e"
 
@@ -617,7 +567,7 @@ def test_names_of_others_command_no_terminal() -> None:
     label=st.text(max_size=300),
     arrays=st.sampled_from(["none", "short"]),
 )
-def test_no_line_is_longer_than_the_terminal(columns: int, size: int, label: str, arrays: str) -> None:
+def test_no_line_is_longer_than_the_terminal(columns, size, label, arrays):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", str(columns))
         shown = everything(size, label.encode(errors="ignore").decode())
@@ -625,8 +575,38 @@ def test_no_line_is_longer_than_the_terminal(columns: int, size: int, label: str
     assert all(len(line) <= columns and line.isprintable() for line in lines)
 
 
-def test_json_has_no_numbers_that_json_does_not_know() -> None:
+def test_json_has_no_numbers_that_json_does_not_know():
     shown = everything()
     odd = Scan(1, np.array([math.nan, math.inf, 1.0], np.float32))
     assert to_plain(schema_of(Scan), odd) == {"stamp_ns": 1, "ranges": ["nan", "inf", 1.0]}
     json.dumps(to_plain(schema_of(Everything), shown), allow_nan=False)
+
+
+README = (ROOT / "cortex" / "README.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"<!-- example: (\w+) -->\s*```python\n(.*?)```", README, flags=re.DOTALL))
+SHOWN = {"minute": "mean 2.25 m", "loan": "(480, 640, 3)", "service": "Done(stamp_ns=0)"}
+"""What each example prints, among other things."""
+
+
+def test_every_example_is_run():
+    assert set(EXAMPLES) == set(SHOWN)
+    assert README.count("```python") == len(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", sorted(SHOWN))
+def test_an_example(name, runtime, tmp_path):
+    path = tmp_path / "example.py"
+    path.write_text(EXAMPLES[name], encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", path], capture_output=True, text=True, timeout=300.0, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert SHOWN[name] in done.stdout
+    assert not done.stderr
+
+
+def test_commands_exist():
+    """Every `cortex …` of the README names a command of the program."""
+    listed = set(re.findall(r"^cortex (\w+)", README, flags=re.MULTILINE))
+    assert listed
+    assert listed <= set(COMMANDS.split())

@@ -49,7 +49,7 @@ def _compile(text: str, tmp_path: Path, body: str = "") -> subprocess.CompletedP
     )
 
 
-def test_names_become_namespaces() -> None:
+def test_names_become_namespaces():
     text = generate([Arm])
     assert "namespace robot::arm {\nstruct Joint {" in text
     assert "std::vector<::robot::arm::Joint> joints{};" in text
@@ -60,7 +60,7 @@ def test_names_become_namespaces() -> None:
     assert "std::vector<::mine::messages::Joint> joints{};" in flat
 
 
-def test_codec_carries_identity_and_layout() -> None:
+def test_codec_carries_identity_and_layout():
     schema = schema_of(Joint)
     text = generate([Joint])
     assert f"fingerprint = 0x{schema.fingerprint:016X}u;" in text
@@ -74,7 +74,7 @@ def test_codec_carries_identity_and_layout() -> None:
     assert "return static_cast<std::int64_t>(message.stamp_ns);" in text
 
 
-def test_text_of_units_stays_in_comments_and_strings(tmp_path: Path) -> None:
+def test_text_of_units_stays_in_comments_and_strings(tmp_path):
     """Units come from anywhere: they can end neither a comment nor a literal."""
     units = ("m/s²", "??/", "*/ #error no", "\u2028#error no", "// %s", "trigraph ??'")
     fields = [Field(f"f{index}", "float64", unit, unit) for index, unit in enumerate(units)]
@@ -86,14 +86,14 @@ def test_text_of_units_stays_in_comments_and_strings(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_same_types_in_two_headers_are_one(tmp_path: Path) -> None:
+def test_same_types_in_two_headers_are_one(tmp_path):
     done = _compile(
         generate([Joint]) + generate([Arm]).replace("#pragma once", ""), tmp_path, "robot::Arm arm;"
     )
     assert done.returncode == 0, done.stderr
 
 
-def test_two_types_of_one_name_are_refused() -> None:
+def test_two_types_of_one_name_are_refused():
     one = _schema("Pose", Field("x", "float64"))
     other = _schema("Pose", Field("x", "float32"))
     with pytest.raises(ValueError, match="two different types would both be Pose"):
@@ -105,19 +105,19 @@ def test_two_types_of_one_name_are_refused() -> None:
 
 
 @pytest.mark.parametrize("namespace", ["", "a::", "a b", "1a", "a;", "ü"])
-def test_wrong_namespaces_are_refused(namespace: str) -> None:
+def test_wrong_namespaces_are_refused(namespace):
     with pytest.raises(ValueError, match="namespace must be names"):
         generate([Joint], namespace=namespace)
 
 
-def test_what_is_no_message_is_refused() -> None:
+def test_what_is_no_message_is_refused():
     with pytest.raises(TypeError, match="message"):
         generate([int])
     with pytest.raises(ValueError, match="at least one"):
         generate([])
 
 
-def test_arrays_are_values_or_views() -> None:
+def test_arrays_are_values_or_views():
     """Small arrays of a fixed shape are values, the others may look into a frame."""
 
     @message

@@ -11,7 +11,6 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import pytest
 from cpp_client import Impostor, Peer, make_frame
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs
+from peer import take_all
 from processes import SOON_S, wait_for
 
 import cortex
@@ -113,7 +113,7 @@ class Leavers(Impostor):
 
 
 @pytest.fixture
-def leavers(runtime: Path) -> Iterator[Leavers]:
+def leavers(runtime):
     impostor = Leavers(runtime)
     yield impostor
     impostor.close()
@@ -127,9 +127,7 @@ def expected(cut_off: int) -> dict[str, int]:
     return {name: sum(getattr(case, name) for case in cases) for name in COUNTERS}
 
 
-def test_python_reports_what_it_has_not_heard_the_end_of(
-    leavers: Leavers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_reports_what_it_has_not_heard_the_end_of(leavers, monkeypatch):
     monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 3 * 10**8)
     with Node("reader", registry=leavers.tcp_registry) as node:
         readers = [node.subscriber(f"/cut{number}", Scan, policy=reliable()) for number in (0, 1)]
@@ -137,18 +135,14 @@ def test_python_reports_what_it_has_not_heard_the_end_of(
         leavers.leave()
         for number, reader in enumerate(readers):
             wait_for(lambda reader=reader: not reader.sources() and not reader._links)
-            with contextlib.suppress(TimeoutError):
-                while True:
-                    reader.recv(0.0)
+            take_all(reader)
             counted = {name: getattr(reader.counters, name) for name in COUNTERS}
             assert counted == expected(number), number
             assert subscriber_stats(reader).cut_off == reader.counters.cut_off
 
 
 @needs_compiler
-def test_cpp_reports_what_it_has_not_heard_the_end_of(
-    programs: Path, leavers: Leavers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cpp_reports_what_it_has_not_heard_the_end_of(programs, leavers, monkeypatch):
     monkeypatch.setenv("CORTEX_TEST_REGISTRY", leavers.registry)
     peers = [Peer([programs / "peer", "count", f"/cut{number}", "reliable", 0, 0]) for number in (0, 1)]
     leavers.speak()
@@ -163,9 +157,7 @@ def test_cpp_reports_what_it_has_not_heard_the_end_of(
 
 
 @pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
-def test_a_lossy_reader_confirms_the_end(
-    request: pytest.FixtureRequest, leavers: Leavers, monkeypatch: pytest.MonkeyPatch, language: str
-) -> None:
+def test_a_lossy_reader_confirms_the_end(request, leavers, monkeypatch, language):
     """Else it is said once, and what the queue had no room for before it is counted by nobody."""
     with contextlib.ExitStack() as ends:
         if language == "C++":
@@ -194,12 +186,8 @@ def await_confirmed(leavers: Leavers, source: int, sequence: int) -> None:
 
 @pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
 def test_what_went_through_a_ring_that_cannot_be_mapped_is_lost(
-    request: pytest.FixtureRequest,
-    runtime: Path,
-    leavers: Leavers,
-    monkeypatch: pytest.MonkeyPatch,
-    language: str,
-) -> None:
+    request, runtime, leavers, monkeypatch, language
+):
     """Messages 5 to 8 did; the last of them is latched, and comes with the second answer."""
     with contextlib.ExitStack() as ends:
         listener = ends.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))

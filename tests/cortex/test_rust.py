@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
 import shutil
 import subprocess
-import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from peer import Block, Number, Scan, is_whole, make_block
-from processes import ROOT, SOON_S
-from test_end_of_stream import Leavers, expected, leavers
+from peer import Block, Number, Scan, is_whole, make_block, take_all
+from processes import ROOT, SOON_S, Beside, Lines
+from test_end_of_stream import expected, leavers
 from wire_vectors import message_to_plain
 
 from cortex import keep_last, reliable
@@ -34,7 +31,7 @@ CARGO = shutil.which(
 OLDEST = (1, 89)
 DEBIAN = Path("/usr/share/cargo/registry")
 """Where `apt install librust-zmq-dev` and the like put crates: they are taken from there, if they are."""
-CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-derive,serde-json,zmq}-dev"
+CRATES = "libzmq3-dev librust-{anyhow,blake2b-simd,hex,nix,rand,serde-json,zmq}-dev"
 PATIENCE_S = 900.0
 """After this a build or program that takes seconds hangs, also on a machine that does a lot besides."""
 
@@ -74,21 +71,21 @@ def cargo(*arguments: str) -> str:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def build() -> None:
+def build():
     """Everything is built once."""
     cargo("build")
 
 
 @pytest.fixture
-def start(runtime: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+def start(runtime):
     """Starts one of the programs, with a registry for it to find, and ends it."""
     ensure_registry(0)
     started: list[subprocess.Popen[bytes]] = []
 
     def run(*arguments: str) -> subprocess.Popen[bytes]:
         pipe = subprocess.PIPE
-        command = [str(TARGET / "debug" / arguments[0]), *arguments[1:]]
-        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))
+        command = [str(TARGET / "debug" / "cortex-peer"), *arguments]
+        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0))
         return started[-1]
 
     yield run
@@ -104,23 +101,19 @@ def finish(process: subprocess.Popen[bytes]) -> tuple[list[Any], list[str]]:
     return [json.loads(line) for line in output.splitlines()], errors.decode().splitlines()
 
 
-class Publishing:
-    """A running `cortex-pub` that publishes messages of a type."""
+class Publishing(Lines):
+    """A running `cortex-peer pub` that publishes messages of a type."""
 
     def __init__(self, process: subprocess.Popen[bytes], kind: type) -> None:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        self._process, self._schema = process, schema_of(kind)
-        self._input: IO[bytes] = process.stdin
-        self._output: IO[bytes] = process.stdout
+        super().__init__(process, "cortex-peer pub")
+        self._schema = schema_of(kind)
         self._say(self._schema.to_json())
 
     def _say(self, line: str) -> None:
-        self._input.write(line.encode() + b"\n")
-        self._input.flush()
+        self.process.stdin.write(line.encode() + b"\n")
 
     def await_subscribers(self, count: int) -> None:
-        while json.loads(self._output.readline())["subscribers"] != count:
+        while json.loads(self.line())["subscribers"] != count:
             pass
 
     def publish(self, message: Any) -> None:
@@ -128,29 +121,9 @@ class Publishing:
 
     def close(self) -> dict[str, int]:
         """End its input; what it has counted."""
-        lines, errors = finish(self._process)
+        lines, errors = finish(self.process)
         assert not errors
-        counted: dict[str, int] = lines[-1]
-        return counted
-
-
-class Reading:
-    """A `cortex-sub` that ends by itself, and whose output is read meanwhile: it must not wait for us."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._results: list[tuple[list[Any], list[str]]] = []
-        self._thread = threading.Thread(target=lambda: self._results.append(finish(process)))
-        self._thread.start()
-
-    def finish(self) -> tuple[list[Any], dict[str, int]]:
-        """The messages, and what it has counted."""
-        self._thread.join()
-        ((messages, errors),) = self._results
-        return messages, json.loads(errors[-1])
-
-
-def transport(name: str) -> list[str]:
-    return ["--tcp"] if name == "tcp" else []
+        return lines[-1]
 
 
 def test_vectors():
@@ -163,16 +136,16 @@ def blocks_of(count: int) -> list[Block]:
     return [make_block(number, 20_000 if number % 100 == 9 else number % 7) for number in range(count)]
 
 
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_reliable_from_python(start, make_node, over):
+def test_reliable_from_python(start, make_node):
     """More than all queues hold: the subscriber gets each message, and the publisher's end."""
-    publisher = make_node(listen="127.0.0.1").publisher("/blocks", Block, max_wait_s=SOON_S)
-    reading = Reading(start("cortex-sub", "/blocks", "--reliable", "--once", *transport(over)))
+    publisher = make_node().publisher("/blocks", Block, max_wait_s=SOON_S)
+    reading = Beside(finish, start("sub", "/blocks", "--reliable", "--once"))  # it must never wait for us
     assert publisher.wait_for_subscribers(1, SOON_S)
     blocks = blocks_of(6_000)
     delivered = sum(map(publisher.publish, blocks))
     publisher.close()
-    messages, counted = reading.finish()
+    ((messages, errors),) = reading.join(PATIENCE_S)
+    counted = json.loads(errors[-1])
     assert len(messages) == counted["received"] >= delivered
     assert counted["received"] + counted["lost"] == len(blocks)
     assert (counted["rejected"], counted["cut_off"]) == (0, 0)
@@ -180,30 +153,21 @@ def test_reliable_from_python(start, make_node, over):
         assert messages == [message_to_plain(schema_of(Block), block) for block in blocks]
 
 
-@pytest.mark.parametrize("over", ["ipc", "tcp"])
-def test_reliable_from_rust(start, make_node, over):
+def test_reliable_from_rust(start, make_node):
     """As the other way round; every tenth message is a large one."""
     node = make_node()
-    publishing = Publishing(start("cortex-pub", "/blocks", *transport(over)), Block)
+    publishing = Publishing(start("pub", "/blocks"), Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
     publishing.await_subscribers(1)
     count, blocks = 3_000, blocks_of(3_000)
-    closing: list[dict[str, int]] = []
-
-    def feed() -> None:
-        for block in blocks:
-            publishing.publish(block)
-        closing.append(publishing.close())
-
-    feeding = threading.Thread(target=feed)
-    feeding.start()
+    feeding = Beside(lambda: [*map(publishing.publish, blocks), publishing.close()][-1])
     received = []
     while subscriber.counters.received + subscriber.counters.lost < count:
         received.append(subscriber.recv(SOON_S))
-    feeding.join()
-    assert closing[0]["published"] == count
+    (closed,) = feeding.join()
+    assert closed["published"] == count
     assert len(received) + subscriber.counters.lost == count
-    assert subscriber.counters.lost <= closing[0]["timeouts"]
+    assert subscriber.counters.lost <= closed["timeouts"]
     assert all(is_whole(block) for block in received)
     numbers = [block.number for block in received]
     assert numbers == sorted(set(numbers))
@@ -212,7 +176,7 @@ def test_reliable_from_rust(start, make_node, over):
 
 def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     """It counts what it has lost, learns of the last loss, and gets messages again."""
-    publishing = Publishing(start("cortex-pub", "/blocks"), Block)
+    publishing = Publishing(start("pub", "/blocks"), Block)
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
     publishing.await_subscribers(1)
     count = 2_000  # of a kilobyte: more than lies between the two
@@ -220,9 +184,9 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
         publishing.publish(make_block(number, 1_000))
     received = 0
     while received + subscriber.counters.lost < count:
-        with contextlib.suppress(TimeoutError):
-            assert is_whole(subscriber.recv(0.01))
-            received += 1
+        blocks = take_all(subscriber)
+        assert all(map(is_whole, blocks))
+        received += len(blocks)
     lost = subscriber.counters.lost
     assert lost > 0
     publishing.publish(make_block(count, 5))
@@ -235,7 +199,7 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
 
 def test_several_subscribers_of_rust(start, make_node):
     """Each reader gets its own copy, whatever its policy; who leaves is no subscriber any more."""
-    publishing = Publishing(start("cortex-pub", "/scans"), Scan)
+    publishing = Publishing(start("pub", "/scans"), Scan)
     first, second = make_node("first"), make_node("second")
     lossy = first.subscriber("/scans", Scan, policy=keep_last(8))
     strict = second.subscriber("/scans", Scan, policy=reliable(8))
@@ -253,7 +217,7 @@ def test_several_subscribers_of_rust(start, make_node):
 
 def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     """Connected peers go on; who comes later is found through the registry that takes over."""
-    publishing = Publishing(start("cortex-pub", "/numbers"), Number)
+    publishing = Publishing(start("pub", "/numbers"), Number)
     node = make_node("first")
     first = node.subscriber("/numbers", Number, policy=reliable(8))
     publishing.await_subscribers(1)
@@ -265,12 +229,12 @@ def test_a_registry_that_is_killed_is_found_again(start, make_node, runtime):
     assert publishing.close() == {"published": 1, "timeouts": 0}
 
 
-def test_rust_reports_what_it_has_not_heard_the_end_of(runtime: Path, leavers: Leavers):
+def test_rust_reports_what_it_has_not_heard_the_end_of(runtime, leavers):
     (runtime / "0").mkdir(mode=0o700)
     leavers.router.bind(f"ipc://{runtime}/0/registry")
-    program, pipe = TARGET / "debug" / "cortex-sub", subprocess.PIPE
+    program, pipe = TARGET / "debug" / "cortex-peer", subprocess.PIPE
     readers = [
-        subprocess.Popen([program, f"/cut{number}", "--reliable", "--once"], stdout=pipe, stderr=pipe)
+        subprocess.Popen([program, "sub", f"/cut{number}", "--reliable", "--once"], stdout=pipe, stderr=pipe)
         for number in (0, 1)
     ]
     try:

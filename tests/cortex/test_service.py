@@ -17,12 +17,7 @@ from cortex.context import new_socket
 from cortex.message import message
 from cortex.schema import TypeMismatch
 from cortex.service import PENDING_MAX, Client, Place
-from cortex.wire import (
-    CONTROL_LIMIT,
-    REPLY,
-    pack_header,
-    unpack_header,
-)
+from cortex.wire import CONTROL_LIMIT, REPLY, pack_header, unpack_header
 
 
 @message
@@ -62,9 +57,6 @@ def begin_call(client, value, outcomes):
     return thread
 
 
-# Replies
-
-
 def test_a_task_calls_without_blocking_the_loop(node):
     """Other tasks go on while the handler works."""
     go_on = threading.Event()
@@ -85,9 +77,6 @@ def test_a_task_calls_without_blocking_the_loop(node):
         assert asyncio.run(run(client)).value == 42
 
 
-# Failures
-
-
 def test_a_handler_that_raises(node, caplog):
     """The text comes back; the next call works; a failure is in the server's log."""
 
@@ -102,22 +91,18 @@ def test_a_handler_that_raises(node, caplog):
     assert sum(record.exc_info is not None for record in caplog.records) == 3
 
 
-def test_nobody_offers_it(node):
-    with node.client("/nobody", Number, Number) as client:
+def test_it_is_not_there_or_withdrawn(node):
+    with node.client("/double", Number, Number) as client:
         assert not client.available()
 
         def call():
             begin = time.monotonic()
-            with pytest.raises(ServiceUnavailable, match=r"nobody offers /nobody \(waited 0\.1 s\)"):
+            with pytest.raises(ServiceUnavailable, match=r"nobody offers /double \(waited 0\.1 s\)"):
                 client.call(Number(0, 0), timeout_s=0.1)
             assert time.monotonic() - begin >= 0.1
 
         in_time(call, 1.0)
-
-
-def test_it_is_withdrawn(node):
-    withdraw = node.service("/double", Number, Number, double)
-    with node.client("/double", Number, Number) as client:
+        withdraw = node.service("/double", Number, Number, double)
         assert client.available()
         assert client.call(Number(0, 4), SOON_S).value == 8
         withdraw()
@@ -145,10 +130,8 @@ def test_wrong_use(node):
         node.service("/double", OtherNumber, Number, double)
     with pytest.raises(ValueError, match="is named like"):
         node.service("double", Number, Number, double)
-    with (
-        node.client("/double", Number, Number) as client,
-        pytest.raises(TypeError, match="takes Number, got Scan"),
-    ):
+    client = node.client("/double", Number, Number)
+    with client, pytest.raises(TypeError, match="takes Number, got Scan"):
         client.call(Scan(0, None))
 
 
@@ -164,9 +147,6 @@ def test_a_request_has_a_limit(node, excess):
         else:
             assert client.call(Bulk(bytes(size)), timeout_s=SOON_S).value == size
         assert client.call(Bulk(b"123"), SOON_S).value == 3
-
-
-# Deadlines
 
 
 def test_a_handler_that_takes_too_long(node):
@@ -226,22 +206,27 @@ def test_the_deadline_goes_along_within_a_host(runtime, local):
         assert header.stamp_ns is None
 
 
-def test_a_client_that_is_closed(make_node):
-    """By itself or with its node, before or during a call: an error at once."""
+@pytest.mark.parametrize("who", ["client", "server"])
+def test_closing_during_a_call(make_node, who):
+    """The client by itself or with its node, or the server: an error at once."""
     server, caller, handler, outcomes = make_node("server"), make_node("caller"), Holding(), []
     server.service("/hold", Number, Number, handler)
     client, other = caller.client("/hold", Number, Number), caller.client("/hold", Number, Number)
     other.close()
     with pytest.raises(Closed, match="/hold"):
         other.call(Number(0, 0), SOON_S)
-    thread = begin_call(client, 0, outcomes)
+    calling = begin_call(client, 0, outcomes)
     assert handler.entered.wait(SOON_S)
-    caller.close()
-    thread.join(SOON_S / 2)
-    assert [type(outcome) for outcome in outcomes] == [Closed]
+    closing = threading.Thread(target=caller.close if who == "client" else server.close)
+    closing.start()
+    calling.join(SOON_S / 2)
+    assert [type(outcome) for outcome in outcomes] == [Closed if who == "client" else ServiceUnavailable]
     handler.release.set()
-    with pytest.raises(Closed, match="/hold"):
-        client.call(Number(0, 0), SOON_S)
+    closing.join(SOON_S)
+    if who == "client":
+        with pytest.raises(Closed, match="/hold"):
+            client.call(Number(0, 0), SOON_S)
+    client.close()
 
 
 def test_an_answer_to_another_call_is_not_taken(runtime):
@@ -289,37 +274,27 @@ def test_too_many_requests(node):
     assert sum(isinstance(outcome, int) for outcome in outcomes) == PENDING_MAX + 1
 
 
-# Servers in other processes
-
-
 def test_a_handler_that_calls_back(make_node):
     """A server asks its caller something before it answers: both threads are free for it."""
     one, two = make_node("one"), make_node("two")
     one.service("/base", Number, Number, lambda request: Number(0, 100))
-    back = two.client("/base", Number, Number)
-    two.service(
-        "/add",
-        Number,
-        Number,
-        lambda request: Number(0, request.value + back.call(request, timeout_s=SOON_S).value),
-    )
-    with one.client("/add", Number, Number) as client:
+    with two.client("/base", Number, Number) as back, one.client("/add", Number, Number) as client:
+
+        def add(request):
+            return Number(0, request.value + back.call(request, timeout_s=SOON_S).value)
+
+        two.service("/add", Number, Number, add)
         assert client.call(Number(0, 7), timeout_s=SOON_S).value == 107
-    back.close()
 
 
 def test_a_handler_that_calls_its_own_node(node, caplog):
     """The one thread for handlers is taken by itself: it is told so at once, and the node lives."""
     node.service("/inner", Number, Number, double)
-    inner = node.client("/inner", Number, Number)
-    node.service("/outer", Number, Number, lambda request: inner.call(request, timeout_s=0.1))
-    with (
-        node.client("/outer", Number, Number) as client,
-        pytest.raises(ServiceFailed, match="its own node"),
-    ):
-        client.call(Number(0, 1), timeout_s=SOON_S)
-    assert inner.call(Number(0, 1), timeout_s=SOON_S).value == 2
-    inner.close()
+    with node.client("/inner", Number, Number) as inner, node.client("/outer", Number, Number) as client:
+        node.service("/outer", Number, Number, lambda request: inner.call(request, timeout_s=0.1))
+        with pytest.raises(ServiceFailed, match="its own node"):
+            client.call(Number(0, 1), timeout_s=SOON_S)
+        assert inner.call(Number(0, 1), timeout_s=SOON_S).value == 2
 
 
 def test_a_server_that_is_killed_during_a_call(make_node, start_child):
@@ -341,17 +316,3 @@ def test_a_server_that_is_killed_during_a_call(make_node, start_child):
         other = start_child("peer")
         other.ask(do="serve", name="/double")
         assert client.call(Number(0, 3), timeout_s=SOON_S) == Number(other.pid, 6)
-
-
-def test_a_server_that_closes_during_a_call(make_node):
-    server, caller, handler, outcomes = make_node("server"), make_node("caller"), Holding(), []
-    server.service("/hold", Number, Number, handler)
-    with caller.client("/hold", Number, Number) as client:
-        thread = begin_call(client, 0, outcomes)
-        assert handler.entered.wait(SOON_S)
-        closing = threading.Thread(target=server.close)
-        closing.start()
-        thread.join(SOON_S / 2)
-        assert [type(outcome) for outcome in outcomes] == [ServiceUnavailable]
-    handler.release.set()
-    closing.join(SOON_S)

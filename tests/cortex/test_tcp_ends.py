@@ -14,10 +14,11 @@ import threading
 import time
 
 import pytest
-from peer import Block, is_whole, make_block
-from processes import SOON_S, fork_server, wait_for
+from peer import Block, accounted, is_whole, make_block
+from processes import SOON_S, Beside, fork_server, wait_for
 
-from cortex import reliable
+import cortex.node
+from cortex import keep_last, reliable
 from cortex.context import Closed
 
 RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "8"))
@@ -39,17 +40,12 @@ class Reading:
         self.subscriber = subscriber
         self.wrong = []
         self._pause_s = pause_s
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self._thread = Beside(self._run)
 
     def _run(self):
         last = -1
         with contextlib.suppress(Closed):
-            while True:
-                try:
-                    block = self.subscriber.recv(0.02)
-                except TimeoutError:
-                    continue
+            for block in self.subscriber:
                 if block.number <= last or not is_whole(block):
                     self.wrong.append(block.number)
                 last = block.number
@@ -57,8 +53,7 @@ class Reading:
                     time.sleep(self._pause_s)
 
     def accounted(self):
-        counters = self.subscriber.counters
-        return counters.received + counters.lost
+        return accounted(self.subscriber.counters)
 
     def wait_for_end(self):
         """Until its publisher has left, and all that came of it was read."""
@@ -66,8 +61,7 @@ class Reading:
 
     def close(self):
         self.subscriber.close()
-        self._thread.join(SOON_S)
-        assert not self._thread.is_alive()
+        self._thread.join()
         assert self.wrong == []
         assert self.subscriber.counters.rejected == self.subscriber.counters.overtaken == 0
 
@@ -232,3 +226,25 @@ def a_subscriber_leaves(node, child, start_child, generator, tmp_path):
     assert longest_s < SOON_S / 2.0
     child.ask(do="close", topic="/numbers")
     victim.end()
+
+
+def test_the_end_comes_after_a_full_queue(make_node, monkeypatch):
+    """A reader of a lossy socket learns how many messages there were, also where its queue was full."""
+    publisher = make_node("one", listen="127.0.0.1").publisher("/blocks", Block)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(cortex.node, "host_id", lambda: "another host")
+        node = make_node("two", listen="127.0.0.1")
+    subscriber = node.subscriber("/blocks", Block, policy=keep_last(4))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert subscriber.wait_for_publisher(SOON_S)
+    assert subscriber.carriers == ["tcp"]
+    block, count = make_block(0, 10_000), 6_000
+    with subscriber._receive_lock:  # nobody reads: queues and buffers fill up, and the rest is dropped
+        for _ in range(count):
+            publisher.publish(block)
+        closing = Beside(publisher.close, linger_s=SOON_S)
+        closing.thread.join(0.3)
+        assert closing.thread.is_alive()  # the reader has not said yet that it knows
+    wait_for(lambda: accounted(subscriber.counters) + len(subscriber._queue) == count)
+    closing.join()
+    assert subscriber.counters.lost > 0

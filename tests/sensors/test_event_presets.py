@@ -9,9 +9,8 @@ import pytest
 import yaml
 
 from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
-from neurosim_core.sensors.event_config import EventCameraConfig, LeakConfig
+from neurosim_core.sensors.event_config import EventCameraConfig, LeakConfig, event_presets
 from neurosim_core.sensors.event_noise_model import terms_of
-from neurosim_core.sensors.event_presets import PRESETS
 from neurosim_core.sensors.events import EventCamera
 
 
@@ -23,7 +22,7 @@ def pixel_of(config: SimulationConfig) -> EventCameraConfig:
     return config.sensors["dvs"].pixel
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", event_presets())
 def test_presets_survive_a_file(name):
     config = load({"preset": name})
     pixel = pixel_of(config)
@@ -31,7 +30,7 @@ def test_presets_survive_a_file(name):
     assert terms_of(pixel) or pixel.readout is not None
     for comments in (False, True):
         assert load_config(yaml.safe_load(to_yaml(config, comments=comments))) == config
-    assert len(PRESETS[name].sources) > 20
+    assert len(event_presets()[name]["sources"]) > 20
 
 
 def test_contrasts_are_logarithms():

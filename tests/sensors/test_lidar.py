@@ -17,8 +17,7 @@ from neurosim_core.packets import Odometry, PointCloud
 from neurosim_core.record.hdf5 import RecordingWriter
 from neurosim_core.record.header import RecordingHeader, describe_sensors
 from neurosim_core.record.recording import Recording
-from neurosim_core.sensors.lidar import LidarConfig
-from neurosim_core.sensors.lidar_presets import PRESETS
+from neurosim_core.sensors.lidar import LidarConfig, lidar_presets
 from neurosim_core.sensors.lidar_scans import PatternScan, SpinningScan
 
 FALSE_ALARM = 1e-6
@@ -226,12 +225,12 @@ def test_a_pattern_comes_from_a_file(settings, tmp_path):
         PatternScan(file=tmp_path / "rays_back.npy")
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("name", sorted(lidar_presets()))
 def test_presets_are_valid_and_give_way_to_single_keys(name):
     config = LidarConfig.model_validate({"preset": name, "range_noise_m": 0.5})
     assert config.range_noise_m == 0.5
-    assert config.range_max_m == PRESETS[name]["range_max_m"]
-    assert json.loads(config.model_dump_json())["scan"]["kind"] == PRESETS[name]["scan"]["kind"]
+    assert config.range_max_m == lidar_presets()[name]["range_max_m"]
+    assert json.loads(config.model_dump_json())["scan"]["kind"] == lidar_presets()[name]["scan"]["kind"]
     assert config.scan.ray_table().shape == (config.scan.height, config.scan.width, 3)
     assert config.span_s < 1.0 / config.rate_hz
 

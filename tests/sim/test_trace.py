@@ -86,13 +86,14 @@ def test_camera_pose_is_body_pose_times_mount(device):
     field, _floor = floor_field(device, np.full((4, 4, 4), 9.0, np.float32))
     trace = Trace(capacity=3, world_count=1, rotor_count=6, device=device)
     trace.bring_to_host()
-    trace.record(surfaces_of(field, device, 1), fleet, 2, 1)
+    trace.record(surfaces_of(field, device, 1), fleet, 2, 1, first=True, last=True)
     trace.fetch(1, 2)
     wp.synchronize_device(device)
     rows = trace.numpy(1, 2)
     assert rows.status.tolist() == [[0], [3]]
     assert rows.redone.tolist() == [[0], [3]]
     assert trace.stamps.numpy().tolist() == [[0], [0], [2**53 + 1]]
+    assert fleet.clock_ns.numpy().tolist() == [2**53 + 1]
     state = rows.states[1, 0]
     for part, array in (
         (POSITION, fleet.position),
@@ -143,10 +144,16 @@ def test_who_touches_the_floor_is_marked_and_held_if_asked(device, holds):
     fleet = fleet_of([[0, 0, 0.15], [0, 0, 0.6], [0, 0, 0.1]], device, active=[1, 1, 0])
     trace = Trace(capacity=2, world_count=3, rotor_count=4, device=device)
     trace.bring_to_host()
-    trace.record(surfaces_of(field, device, 3, holds=holds), fleet, 1, 0)
+    surfaces = surfaces_of(field, device, 3, holds=holds)
+    trace.record(surfaces, fleet, 1, 0, first=True, last=False)
     trace.fetch(0, 2)
     wp.synchronize_device(device)
     # float32
     np.testing.assert_allclose(trace.numpy(1, 1).clearance, [[-0.05, 0.4, -0.1]], atol=1e-6)
     assert fleet.collided.numpy().tolist() == [1, 0, 0]
     assert fleet.status.numpy().tolist() == [int(STATUS_COLLISION) if holds else 0, 0, 0]
+    fleet.position.fill_((0.0, 0.0, 0.6))
+    trace.record(surfaces, fleet, 0, 0, first=False, last=False)
+    assert fleet.collided.numpy().tolist() == [1, 0, 0], "a touch lasts as long as its batch"
+    trace.record(surfaces, fleet, 0, 0, first=True, last=False)
+    assert fleet.collided.numpy().tolist() == [int(holds), 0, 0]

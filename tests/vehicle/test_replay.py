@@ -12,7 +12,6 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.vehicle import Multirotor, preset
-from neurosim_core.vehicle.presets import CRAZYFLIE
 from neurosim_core.vehicle.replay import (
     _FADING_RAD_S2,
     _FADING_S,
@@ -27,6 +26,8 @@ from neurosim_core.vehicle.replay import (
     replay,
     rotor_thrust_n,
 )
+
+CRAZYFLIE = preset("crazyflie")
 
 LOGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "crazyflie"
 

@@ -159,16 +159,9 @@ class FloorPlan:
 def make_floor_plan(
     *, seed: int, rooms: int, door_width_m: float, door_height_m: float, ceiling_m: float
 ) -> FloorPlan:
-    """Lay out a flat whose rooms are all connected by doors.
+    """Lay out a flat of 1 to 8 rooms that are all connected by doors.
 
     Of many random subdivisions of a rectangle the one with the best proportions is taken.
-
-    Args:
-        seed: Chooses the flat.
-        rooms: Number of rooms, 1 to 8.
-        door_width_m: Clear width of doorways [m].
-        door_height_m: Clear height of doorways [m].
-        ceiling_m: Height of the rooms [m].
     """
     roles = _MANY[:rooms] if rooms > 2 else (("studio",), ("living", "bedroom"))[rooms - 1]
     best: tuple[float, list[Rect], list[Door], Rect] | None = None

@@ -52,10 +52,7 @@ class RoomSpace:
     def _free(self, boxes: Array, *, group: bool = False, window: bool = False) -> NDArray[np.bool_]:
         """Return for each box whether a body can be there, shape [N].
 
-        Args:
-            boxes: The bodies.
-            group: They belong to what asked for clearance, and may stand in it.
-            window: They may hide a window.
+        A `group` belongs to what asked for clearance, and may stand in it; `window`: it may hide one.
         """
         rect = self.room.rect
         inside = (boxes[:, 0, :2] >= (rect.x0, rect.y0)) & (boxes[:, 1, :2] <= (rect.x1, rect.y1))
@@ -110,18 +107,11 @@ class RoomSpace:
         prefer: Place = "anywhere",
         window: bool = False,
     ) -> tuple[Wall, float] | None:
-        """Place a piece at the best spot along the walls.
+        """Place a piece at the best spot along the walls; return the wall and the position along it, or None.
 
-        Args:
-            piece: What shall be placed.
-            draws: Breaks ties.
-            front: Floor in front of it that must be free of other bodies, and stays so but for its group [m].
-            sides: Floor on both sides that must be free [m].
-            prefer: The ends of walls, or the middle of long walls without windows.
-            window: It may hide a window.
-
-        Returns:
-            The wall and the position along it, or None when it fits nowhere.
+        In front and on both sides of it so much floor must be free of other bodies [m], and that in front
+        stays so but for its group. `prefer`: the ends of walls, or the middle of long walls without windows,
+        one of which it may hide with `window`.
         """
         (x0, y0, z0), (x1, _, z1) = piece.bounds
         heights = (z0 + _LIFT_M, z1 + _LIFT_M)
@@ -157,11 +147,7 @@ class RoomSpace:
     ) -> tuple[float, float] | None:
         """Return where something has the most central place with `around` of free floor [m], or None.
 
-        Args:
-            bounds: Lowest and highest corner of it [m], shape [2, 3].
-            draws: Proposes places.
-            around: Free floor on all sides [m].
-            group: It may stand in what other pieces want free.
+        Its corners are `bounds` [m], shape [2, 3]; with `group` it may stand in what other pieces want free.
         """
         rect = self.room.rect
         box = bounds + np.array([[-around, -around, _LIFT_M], [around, around, _LIFT_M]])

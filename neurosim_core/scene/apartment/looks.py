@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from neurosim_core.scene.apartment import pictures, textures
 from neurosim_core.scene.apartment.draws import stream
 from neurosim_core.scene.apartment.floorplan import Role
-from neurosim_core.scene.apartment.tables import read_table
 from neurosim_core.scene.scene import LinearRgb
+from neurosim_core.tables import read_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class Palette:
     def __init__(self, seed: int) -> None:
         """Choose a scheme of colours."""
         self._seed = seed
-        self._table = read_table("looks")
+        self._table = read_table(__file__, "looks")
         schemes = list(self._table["schemes"].values())
         self._scheme: dict[str, list[str]] = schemes[int(stream(seed, "scheme").integers(len(schemes)))]
         self.common = {name: _surface(name, **data) for name, data in self._table["surfaces"].items()}

@@ -30,9 +30,9 @@ from neurosim_core.scene import solids
 from neurosim_core.scene.apartment.draws import Draws
 from neurosim_core.scene.apartment.looks import Surface
 from neurosim_core.scene.apartment.pictures import SPINE_COLUMNS, SPINE_ROWS
-from neurosim_core.scene.apartment.tables import read_table
 from neurosim_core.scene.scene import Light
 from neurosim_core.scene.solids import Array, Part, turned
+from neurosim_core.tables import read_table
 
 _WARM = np.array([1.5, 1.35, 1.14])
 """Intensity of a lamp of strength 1: walls and floors of furnished rooms get a radiance of 0.2 to 0.6."""
@@ -68,19 +68,13 @@ class Piece:
 
 
 def make_piece(kind: str, surfaces: Mapping[str, Surface], draws: Draws, **given: Any) -> Piece:
-    """Build a piece of the table.
-
-    Args:
-        kind: Its name in the table.
-        surfaces: What it can be made of, by name.
-        draws: Its random numbers.
-        **given: Variables that replace those of its `let`, or that it asks for.
+    """Build a piece of the table; `given` variables replace those of its `let`, or are those it asks for.
 
     Raises:
         NameError: It asks for a variable that is not given.
     """
     scope = {**FUNCTIONS, **surfaces, **given}
-    return replace(_build(read_table("furniture")[kind], scope, draws, given), kind=kind)
+    return replace(_build(read_table(__file__, "furniture")[kind], scope, draws, given), kind=kind)
 
 
 def _build(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws, given: Mapping[str, Any]) -> Piece:
@@ -119,7 +113,7 @@ def _solid(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws) -> Piec
     kind = next((key for key in node if key not in _KEYS), None)
     if kind is None:
         return Piece("")
-    if kind in read_table("furniture"):
+    if kind in read_table(__file__, "furniture"):
         given = {name: evaluate(data, scope, draws, name) for name, data in node[kind].items()}
         surfaces = {name: value for name, value in scope.items() if isinstance(value, Surface)}
         return make_piece(kind, surfaces, draws.under(kind), **given)

@@ -13,7 +13,7 @@ from neurosim_core.scene.apartment.floorplan import Room, Wall
 from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
 from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
-from neurosim_core.scene.apartment.tables import read_table
+from neurosim_core.tables import read_table
 
 _PLACE = ("front", "sides", "window")
 
@@ -35,17 +35,7 @@ class Furnisher:
         density: float,
         ceiling_m: float,
     ) -> None:
-        """Take an empty room.
-
-        Args:
-            room: The room.
-            index: Its number in the plan.
-            palette: Surfaces of the flat.
-            finish: What the room is lined with.
-            seed: Chooses the furniture.
-            density: Share of the optional things that are there, 0 to 1.
-            ceiling_m: Height of the room [m].
-        """
+        """Take an empty room; `density` is the share of the optional things that are there, 0 to 1."""
         self._room = room
         self._space = RoomSpace(room, ceiling_m)
         self._all_draws = self._draws = Draws(seed, room.name)
@@ -57,7 +47,7 @@ class Furnisher:
 
     def furnish(self) -> RoomSpace:
         """Do all steps, and return the furniture, the lamps and what space is left."""
-        for number, step in enumerate(read_table("rooms")[self._room.role]):
+        for number, step in enumerate(read_table(__file__, "rooms")[self._room.role]):
             ((method, options),) = step.items()
             self._do(f"{method} {number}", method, **options)
         self._draws = self._all_draws.under("windows")
@@ -97,16 +87,11 @@ class Furnisher:
         around: Sequence[dict[str, Any]] = (),
         **options: Any,
     ) -> None:
-        """Place pieces along the walls, each in the first way that fits, with what belongs to them.
+        """Place `count` pieces along the walls, each in the first way that fits, with what belongs to them.
 
-        Args:
-            kind: Of the piece.
-            tries: Variables of the piece and requirements of its place, the best first.
-            count: How many there are.
-            beside: Each one stands at this distance from the one before, if it fits there [m].
-            pictures: Chance of pictures above it.
-            around: What stands around it, see `rooms.yaml`.
-            **options: What all ways have in common; `with` are variables of the piece.
+        `tries` are variables of the piece and requirements of its place, the best first, and `options` what
+        they have in common (`with`: variables). Each stands `beside` the one before, if it fits there [m].
+        `pictures` is the chance of pictures above it; what stands `around` it: see `rooms.yaml`.
         """
         common = evaluate(options.pop("with", {}), dict(FUNCTIONS), self._draws, "with")
         spot: tuple[Wall, float] | None = None

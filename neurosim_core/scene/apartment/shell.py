@@ -23,16 +23,10 @@ _NO_DRAWS = Draws()
 def make_shell(
     plan: FloorPlan, finishes: Sequence[Finish], surfaces: Mapping[str, Surface], *, ceiling_m: float
 ) -> list[Piece]:
-    """Build every room of the plan, where it stands.
+    """Build every room of the plan, where it stands, of the surfaces that each is lined with.
 
     Ceilings are pieces `ceiling` and the top is `roof`, so that they can be left out of a picture from above;
     the walls have tops just below the roof.
-
-    Args:
-        plan: The rooms.
-        finishes: What each room is lined with.
-        surfaces: Of ceilings, mouldings, windows and doors, by name.
-        ceiling_m: Height of the rooms [m].
     """
     pieces = []
     for room, finish in zip(plan.rooms, finishes, strict=True):

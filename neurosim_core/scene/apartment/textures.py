@@ -31,11 +31,8 @@ def noise(
 ) -> Field:
     """Return tileable noise of mean 0 and standard deviation 1 whose amplitude falls as frequency^-slope.
 
-    Args:
-        rng: Source of randomness.
-        slope: 0 is white, 1 has equal contrast in each octave, 2 is cloudy.
-        stretch: How many times longer its structures are along u than along v.
-        coarsest: Below this many periods per tile the spectrum is flat.
+    A slope of 0 is white, 1 has equal contrast in each octave, 2 is cloudy. Its structures are `stretch`
+    times longer along u than along v; below `coarsest` periods per tile the spectrum is flat.
     """
     spectrum = scipy.fft.rfft2(rng.standard_normal((SIZE_PX, SIZE_PX), dtype=np.float32))
     across = np.fft.fftfreq(SIZE_PX, 1.0 / SIZE_PX).astype(np.float32)[:, None]

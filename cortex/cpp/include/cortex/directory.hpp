@@ -95,7 +95,7 @@ class Directory {
   bool take_changed() noexcept { return std::exchange(changed_, false); }
 
   // CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one; 0: not known.
-  std::int64_t clock_offset_ns() const { return clock_.offset_ns(monotonic_ns()); }
+  std::int64_t clock_offset_ns() const noexcept { return clock_.offset_ns(); }
 
   // This node's record has changed; the next `tick` says so.
   void announce() noexcept { dirty_ = true; }

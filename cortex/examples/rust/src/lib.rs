@@ -1,4 +1,4 @@
-//! A subscriber and a publisher of Cortex, written from WIRE.md; "[B3]" in a comment is a rule there. See README.md.
+//! A publisher and a subscriber of Cortex, written from WIRE.md; rules in brackets are of that page.
 
 pub mod body;
 pub mod node;

@@ -2,85 +2,29 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 use nix::time::{ClockId, clock_gettime};
 use serde_json::{Value, json};
 use zmq::{Context, DEALER, DONTWAIT, Socket};
 
 use crate::schema;
-use crate::wire::{HEADER, pack_control, parse_control};
+use crate::wire::{pack_control, parse_control};
 
 const LEASE: Duration = Duration::from_secs(1);
 const HEARTBEAT: Duration = Duration::from_millis(250);
 const ANSWER: Duration = Duration::from_millis(300);
-const CONTROL_MAX: i64 = (16 << 20) + HEADER as i64;
 
 pub fn clock_ns(clock: ClockId) -> Result<i64> {
     let time = clock_gettime(clock)?;
     Ok(time.tv_sec() * 1_000_000_000 + time.tv_nsec())
 }
 
-/// The user of this process.
-fn user() -> Result<u32> {
-    Ok(fs::metadata("/proc/self")?.uid())
-}
-
-/// BASE, where the folders of all domains are.
-fn base() -> Result<PathBuf> {
-    let user = user()?;
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let is_ours = |path: &PathBuf| fs::metadata(path).is_ok_and(|found| found.is_dir() && found.uid() == user);
-    let session = variable("XDG_RUNTIME_DIR").filter(is_ours).map(|path| path.join("cortex"));
-    Ok(variable("CORTEX_RUNTIME_DIR").or(session).unwrap_or_else(|| format!("/tmp/cortex-{user}").into()))
-}
-
-/// DIR, made if need be [D1].
-fn directory() -> Result<PathBuf> {
-    let path = base()?.join(std::env::var("CORTEX_DOMAIN").unwrap_or("0".into()));
-    fs::DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
-    for ours in [&path, &base()?] {
-        let found = fs::symlink_metadata(ours)?;
-        let is_private = found.is_dir() && found.uid() == user()? && found.mode() & 0o077 == 0;
-        ensure!(is_private, "{} is not a directory of ours with mode 0700", ours.display());
-    }
-    Ok(path)
-}
-
-/// The lock that keeps a node's files as long as it is open [D3].
-fn lock(path: &Path) -> Result<File> {
-    loop {
-        let file = File::options().write(true).create(true).truncate(false).mode(0o600).open(path)?;
-        file.lock()?;
-        if fs::metadata(path).is_ok_and(|found| file.metadata().is_ok_and(|own| own.ino() == found.ino())) {
-            return Ok(file);
-        }
-    }
-}
-
-/// What nodes have in common that can share unix sockets [D5].
-fn host() -> Result<String> {
-    let (boot, space) = (fs::read_to_string("/proc/sys/kernel/random/boot_id")?, fs::read_link("/proc/self/ns/pid")?);
-    let base = fs::metadata(base()?)?;
-    let text = format!("{}\n{}\n{}\n{}:{}", boot.trim(), space.display(), user()?, base.dev(), base.ino());
-    Ok(hex::encode(schema::hash(text.as_bytes())))
-}
-
-/// What the registry has told.
-#[derive(Default)]
-struct Told {
-    epoch: u64,
-    version: u64,
-    /// All nodes that it knows, us among them, and when it named them all.
-    nodes: BTreeSet<u64>,
-    named: Option<Instant>,
-}
-
 pub struct Node {
-    pub id: u64,
+    id: u64,
     pub host: String,
     /// Records of the other nodes, and how often they have changed.
     pub others: BTreeMap<u64, Value>,
@@ -89,24 +33,51 @@ pub struct Node {
     lock: File,
     registry: Socket,
     record: Value,
-    told: Told,
+    /// What the registry has told: its state, all nodes that it knows, and when it named them.
+    state: (u64, u64),
+    named: BTreeSet<u64>,
+    since: Option<Instant>,
     /// When we last said Hello, if there is no answer yet, and when Heartbeat.
     asked: Option<Instant>,
     beat: Instant,
 }
 
 impl Node {
-    /// A node that nobody knows yet.
+    /// A node that nobody knows yet, in the folder that a registry has made [D1].
     pub fn open(context: &Context) -> Result<Node> {
-        let (id, directory, registry) = (rand::random(), directory()?, context.socket(DEALER)?);
+        let (id, user) = (rand::random(), fs::metadata("/proc/self")?.uid());
+        let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+        let is_ours =
+            |path: &PathBuf| fs::symlink_metadata(path).is_ok_and(|found| found.is_dir() && found.uid() == user);
+        let session = variable("XDG_RUNTIME_DIR").filter(is_ours).map(|path| path.join("cortex"));
+        let base = variable("CORTEX_RUNTIME_DIR").or(session).unwrap_or_else(|| format!("/tmp/cortex-{user}").into());
+        let directory = base.join(std::env::var("CORTEX_DOMAIN").unwrap_or("0".into()));
+        for path in [&base, &directory] {
+            let found = fs::symlink_metadata(path).with_context(|| format!("no registry in {}", path.display()))?;
+            ensure!(is_ours(path) && found.mode() & 0o077 == 0, "{} is not private", path.display());
+        }
+        let (boot, space) =
+            (fs::read_to_string("/proc/sys/kernel/random/boot_id")?, fs::read_link("/proc/self/ns/pid")?);
+        let (found, boot, space) = (fs::metadata(&base)?, boot.trim(), space.display());
+        let host =
+            hex::encode(schema::hash(format!("{boot}\n{space}\n{user}\n{}:{}", found.dev(), found.ino()).as_bytes())); // [D5]
+        let path = directory.join(format!("{id:016x}.lock"));
+        let lock = loop {
+            let file = File::options().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
+            file.lock()?;
+            if fs::metadata(&path).is_ok_and(|found| file.metadata().is_ok_and(|own| own.ino() == found.ino())) {
+                break file; // [D3]
+            }
+        };
+        let registry = context.socket(DEALER)?;
         registry.set_linger(1000)?;
-        registry.set_maxmsgsize(CONTROL_MAX)?;
+        registry.set_maxmsgsize(17 << 20)?;
         registry.set_immediate(true)?; // nothing is queued while there is no registry
         registry.set_reconnect_ivl(20)?;
         registry.connect(&format!("ipc://{}", directory.join("registry").display()))?;
-        let (host, lock) = (host()?, lock(&directory.join(format!("{id:016x}.lock")))?);
-        let (others, record, told, beat) = (BTreeMap::new(), Value::Null, Told::default(), Instant::now());
-        Ok(Node { id, host, others, changes: 0, directory, lock, registry, record, told, asked: None, beat })
+        let (others, named, record, beat) = (BTreeMap::new(), BTreeSet::new(), Value::Null, Instant::now());
+        let (changes, state, since, asked) = (0, (0, 0), None, None);
+        Ok(Node { id, host, others, changes, directory, lock, registry, record, state, named, since, asked, beat })
     }
 
     pub fn path(&self, role: &str) -> PathBuf {
@@ -121,7 +92,7 @@ impl Node {
             "clock_offset_ns": offset_ns, "endpoints": endpoints, "publishers": publishers,
             "subscribers": subscribers, "services": [],
         });
-        self.hello(true)
+        self.hello()
     }
 
     fn send(&self, name: &str, message: &Value) -> Result<()> {
@@ -129,9 +100,9 @@ impl Node {
         Ok(())
     }
 
-    fn hello(&mut self, snapshot: bool) -> Result<()> {
+    fn hello(&mut self) -> Result<()> {
         self.asked = Some(Instant::now());
-        self.send("Hello", &json!({"snapshot": snapshot, "record": self.record}))
+        self.send("Hello", &json!({"snapshot": true, "record": self.record}))
     }
 
     /// Hear the registry, and say what is due; to be called all the time.
@@ -141,44 +112,41 @@ impl Node {
                 self.hear(name, &message)?;
             }
         }
-        if self.told.named.is_some_and(|since| since.elapsed() > LEASE) {
+        if self.since.is_some_and(|since| since.elapsed() > LEASE) {
             let before = self.others.len(); // [C5]
-            self.others.retain(|node, _| self.told.nodes.contains(node));
+            self.others.retain(|node, _| self.named.contains(node));
             self.changes += (self.others.len() < before) as u64;
         }
         if self.beat.elapsed() > HEARTBEAT {
             self.beat = Instant::now();
             self.send("Heartbeat", &json!({"node": self.id, "revision": 1, "held": 0}))?;
         }
-        if self.asked.is_some_and(|since| since.elapsed() > ANSWER) { self.hello(true) } else { Ok(()) }
+        if self.asked.is_some_and(|since| since.elapsed() > ANSWER) { self.hello() } else { Ok(()) }
     }
 
     fn hear(&mut self, name: &str, message: &Value) -> Result<()> {
         let number = |name: &str| message[name].as_u64().unwrap_or(0);
+        let state = (number("epoch"), number("version"));
         match name {
             "Welcome" => {
-                let nodes = serde_json::from_value(message["nodes"].clone())?;
-                self.told =
-                    Told { epoch: number("epoch"), version: number("version"), nodes, named: Some(Instant::now()) };
-                self.asked = None;
+                (self.state, self.since, self.asked) = (state, Some(Instant::now()), None);
+                self.named = serde_json::from_value(message["nodes"].clone())?;
             }
             "Changed" | "Gone" => {
-                self.told.version += (number("version") == self.told.version + 1) as u64; // [C2]
+                self.state.1 += (state.1 == self.state.1 + 1) as u64; // [C2]
                 self.changes += 1;
-                if name == "Gone" {
-                    self.told.nodes.remove(&number("node"));
-                    self.others.remove(&number("node"));
-                } else if let Some(node) = message["record"]["node"].as_u64() {
-                    self.told.nodes.insert(node);
+                if let Some(node) = message["record"]["node"].as_u64() {
+                    self.named.insert(node);
                     self.others.insert(node, message["record"].clone());
+                } else {
+                    self.named.remove(&number("node"));
+                    self.others.remove(&number("node"));
                 }
             }
             "Alive" if self.asked.is_none() => {
                 let is_known = |node: &u64| *node == self.id || self.others.contains_key(node);
-                let is_current = (self.told.epoch, self.told.version) == (number("epoch"), number("version"))
-                    && self.told.nodes.iter().all(is_known);
-                if !is_current || number("held") != 1 {
-                    self.hello(!is_current)?; // [C4]
+                if self.state != state || number("held") != 1 || !self.named.iter().all(is_known) {
+                    self.hello()?; // [C4]
                 }
             }
             "Refused" => eprintln!("the registry refuses this node: {}", message["reason"]),
@@ -190,7 +158,7 @@ impl Node {
     /// Leave, and remove the node's files, the lock last.
     pub fn close(&self) -> Result<()> {
         for role in ["lossy", "strict", "lock"] {
-            let _ = fs::remove_file(self.path(role)); // a tcp port has none
+            let _ = fs::remove_file(self.path(role)); // a subscriber has a lock only
         }
         self.lock.unlock()?;
         self.send("Leave", &json!({"node": self.id}))

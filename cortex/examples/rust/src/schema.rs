@@ -1,71 +1,27 @@
-//! Schemas: their canonical text, what they may say, their fingerprint [S], and how a type lies in a block [B1].
+//! Schemas, which are JSON: their canonical text, their fingerprint [S], and how a type lies in a block [B1].
 
-use anyhow::{Result, bail, ensure};
-use serde::{Deserialize, Serialize};
+use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Map, Value};
 
-const BLOCK_MAX: usize = 1 << 30;
-
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(rename_all = "lowercase")]
+/// Names and itemsizes by number.
 #[rustfmt::skip]
-pub enum Dtype {
-    Bool, Int8, Int16, Int32, Int64, UInt8, UInt16, UInt32, UInt64, Float16, Float32, Float64, Complex64, Complex128,
-    Str, Bytes, Any,
-}
+pub const DTYPES: [(&str, usize); 14] = [
+    ("bool", 1), ("int8", 1), ("int16", 2), ("int32", 4), ("int64", 8), ("uint8", 1), ("uint16", 2), ("uint32", 4),
+    ("uint64", 8), ("float16", 2), ("float32", 4), ("float64", 8), ("complex64", 8), ("complex128", 16),
+];
 
-impl Dtype {
-    /// By their numbers in a body.
-    #[rustfmt::skip]
-    pub const CODES: [Dtype; 14] = {
-        use Dtype::*;
-        [Bool, Int8, Int16, Int32, Int64, UInt8, UInt16, UInt32, UInt64, Float16, Float32, Float64, Complex64, Complex128]
-    };
-
-    pub fn itemsize(self) -> usize {
-        [1, 1, 2, 4, 8, 1, 2, 4, 8, 2, 4, 8, 8, 16].get(self as usize).copied().unwrap_or(1)
-    }
-
-    pub fn is_signed(self) -> bool {
-        (Dtype::Int8 as u8..=Dtype::Int64 as u8).contains(&(self as u8))
-    }
-
-    pub fn is_unsigned(self) -> bool {
-        (Dtype::UInt8 as u8..=Dtype::UInt64 as u8).contains(&(self as u8))
-    }
-}
-
-#[derive(Debug, Deserialize, Serialize)]
-pub struct Schema {
-    pub name: String,
-    pub fields: Vec<Field>,
-}
-
-#[derive(Debug, Deserialize, Serialize)]
-pub struct Field {
-    pub name: String,
-    #[serde(rename = "type")]
-    pub of: Type,
-    unit: String,
-    frame: String,
-}
-
-#[derive(Debug, Deserialize, Serialize)]
-#[serde(untagged)]
-pub enum Type {
-    Plain(Dtype),
-    Enum { r#enum: String, values: Map<String, Value> },
-    Array { array: Dtype, shape: Vec<Dimension> },
-    Optional { optional: Box<Type> },
-    List { list: Box<Type> },
-    Message { message: Schema },
-}
-
-#[derive(Debug, Deserialize, Serialize)]
-#[serde(untagged)]
-pub enum Dimension {
-    Size(u32),
-    Name(String),
+pub enum Type<'a> {
+    /// "str" or "bytes".
+    Text(&'a str),
+    Number(&'a str, usize),
+    Enum(&'a Map<String, Value>),
+    /// An array in the block, of so many bytes.
+    Fixed(usize),
+    /// An array in the tail: its dtype or "any", and its shape.
+    Array(&'a str, &'a [Value]),
+    Optional(&'a Value),
+    List(&'a Value),
+    Message(&'a Value),
 }
 
 /// How a type lies in a block, whether it may have a tail [B2], and for how many values an element of it counts [B10].
@@ -83,114 +39,80 @@ impl Layout {
     }
 }
 
-impl Type {
-    pub fn layout(&self) -> Layout {
-        let (size, alignment, has_tail) = match self {
-            Type::Plain(Dtype::Str | Dtype::Bytes) | Type::List { .. } => (8, 4, true),
-            Type::Plain(dtype) => (dtype.itemsize(), dtype.itemsize(), false),
-            Type::Enum { .. } => (4, 4, false),
-            Type::Array { array, shape } => match fixed_shape(*array, shape) {
-                None => (8 + 4 * shape.len(), 4, true),
-                Some(sizes) => {
-                    let size = sizes.iter().fold(array.itemsize(), |all, size| (all * size).min(BLOCK_MAX + 1));
-                    (size, if size >= 1024 { 64 } else { array.itemsize() }, false)
+/// A type, and how it lies.
+pub fn type_of(json: &Value) -> Result<(Type<'_>, Layout)> {
+    let lay = |size, alignment, has_tail| Layout { size, alignment, has_tail, values: 1 };
+    let itemsize = |name: &str| DTYPES.iter().find(|(known, _)| *known == name).map(|(_, size)| *size);
+    if let Value::String(name) = json {
+        return Ok(match name.as_str() {
+            "str" | "bytes" => (Type::Text(name), lay(8, 4, true)),
+            _ => {
+                let size = itemsize(name).with_context(|| format!("no type {name}"))?;
+                (Type::Number(name, size), lay(size, size, false))
+            }
+        });
+    }
+    let (key, inner) = json.as_object().and_then(|members| members.iter().next()).context("no type")?;
+    Ok(match key.as_str() {
+        "enum" => (Type::Enum(json["values"].as_object().context("an enum without values")?), lay(4, 4, false)),
+        "array" => {
+            let (dtype, shape) = inner.as_str().zip(json["shape"].as_array()).context("an array without a shape")?;
+            let item = if dtype == "any" { None } else { Some(itemsize(dtype).context("no such dtype")?) };
+            let size = |size: u64, of: &Value| Some(size.saturating_mul(of.as_u64()?).min(1 << 32));
+            match item.and_then(|item| shape.iter().try_fold(item as u64, size)) {
+                None => (Type::Array(dtype, shape), lay(8 + 4 * shape.len(), 4, true)),
+                Some(size) => {
+                    let alignment = if size >= 1024 { 64 } else { item.unwrap_or(1) };
+                    (Type::Fixed(size as usize), lay(size as usize, alignment, false))
                 }
-            },
-            Type::Optional { optional } => {
-                let inner = optional.layout();
-                return Layout { size: (inner.alignment + inner.size).next_multiple_of(inner.alignment), ..inner };
             }
-            Type::Message { message } => return message.layout(),
-        };
-        Layout { size, alignment, has_tail, values: 1 }
-    }
-
-    /// Count the fields, enum values and dimensions in a type, unless it is over the limits [S4].
-    fn count(&self, depth: usize) -> Result<usize> {
-        ensure!(depth <= 8, "nested more than 8 deep");
-        match self {
-            Type::Plain(Dtype::Float16 | Dtype::Complex64 | Dtype::Complex128 | Dtype::Any) => {
-                bail!("{self:?} in a field")
-            }
-            Type::Plain(_) => Ok(0),
-            Type::Enum { values, .. } => Ok(values.len()),
-            Type::Array { array, shape } => {
-                let is_one =
-                    shape.len() <= 32 && self.layout().size <= BLOCK_MAX && !matches!(array, Dtype::Str | Dtype::Bytes);
-                ensure!(is_one, "an array of {} dimensions of {array:?}", shape.len());
-                Ok(shape.len())
-            }
-            Type::Optional { optional: inner } | Type::List { list: inner } => inner.count(depth + 1),
-            Type::Message { message } => message.count(depth + 1),
         }
-    }
+        "optional" => {
+            let layout = type_of(inner)?.1;
+            let size = (layout.alignment + layout.size).next_multiple_of(layout.alignment);
+            (Type::Optional(inner), Layout { size, ..layout })
+        }
+        "list" => (Type::List(inner), lay(8, 4, true)),
+        "message" => (Type::Message(inner), places(inner)?.1),
+        _ => bail!("no type {key}"),
+    })
 }
 
-/// The shape of an array that lies in the block.
-pub fn fixed_shape(dtype: Dtype, shape: &[Dimension]) -> Option<Vec<usize>> {
-    let size = |dimension: &Dimension| match dimension {
-        Dimension::Size(size) => Some(*size as usize),
-        Dimension::Name(_) => None,
-    };
-    if dtype == Dtype::Any { None } else { shape.iter().map(size).collect() }
+/// The name, type and offset of each field of a message, and how the message lies.
+pub fn places(schema: &Value) -> Result<(Vec<(&str, &Value, usize)>, Layout)> {
+    let mut whole = Layout { size: 0, alignment: 1, has_tail: false, values: 1 };
+    let mut fields = vec![];
+    for field in schema["fields"].as_array().context("a message without fields")? {
+        let layout = type_of(&field["type"])?.1;
+        let offset = whole.size.next_multiple_of(layout.alignment);
+        fields.push((field["name"].as_str().context("a field without a name")?, &field["type"], offset));
+        whole.size = offset + layout.size;
+        whole.alignment = whole.alignment.max(layout.alignment);
+        whole.has_tail |= layout.has_tail;
+        whole.values += layout.values;
+    }
+    whole.size = whole.size.next_multiple_of(whole.alignment);
+    Ok((fields, whole))
 }
 
-impl Schema {
-    /// Read a canonical text [S1].
-    pub fn parse(text: &str) -> Result<Schema> {
-        ensure!(text.len() <= 1 << 16, "a schema of {} bytes", text.len());
-        let schema: Schema = serde_json::from_str(text)?;
-        ensure!(schema.to_json() == text, "a schema that is not canonical");
-        let parts = schema.count(1)?;
-        ensure!(parts <= 2048, "a schema of {parts} fields, values and dimensions");
-        Ok(schema)
-    }
+/// Read a canonical text [S1].
+pub fn parse(text: &str) -> Result<Value> {
+    let schema: Value = serde_json::from_str(text)?;
+    ensure!(text.len() <= 1 << 16 && schema.to_string() == text, "a schema that is too long or not canonical");
+    places(&schema)?;
+    Ok(schema)
+}
 
-    pub fn to_json(&self) -> String {
-        serde_json::to_string(self).unwrap()
-    }
+/// The fingerprint of a type [S6].
+pub fn fingerprint(schema: &Value) -> u64 {
+    u64::from_le_bytes(hash(schema.to_string().as_bytes()))
+}
 
-    /// The fingerprint of the type [S6].
-    pub fn fingerprint(&self) -> u64 {
-        u64::from_le_bytes(hash(self.to_json().as_bytes()))
-    }
-
-    /// Whether a message has a stamp of its own [H3].
-    pub fn is_stamped(&self) -> bool {
-        let is_stamp = |of: &Type| matches!(of, Type::Plain(dtype) if dtype.is_signed() || dtype.is_unsigned());
-        self.fields.iter().any(|field| field.name == "stamp_ns" && is_stamp(&field.of))
-    }
-
-    /// The fields of a message, and where they begin after it.
-    pub fn places(&self) -> Vec<(&Field, usize)> {
-        let mut end: usize = 0;
-        let place = |field: &'_ Field| {
-            let layout = field.of.layout();
-            end = end.next_multiple_of(layout.alignment) + layout.size;
-            end - layout.size
-        };
-        let offsets: Vec<usize> = self.fields.iter().map(place).collect();
-        self.fields.iter().zip(offsets).collect()
-    }
-
-    pub fn layout(&self) -> Layout {
-        let mut whole = Layout { size: 0, alignment: 1, has_tail: false, values: 1 };
-        for (field, offset) in self.places() {
-            let inner = field.of.layout();
-            whole.size = offset + inner.size;
-            whole.alignment = whole.alignment.max(inner.alignment);
-            whole.has_tail |= inner.has_tail;
-            whole.values += inner.values;
-        }
-        Layout { size: whole.size.next_multiple_of(whole.alignment), ..whole }
-    }
-
-    fn count(&self, depth: usize) -> Result<usize> {
-        ensure!(self.fields.len() <= 256 && depth <= 8, "a message of {} fields, {depth} deep", self.fields.len());
-        let inner: usize = self.fields.iter().map(|field| field.of.count(depth)).sum::<Result<_>>()?;
-        ensure!(self.layout().size <= BLOCK_MAX, "a block of more than {BLOCK_MAX} bytes");
-        Ok(self.fields.len() + inner)
-    }
+/// Whether a message has a stamp of its own [H3].
+pub fn is_stamped(schema: &Value) -> bool {
+    let is_integer = |of: &Value| of.as_str().is_some_and(|name| name.contains("int"));
+    let mut fields = schema["fields"].as_array().into_iter().flatten();
+    fields.any(|field| field["name"] == "stamp_ns" && is_integer(&field["type"]))
 }
 
 /// BLAKE2b with a digest of 8 bytes.

@@ -7,10 +7,9 @@ use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use zmq::{Context, DONTWAIT, POLLIN, SUB, Socket};
 
-use crate::body;
 use crate::node::Node;
-use crate::schema::Schema;
-use crate::wire::{BODY_MAX, CONFIRMS, CONFIRMS_END, HEADER, Header, LAST, STRICT, number, parse_answer};
+use crate::wire::{BODY_MAX, CONFIRMS, CONFIRMS_END, HEADER, Header, MARKS_END, STRICT, number, parse_answer};
+use crate::{body, schema};
 
 const JUMP_MAX: u64 = 1 << 32;
 /// How long a publisher may wait for us, if it likes to.
@@ -31,7 +30,7 @@ pub struct Counters {
 /// The connection to one publisher.
 pub struct Link {
     socket: Socket,
-    schema: Schema,
+    schema: Value,
     /// What all frames of the publisher have in common.
     head: Header,
     reliable: bool,
@@ -51,13 +50,13 @@ pub struct Link {
 impl Link {
     /// Connect and attach: the prefixes first, then the key [A1]. Libzmq connects again where that is lost.
     pub fn open(context: &Context, publisher: &Value, address: &str, reliable: bool) -> Result<Link> {
-        let schema = Schema::parse(publisher["schema"].as_str().unwrap_or(""))?;
-        let (fingerprint, stamped, reader) = (schema.fingerprint(), schema.is_stamped(), rand::random());
+        let schema = schema::parse(publisher["schema"].as_str().unwrap_or(""))?;
+        let (fingerprint, stamped) = (schema::fingerprint(&schema), schema::is_stamped(&schema));
         ensure!(publisher["fingerprint"] == fingerprint, "another fingerprint than its schema's [S7]");
-        let head =
-            Header { source: publisher["source"].as_u64().unwrap_or(0), fingerprint, stamped, ..Header::default() };
+        let source = publisher["source"].as_u64().unwrap_or(0);
+        let head = Header { source, fingerprint, stamped, ..Header::default() };
         let options = if reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS | CONFIRMS_END } else { 0 };
-        let (socket, key) = (context.socket(SUB)?, head.key(b'A', reader, options));
+        let (socket, key) = (context.socket(SUB)?, head.key(b'A', rand::random(), options));
         socket.set_maxmsgsize(BODY_MAX as i64 + 4096)?;
         socket.connect(address)?;
         for wanted in [head.prefix(b'M'), head.prefix(b'N'), head.prefix(b'L'), key.clone()] {
@@ -97,8 +96,7 @@ impl Link {
         let frame = &frames[0];
         if frame.starts_with(&self.key) {
             let (next, marks_end, latched) = parse_answer(frame)?;
-            self.marks_end = marks_end;
-            self.reached = self.reached.max(next);
+            (self.marks_end, self.reached) = (marks_end, self.reached.max(next));
             let known = self.expected.replace(self.expected.unwrap_or(next));
             self.confirm(known.unwrap_or(next))?;
             if known.is_some() || latched.is_empty() {
@@ -123,8 +121,8 @@ impl Link {
         };
         let is_new = self.advance(header.sequence, count, counters)?;
         if is_new && count == 0 {
-            self.end = (header.aux & LAST != 0 || !self.marks_end).then_some(header.sequence).or(self.end);
-            self.confirm(header.sequence + (header.aux & LAST))?;
+            self.end = (header.aux & MARKS_END != 0 || !self.marks_end).then_some(header.sequence).or(self.end);
+            self.confirm(header.sequence + (header.aux & MARKS_END))?;
         }
         Ok((is_new && count == 1).then(|| body.to_vec()))
     }
@@ -132,9 +130,11 @@ impl Link {
     /// A header of this publisher, with the body that it announces [H2, H3, H5].
     fn check(&self, frame: &[u8], body: &[u8]) -> Result<Header> {
         let header = Header::parse(frame)?;
-        let Header { source, stamped, fingerprint, .. } = self.head;
-        ensure!((header.source, header.stamped) == (source, stamped), "of another publisher");
-        ensure!(header.fingerprint == fingerprint && header.size <= BODY_MAX, "another type, or too large");
+        let same = Header { fingerprint: self.head.fingerprint, kind: header.kind, ..self.head };
+        ensure!(
+            frame.starts_with(&same.pack()[..24]) && header.size <= BODY_MAX,
+            "another publisher, type, or too large"
+        );
         ensure!(body.len() as u64 == header.size, "a body of {} bytes, said {}", body.len(), header.size);
         Ok(header)
     }
@@ -155,7 +155,6 @@ pub struct Subscriber {
     node: Node,
     topic: String,
     reliable: bool,
-    tcp: bool,
     /// By source.
     links: BTreeMap<u64, Link>,
     changes: u64,
@@ -165,47 +164,35 @@ pub struct Subscriber {
 }
 
 impl Subscriber {
-    /// Subscribe to a topic; over tcp only, if asked.
-    pub fn open(context: &Context, topic: &str, reliable: bool, tcp: bool) -> Result<Subscriber> {
+    pub fn open(context: &Context, topic: &str, reliable: bool) -> Result<Subscriber> {
         let mut node = Node::open(context)?;
         let policy = if reliable { "reliable" } else { "lossy" };
-        let own = json!([{"topic": topic, "type_name": "", "fingerprint": 0, "policy": policy}]);
-        node.announce(json!([]), json!([]), own)?;
+        node.announce(
+            json!([]),
+            json!([]),
+            json!([{"topic": topic, "type_name": "", "fingerprint": 0, "policy": policy}]),
+        )?;
         let (context, topic, links, counters) = (context.clone(), topic.into(), BTreeMap::new(), Counters::default());
-        Ok(Subscriber { context, node, topic, reliable, tcp, links, changes: 0, counters, ended: false })
+        Ok(Subscriber { context, node, topic, reliable, links, changes: 0, counters, ended: false })
     }
 
-    /// Where a node is reached from here [C8].
-    fn reach(&self, node: &Value) -> Option<String> {
-        let usable = |endpoint: &&Value| {
-            let lossy = endpoint["lossy"].as_str().unwrap_or("");
-            let is_loopback = lossy.starts_with("tcp://127.") || lossy.starts_with("tcp://[::1]");
-            match endpoint["transport"].as_str() {
-                Some("ipc") => !self.tcp && node["host"] == self.node.host,
-                _ => is_loopback && endpoint["server_key"] == "",
-            }
-        };
-        let endpoint = node["endpoints"].as_array()?.iter().find(usable)?;
-        Some(endpoint[if self.reliable { "strict" } else { "lossy" }].as_str()?.to_string())
-    }
-
-    /// Connect to publishers that have come, and note which have left.
-    fn meet(&mut self) {
+    /// Connect to publishers of this host [C8] that have come, and note which have left.
+    fn meet(&mut self) -> Result<()> {
         self.links.values_mut().for_each(|link| link.left = link.left.or(Some(Instant::now())));
-        for node in self.node.others.values() {
-            let offered = node["publishers"].as_array().into_iter().flatten();
-            for publisher in offered.filter(|publisher| publisher["topic"] == self.topic) {
+        for node in self.node.others.values().filter(|node| node["host"] == self.node.host) {
+            let endpoints = node["endpoints"].as_array().into_iter().flatten();
+            let Some(local) = endpoints.into_iter().find(|each| each["transport"] == "ipc") else { continue };
+            let address = local[if self.reliable { "strict" } else { "lossy" }].as_str().unwrap_or("");
+            for publisher in node["publishers"].as_array().into_iter().flatten() {
                 let source = publisher["source"].as_u64().unwrap_or(0);
                 if let Some(link) = self.links.get_mut(&source) {
                     link.left = None;
-                } else if let Some(address) = self.reach(node) {
-                    match Link::open(&self.context, publisher, &address, self.reliable) {
-                        Ok(link) => drop(self.links.insert(source, link)),
-                        Err(error) => eprintln!("{}: {error:#}", self.topic),
-                    }
+                } else if publisher["topic"] == self.topic {
+                    self.links.insert(source, Link::open(&self.context, publisher, address, self.reliable)?);
                 }
             }
         }
+        Ok(())
     }
 
     /// Wait for messages, but not for long; to be called all the time.
@@ -213,12 +200,10 @@ impl Subscriber {
         self.node.poll()?;
         if self.changes != self.node.changes {
             self.changes = self.node.changes;
-            self.meet();
+            self.meet()?;
         }
-        zmq::poll(
-            &mut self.links.values().map(|link| link.socket.as_poll_item(POLLIN)).collect::<Vec<_>>(),
-            timeout_ms,
-        )?;
+        let mut sockets: Vec<_> = self.links.values().map(|link| link.socket.as_poll_item(POLLIN)).collect();
+        zmq::poll(&mut sockets, timeout_ms)?;
         let mut messages = vec![];
         for link in self.links.values_mut() {
             for _ in 0..TURN {

@@ -5,19 +5,16 @@ use std::sync::LazyLock;
 use anyhow::{Context, Result, ensure};
 use serde_json::Value;
 
-use crate::body::{decode, encode};
-use crate::schema::Schema;
+use crate::{body, schema};
 
 pub const HEADER: usize = 64;
 pub const BODY_MAX: u64 = 1 << 30;
-/// Options of an attach key.
+/// Options of an attach key: it is reliable, it confirms, and does so with its answer and the end.
 pub const STRICT: u64 = 1 << 1;
 pub const CONFIRMS: u64 = 1 << 2;
 pub const CONFIRMS_END: u64 = 1 << 3;
-/// Options of an answer: the end of the stream will be marked [E1].
+/// In an answer: the end of the stream will be marked [E1]. In `aux` of kind `N`: it is here.
 pub const MARKS_END: u64 = 1;
-/// In `aux` of kind `N`: the stream ends here.
-pub const LAST: u64 = 1;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Header {
@@ -66,24 +63,21 @@ impl Header {
 
 /// Sequence of an answer, whether its publisher marks the end of its stream, and the latched message [A4].
 pub fn parse_answer(frame: &[u8]) -> Result<(u64, bool, &[u8])> {
-    ensure!(frame.len() >= 64, "an answer of {} bytes", frame.len());
-    let (sequence, latched) = (number(frame, 32), number(frame, 48));
-    ensure!(frame.len() as u64 == 64 + latched.min(BODY_MAX), "an answer that says it has {latched} more bytes");
-    Ok((sequence, number(frame, 40) & MARKS_END != 0, &frame[64..]))
+    ensure!(frame.len() >= 64 && frame.len() as u64 - 64 == number(frame, 48), "an answer of {} bytes", frame.len());
+    Ok((number(frame, 32), number(frame, 40) & MARKS_END != 0, &frame[64..]))
 }
 
-/// Fingerprints and schemas of the control messages.
-static TYPES: LazyLock<Vec<(u64, Schema)>> = LazyLock::new(|| {
-    let types: Value = serde_json::from_str(include_str!("../../../vectors/types.json")).unwrap();
-    let schemas =
-        types.as_array().unwrap().iter().map(|entry| Schema::parse(entry["schema"].as_str().unwrap()).unwrap());
-    schemas.map(|schema| (schema.fingerprint(), schema)).collect()
+/// Fingerprints and schemas of the control messages, by name.
+static TYPES: LazyLock<Vec<(u64, Value)>> = LazyLock::new(|| {
+    let types: Vec<Value> = serde_json::from_str(include_str!("../../../vectors/types.json")).unwrap();
+    let schemas = types.iter().map(|entry| schema::parse(entry["schema"].as_str().unwrap()).unwrap());
+    schemas.map(|json| (schema::fingerprint(&json), json)).collect()
 });
 
 pub fn pack_control(name: &str, message: &Value) -> Result<Vec<u8>> {
-    let found = TYPES.iter().find(|(_, schema)| schema.name == format!("cortex/{name}"));
-    let (fingerprint, schema) = found.context("no such control message")?;
-    let body = encode(schema, message)?;
+    let is_it = |json: &Value| json["name"] == format!("cortex/{name}");
+    let (fingerprint, schema) = TYPES.iter().find(|(_, json)| is_it(json)).context("no such control message")?;
+    let body = body::encode(schema, message)?;
     let header = Header { kind: b'C', fingerprint: *fingerprint, size: body.len() as u64, ..Header::default() };
     Ok([header.pack(), body].concat())
 }
@@ -93,5 +87,6 @@ pub fn parse_control(frame: &[u8]) -> Result<(&'static str, Value)> {
     let header = Header::parse(frame)?;
     ensure!(header.kind == b'C' && header.size as usize == frame.len() - HEADER, "not a control message");
     let (_, schema) = TYPES.iter().find(|(known, _)| *known == header.fingerprint).context("of no known type")?;
-    Ok((schema.name.trim_start_matches("cortex/"), decode(schema, &frame[HEADER..])?))
+    let name = schema["name"].as_str().unwrap_or_default().trim_start_matches("cortex/");
+    Ok((name, body::decode(schema, &frame[HEADER..])?))
 }
