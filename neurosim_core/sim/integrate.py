@@ -176,8 +176,7 @@ def integrate(state: State, batch: Batch) -> None:
         end = slot + count
         record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
         if isinstance(vehicle, Multirotor) and span_ns > 0:
-            span = {"span_ns": span_ns, "count": count}
-            trace.fly(vehicle, state.surfaces, state.fleet, slot, elapsed_ns, **span, **record)
+            trace.fly(vehicle, state.surfaces, state.fleet, slot, elapsed_ns, span_ns, count, **record)
         else:
             if span_ns > 0:
                 vehicle.advance(span_ns)

@@ -298,16 +298,16 @@ class Trace:
         fleet: Any,
         slot: int,
         elapsed_ns: int,
-        *,
         span_ns: int,
         count: int,
+        *,
         first: bool,
         last: bool,
     ) -> None:
-        """Move all vehicles through equal spans, and do what `record` does after each, in one launch.
+        """Move all vehicles through `count` equal spans; `record` the state after each, in one launch.
 
-        Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. The first span may
-        be the `first` of a batch, and the last one its `last`.
+        Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. `first`: a batch
+        begins with it; `last`: a batch ends with the last span.
         """
         if span_ns not in self._flights:
             if len(self._flights) >= _LAUNCHES_MAX:
