@@ -87,9 +87,10 @@ def number_of(received: Any) -> int:
 def connect(
     node: Node, topic: str, kind: Any, policy: Policy | None = None, callback: Any = None, **options: Any
 ) -> tuple[Any, Any]:
-    """A publisher of a node, and a subscriber of the same node that is attached to it."""
+    """A publisher of a node, and a subscriber of the same node, or of `reader`, that is attached to it."""
+    reader = options.pop("reader", node)
     publisher = node.publisher(topic, kind, **options)
-    subscriber = node.subscriber(topic, kind, callback, policy=policy)
+    subscriber = reader.subscriber(topic, kind, callback, policy=policy)
     assert publisher.wait_for_subscribers(timeout_s=60.0)
     return publisher, subscriber
 

@@ -40,8 +40,7 @@ pytestmark = pytest.mark.usefixtures("runtime")
 @pytest.fixture
 def long_leases(monkeypatch):
     """No lease of this process runs out during a test: what ends before has another reason."""
-    for name in ("discovery", "registry"):
-        monkeypatch.setattr(f"cortex.{name}.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
+    monkeypatch.setattr("cortex.control.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
 
 
 def test_two_nodes_see_each_other_change_and_leave(make, long_leases):
@@ -149,9 +148,6 @@ def test_a_stopped_registry_disturbs_nobody(make):
     drive([*nodes, newcomer], lambda: len(newcomer.directory.nodes) == 2)
     drive_for(nodes, 0.5)
     assert not any(node.ever_lost for node in nodes)
-
-
-# What order and loss may do: a registry that the test plays itself
 
 
 class Played:

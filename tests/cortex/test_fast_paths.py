@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 
 import pytest
 from peer import Number, Scan, connect, make
-from processes import SOON_S
+from processes import SOON_S, Beside
 
 import cortex.link
 from cortex.compiled import native
@@ -46,33 +45,21 @@ def test_errors_of_sockets_pass_and_leave_no_lock_held(node, monkeypatch):
     assert subscriber.recv(SOON_S).value == 3
 
 
-def test_who_publishes_into_a_ring_waits_for_the_lock(numbers):
+def test_who_publishes_into_a_ring_or_receives_from_it_waits_for_the_lock(numbers):
     """It is not taken where it is free, but nobody passes one who has it."""
     publisher, subscriber = numbers
     assert publisher.publish(Number(0, 0))
     with publisher._lock:
-        thread = threading.Thread(target=publisher.publish, args=(Number(1, 1),))
-        thread.start()
-        thread.join(0.05)
+        publishing = Beside(publisher.publish, Number(1, 1))
+        publishing.thread.join(0.05)
         assert publisher._fast_send.sequence == 1
-    thread.join()
-    assert [subscriber.recv(SOON_S).value for _ in range(2)] == [0, 1]
-
-
-def test_who_receives_from_a_ring_waits_for_the_lock(numbers):
-    """As a publisher; what is there is taken once the lock is free, in order."""
-    publisher, subscriber = numbers
-    assert publisher.publish(Number(0, 0))
+    publishing.join()
     assert subscriber.recv(SOON_S).value == 0
-    assert publisher.publish(Number(1, 1))
-    got = []
     with subscriber._lock:
-        thread = threading.Thread(target=lambda: got.append(subscriber.recv(SOON_S).value))
-        thread.start()
-        thread.join(0.05)
-        assert got == []
-    thread.join()
-    assert got == [1]
+        receiving = Beside(lambda: subscriber.recv(SOON_S).value)
+        receiving.thread.join(0.05)
+        assert receiving.results == []
+    assert receiving.join() == [1]
     assert subscriber.counters.received == 2
 
 
@@ -81,25 +68,23 @@ def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, monkeypat
     """It gets the lock before it gets the GIL, while another thread finds a frame that takes more care."""
     publisher, subscriber = connect(node, "/gap", Scan, reliable(64))
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
-    interval, got = sys.getswitchinterval(), []
+    interval = sys.getswitchinterval()
     for number in range(3):
         publisher.publish(make(Scan, number, size))
         subscriber.recv(SOON_S)
     subscriber._links[0].expected -= 2  # as if two had been lost
     for number in (3, 4):
         publisher.publish(make(Scan, number, size))
-    thread = threading.Thread(target=lambda: got.append(subscriber.recv(SOON_S)))
     sys.setswitchinterval(5.0)
     try:
         with subscriber._lock:
-            thread.start()
+            other = Beside(subscriber.recv, SOON_S)
             time.sleep(0.1)
         until_s = time.monotonic() + 0.05
         while time.monotonic() < until_s:
             pass
-        got.append(subscriber.recv(SOON_S))
+        got = subscriber.recv(SOON_S)
     finally:
         sys.setswitchinterval(interval)
-    thread.join()
-    assert sorted(message.stamp_ns for message in got) == [3, 4]
+    assert sorted(message.stamp_ns for message in (got, *other.join())) == [3, 4]
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (2, 0)

@@ -105,28 +105,35 @@ def test_a_lock_has_one_holder_at_a_time(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def _sit_until_killed(ready):
-    ready.set()
-    signal.pause()
+@pytest.fixture
+def fork():
+    """Starts children that call a function and sit until they are killed."""
+    context, children = multiprocessing.get_context("fork"), []
+
+    def start(action, *arguments):
+        ready = context.Event()
+        children.append(context.Process(target=lambda: (action(*arguments), ready.set(), signal.pause())))
+        children[-1].start()
+        assert ready.wait(SOON_S)
+        return children[-1]
+
+    yield start
+    for child in children:
+        child.kill()
+        child.join()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
-def test_a_forked_child_does_not_keep_the_lock(tmp_path):
-    """A child that outlives us must not make us look alive."""
-    lock = FileLock.acquire(tmp_path / "lock")
-    context = multiprocessing.get_context("fork")
-    ready = context.Event()
-    child = context.Process(target=_sit_until_killed, args=(ready,))
-    child.start()
-    try:
-        assert ready.wait(SOON_S)
-        lock.close()
-        again = FileLock.acquire(tmp_path / "lock")
-        assert again is not None
-        again.close()
-    finally:
-        child.kill()
-        child.join()
+def test_a_forked_child_neither_keeps_nor_removes_what_is_its_parents(fork):
+    """It may outlive us, and must not make us look alive."""
+    files = NodeFiles(0, 8)
+    files.path("lossy").touch()
+    fork(files.close)
+    fork(lambda: None)
+    assert files.path("lossy").exists()
+    assert sweep(files.directory) == []  # and it lives still
+    files.close()
+    NodeFiles(0, 8).close()
 
 
 def test_a_node_has_its_number_alone_lives_and_leaves_nothing_behind():
@@ -149,57 +156,28 @@ def test_a_node_has_its_number_alone_lives_and_leaves_nothing_behind():
     assert list(files.directory.iterdir()) == []
 
 
+def hold(number: int) -> None:
+    """Be a node."""
+    files = NodeFiles(0, number)
+    for role in ("lossy", "strict", "control"):
+        files.path(role).touch()
+
+
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
-def test_a_forked_child_removes_nothing_of_its_parent():
-    files = NodeFiles(0, 8)
-    files.path("lossy").touch()
-    child = multiprocessing.get_context("fork").Process(target=files.close)
-    child.start()
-    child.join(SOON_S)
-    assert child.exitcode == 0
-    assert files.path("lossy").exists()
-    assert sweep(files.directory) == []  # and it lives still
-    files.close()
-
-
-_HOLD = """
-import signal, sys
-from cortex.host import NodeFiles
-files = NodeFiles(0, int(sys.argv[1]))
-for role in ("lossy", "strict", "control"):
-    files.path(role).touch()
-print("ready", flush=True)
-signal.pause()
-"""
-
-
-def test_sweep_removes_the_files_of_killed_nodes_only():
+def test_sweep_removes_the_files_of_killed_nodes_only(fork):
     living = NodeFiles(0, 1)
     living.path("lossy").touch()
-    command = [sys.executable, "-c", _HOLD]
-    killed = subprocess.Popen([*command, "2"], cwd=ROOT, stdout=subprocess.PIPE)
-    stopped = subprocess.Popen([*command, "3"], cwd=ROOT, stdout=subprocess.PIPE)
-    foreign = living.directory / "notes.txt"
-    foreign.touch()
-    try:
-        assert killed.stdout.readline() == stopped.stdout.readline() == b"ready\n"
-        (living.directory / f"{4:016x}.lossy").touch()  # the lock of its node was lost
-        stopped.send_signal(signal.SIGSTOP)
-        killed.kill()
-        killed.wait()
-        assert sorted(sweep(living.directory)) == [2, 4]
-        left = {path.name for path in living.directory.iterdir()}
-        assert left == {
-            "notes.txt",
-            f"{1:016x}.lock",
-            f"{1:016x}.lossy",
-            *(f"{3:016x}.{role}" for role in ("lock", "lossy", "strict", "control")),
-        }
-    finally:
-        for process in (killed, stopped):
-            process.kill()
-            process.communicate()
-        living.close()
+    killed, stopped = fork(hold, 2), fork(hold, 3)
+    (living.directory / "notes.txt").touch()
+    (living.directory / f"{4:016x}.lossy").touch()  # the lock of its node was lost
+    os.kill(stopped.pid, signal.SIGSTOP)
+    killed.kill()
+    killed.join()
+    assert sorted(sweep(living.directory)) == [2, 4]
+    roles = {1: ("lock", "lossy"), 3: ("lock", "lossy", "strict", "control")}
+    left = {f"{number:016x}.{role}" for number in roles for role in roles[number]}
+    assert {path.name for path in living.directory.iterdir()} == {"notes.txt", *left}
+    living.close()
 
 
 OTHER_SYSTEM = """

@@ -19,10 +19,10 @@ from processes import ROOT, SOON_S, Beside, wait_for
 
 from cortex import latest, reliable
 from cortex.context import new_socket
+from cortex.control import control_types
 from cortex.host import runtime_dir
 from cortex.publisher import Closed
 from cortex.records import StatsReply, StatsRequest
-from cortex.registry import control_types
 from cortex.schema import schema_of
 from cortex.wire import control_frame, pack_header, parse_control, unpack_header
 
@@ -74,9 +74,7 @@ def test_domains_do_not_see_each_other(make_node):
 
 def test_counters_of_this_and_other_nodes(make_node):
     one, two = make_node("one"), make_node("two")
-    publisher = one.publisher("/numbers", Number)
-    subscriber = two.subscriber("/numbers", Number, policy=reliable())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(one, "/numbers", Number, reliable(), reader=two)
     for value in range(10):
         publisher.publish(Number(0, value))
         subscriber.recv(SOON_S)
@@ -321,9 +319,7 @@ print("done")
 def test_a_jump_of_the_clock(make_node, monkeypatch):
     """Somebody sets the clock by an hour: the stream goes on, latencies stay right, the others are told."""
     one, two = make_node("one"), make_node("two")
-    publisher = one.publisher("/numbers", Number)
-    subscriber = two.subscriber("/numbers", Number, policy=latest())
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = connect(one, "/numbers", Number, latest(), reader=two)
     wait_for(lambda: len(two.nodes()) == 2)
 
     def known():
@@ -349,9 +345,7 @@ def test_a_callback_that_always_raises_does_not_flood_the_log(make_node, caplog)
         called.append(message.value)
         raise KeyError(message.value)
 
-    node.subscriber("/numbers", Number, fail, policy=reliable(64))
-    publisher = node.publisher("/numbers", Number)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, _ = connect(node, "/numbers", Number, reliable(64), fail)
     for value in range(100):
         publisher.publish(Number(0, value))
     wait_for(lambda: len(called) == 100)

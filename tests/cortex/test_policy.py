@@ -41,9 +41,6 @@ def test_policies_say_what_they_are():
     assert reliable(8) != keep_last(8)
 
 
-# keep_last and latest
-
-
 @pytest.mark.parametrize("depth", [1, 5, 64, 100])
 def test_keep_last_hands_out_exactly_the_last(node, depth):
     """Whatever was published while nobody looked; the others were overtaken, none was lost."""
@@ -91,9 +88,6 @@ def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
     assert counters.received == len(ages_s)
     assert value < accounted(counters) <= 2000
     assert counters.overtaken > 100
-
-
-# reliable
 
 
 @pytest.mark.parametrize("place", [{}, {"listen": "127.0.0.1", "host": "elsewhere"}], ids=["ring", "tcp"])
