@@ -341,7 +341,7 @@ class _Column:
         self._taken = None
         self._dataset.id.set_extent((end, *self._shape))
         for chunks in deflated:
-            for number, chunk in enumerate(chunks.future.result()[chunks.index]):
+            for number, chunk in enumerate(chunks.future.result()[chunks.position]):
                 place = (chunks.first + number * self.chunk, *[0] * len(self._shape))
                 self._dataset.id.write_direct_chunk(place, chunk)
         if self.deflates or 0 in self._shape:
@@ -361,8 +361,8 @@ class _Chunks(NamedTuple):
     first: int
     """First row."""
     future: Future[list[list[bytes]]]
-    index: int
-    """Which of its lists."""
+    position: int
+    """Of their list in its result."""
 
 
 class _Stream:
@@ -468,8 +468,8 @@ class _Stream:
         cut = [(column, first, parts) for column, first, parts in cut if parts]
         if cut:
             future = self._pool.submit(_deflate, [(parts, column.chunk) for column, _, parts in cut])
-            for index, (column, first, _) in enumerate(cut):
-                column.note(_Chunks(first, future, index))
+            for position, (column, first, _) in enumerate(cut):
+                column.note(_Chunks(first, future, position))
 
     def _add_rows(self, name: str, dtype: Any) -> None:
         self._columns[name] = _Column(self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False)
