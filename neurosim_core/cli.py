@@ -27,7 +27,7 @@ from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.scene.reader import SceneReader
-from neurosim_core.settings_file import scene_settings
+from neurosim_core.settings_file import unchecked_settings
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")  # it would look through all that is installed
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
     if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
@@ -361,7 +362,7 @@ def _run(arguments: argparse.Namespace) -> int:
     overrides = _overrides(arguments)
     if arguments.print_config:
         return _print_config(_load(arguments, overrides))
-    with SceneReader(scene_settings(arguments.config, overrides)) as reader:
+    with SceneReader(unchecked_settings(arguments.config, overrides)) as reader:
         from rich.console import Console
 
         with (
