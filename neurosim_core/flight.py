@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
+import yaml
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -173,8 +174,6 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
         FileNotFoundError: There is no flight.
         ImportError: Rerun or h5py is not installed.
     """
-    import yaml
-
     from neurosim_core.io import is_event_file
     from neurosim_core.io.transfer import as_recording
     from neurosim_core.view.rerun_log import RerunLogger
