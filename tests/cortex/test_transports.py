@@ -121,7 +121,6 @@ def test_what_the_environment_says_of_other_hosts_can_be_overridden(runtime, mon
         monkeypatch.setenv(f"CORTEX_{name}", value)
     found = network(None, None, None)
     assert (found.registry, found.listen) == ("tcp://127.0.0.1:9", "127.0.0.1")
-    assert found.keys is not None
     assert found.keys.public == keys.public
     assert network("auto", "", keys) == ("auto", None, keys)
 
