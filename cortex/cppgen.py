@@ -8,22 +8,12 @@ compiler sees constants. A header may be included together with others that hold
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cortex.messages
-from cortex import records
-from cortex.layout import (
-    ITEM_ALIGNMENT,
-    LARGE_ARRAY_BYTES,
-    fixed_bytes,
-    has_tail,
-    measure,
-    measure_fields,
-    stride_of,
-    values_of,
-)
+from cortex import layout, records
 from cortex.message import is_message
 from cortex.schema import (
     ANY_DTYPE,
@@ -86,22 +76,13 @@ def generate(types: Sequence[type | Schema], *, namespace: str | None = None) ->
     for item in types:
         generator.message(item if isinstance(item, Schema) else schema_of(item))
     names = ", ".join(block.name for block in generator.blocks)
+    standard = "array complex cstddef cstdint limits optional stdexcept string string_view utility vector"
     return "\n".join(
         [
             f"// Written by `cortex cpp`; do not edit. Types: {names}.",
             "#pragma once",
             "",
-            "#include <array>",
-            "#include <complex>",
-            "#include <cstddef>",
-            "#include <cstdint>",
-            "#include <limits>",
-            "#include <optional>",
-            "#include <stdexcept>",
-            "#include <string>",
-            "#include <string_view>",
-            "#include <utility>",
-            "#include <vector>",
+            *(f"#include <{header}>" for header in standard.split()),
             "",
             "#include <cortex/codec.hpp>",
             "",
@@ -196,12 +177,9 @@ class _Generator:
         members: dict[str, int] = {}
         for member, value in kind.values:
             members[_identifier(member, members)] = value
+        listed = (f"  {member} = {_int32(value)}," for member, value in members.items())
         lines = [
-            *_open(namespace),
-            f"enum class {name} : std::int32_t {{",
-            *(f"  {member} = {_int32(value)}," for member, value in members.items()),
-            "};",
-            *_close(namespace),
+            *_within(namespace, [f"enum class {name} : std::int32_t {{", *listed, "};"]),
             "namespace cortex {",
             "template <>",
             f"struct EnumCodec<::{qualified}> {{",
@@ -227,21 +205,15 @@ class _Generator:
         if self._is_known(qualified, key):
             return f"::{qualified}"
         members: list[_Member] = []
-        for item, offset in zip(schema.fields, measure_fields(schema)[0], strict=True):
+        for item, offset in zip(schema.fields, layout.measure_fields(schema)[0], strict=True):
             taken = [name, *(member.name for member in members)]
             members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item, offset))
-        lines = [
-            *_open(namespace),
-            *_struct(name, members),
-            *_close(namespace),
-            *self._codec(schema, f"::{qualified}", members),
-        ]
-        self._add(qualified, key, lines)
+        lines = _within(namespace, _struct(name, members))
+        self._add(qualified, key, lines + self._codec(schema, f"::{qualified}", members))
         return f"::{qualified}"
 
     def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
-        stamp = next((m for m in members if m.field.name == "stamp_ns" and _is_integer(m.field.type)), None)
-        unused = "" if stamp else "[[maybe_unused]] "
+        stamp = members[schema.stamp_index] if schema.stamp_index >= 0 else None
         stamp_code = f"static_cast<std::int64_t>(message.{stamp.name})" if stamp else "0"
         return [
             "namespace cortex {",
@@ -249,13 +221,12 @@ class _Generator:
             f"struct Codec<{cpp}> {{",
             f"  static constexpr std::string_view name = {_literal(schema.name)};",
             f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
-            "  static constexpr std::string_view schema =",
-            *_string_lines(schema.to_json()),
-            f"  static constexpr std::size_t block = {measure_fields(schema)[1]};",
-            f"  static constexpr bool fixed = {_truth(not has_tail(schema))};",
-            f"  static constexpr bool stamped = {_truth(stamp is not None)};",
+            f"  static constexpr std::string_view schema = {_literal(schema.to_json())};",
+            f"  static constexpr std::size_t block = {layout.measure_fields(schema)[1]};",
+            f"  static constexpr bool fixed = {str(not layout.has_tail(schema)).lower()};",
+            f"  static constexpr bool stamped = {str(stamp is not None).lower()};",
             "",
-            f"  static std::int64_t stamp({unused}const {cpp}& message) noexcept {{",
+            f"  static std::int64_t stamp([[maybe_unused]] const {cpp}& message) noexcept {{",
             f"    return {stamp_code};",
             "  }",
             "",
@@ -268,9 +239,8 @@ class _Generator:
 
 def _fields(name: str, members: list[_Member]) -> Iterator[str]:
     """The function that hands each field, its place and its shape to a visitor."""
-    unused = "" if members else "[[maybe_unused]] "
     parameters = ("Visitor& visit", "std::size_t at", "Message& message")
-    yield f"  static void fields({', '.join(unused + each for each in parameters)}) {{"
+    yield f"  static void fields({', '.join(f'[[maybe_unused]] {each}' for each in parameters)}) {{"
     variables: dict[tuple[str, str], str] = {}
     """By the field whose own they are, or nothing if others share them, and their name."""
     calls = []
@@ -293,11 +263,11 @@ def _holds_list(kind: FieldType) -> bool:
 def _shapes(kind: FieldType, where: str, scope: str, variables: dict[tuple[str, str], str]) -> Iterator[str]:
     """What a visitor has to be told of a field besides its C++ type, from the outside in."""
     if isinstance(kind, OptionalType):
-        yield f"Held<{measure(kind)[1]}>{{}}"
+        yield f"Held<{layout.measure(kind)[1]}>{{}}"
         yield from _shapes(kind.item, where, scope, variables)
     elif isinstance(kind, ListType):
-        alignment = max(ITEM_ALIGNMENT, measure(kind.item)[1])
-        yield f"Elements<{stride_of(kind.item)}, {alignment}, {values_of(kind.item)}>{{}}"
+        alignment = max(layout.ITEM_ALIGNMENT, layout.measure(kind.item)[1])
+        yield f"Elements<{layout.stride_of(kind.item)}, {alignment}, {layout.values_of(kind.item)}>{{}}"
         yield from _shapes(kind.item, where, scope, variables)
     elif kind == "bytes":
         yield "Bytes{}"
@@ -314,8 +284,7 @@ def _shapes(kind: FieldType, where: str, scope: str, variables: dict[tuple[str, 
 
 
 def _is_large(kind: ArrayType) -> bool:
-    """Whether an array of a fixed shape is so large that C++ has it as a view."""
-    return kind.is_fixed and fixed_bytes(kind) >= LARGE_ARRAY_BYTES
+    return kind.is_fixed and layout.fixed_bytes(kind) >= layout.LARGE_ARRAY_BYTES
 
 
 def _struct(name: str, members: list[_Member]) -> Iterator[str]:
@@ -330,10 +299,9 @@ def _struct(name: str, members: list[_Member]) -> Iterator[str]:
             notes.append(f"frame {_comment(member.field.frame)}")
         yield f"  {member.cpp} {member.name}{{}};" + (f"  // {', '.join(notes)}" if notes else "")
     equal = " &&\n           ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
-    unused = "" if members else "[[maybe_unused]] "
-    if members:
-        yield ""
-    yield f"  friend bool operator==({unused}const {name}& a, {unused}const {name}& b) {{"
+    yield ""
+    parameters = f"[[maybe_unused]] const {name}& a, [[maybe_unused]] const {name}& b"
+    yield f"  friend bool operator==({parameters}) {{"
     yield f"    return {equal};"
     yield "  }"
     yield f"  friend bool operator!=(const {name}& a, const {name}& b) {{ return !(a == b); }}"
@@ -353,10 +321,6 @@ def _array(kind: ArrayType) -> str:
     return cpp
 
 
-def _is_integer(kind: FieldType) -> bool:
-    return isinstance(kind, str) and "int" in kind
-
-
 def _identifier(name: str, taken: Sequence[str] | dict[str, int] = ()) -> str:
     safe = re.sub(r"[^A-Za-z0-9_]", "_", name)
     if not safe or safe[0].isdigit():
@@ -372,18 +336,10 @@ def _comment(text: str) -> str:
     return plain.replace("??", "? ?")  # a trigraph
 
 
-def _string_lines(text: str) -> Iterator[str]:
-    pieces = [text[start : start + 90] for start in range(0, len(text), 90)]
-    for index, piece in enumerate(pieces):
-        yield f"      {_literal(piece)}{';' if index == len(pieces) - 1 else ''}"
-
-
-def _open(namespace: str) -> list[str]:
-    return [f"namespace {namespace} {{"] if namespace else []
-
-
-def _close(namespace: str) -> list[str]:
-    return [f"}}  // namespace {namespace}"] if namespace else []
+def _within(namespace: str, lines: Iterable[str]) -> list[str]:
+    if not namespace:
+        return [*lines]
+    return [f"namespace {namespace} {{", *lines, f"}}  // namespace {namespace}"]
 
 
 def _literal(text: str) -> str:
@@ -400,7 +356,3 @@ def _literal(text: str) -> str:
 
 def _int32(value: int) -> str:
     return "std::numeric_limits<std::int32_t>::min()" if value == -(2**31) else str(value)
-
-
-def _truth(value: bool) -> str:
-    return "true" if value else "false"

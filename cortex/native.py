@@ -14,7 +14,6 @@ from cortex.layout import (
     DTYPE_CODES,
     DTYPES,
     ITEM_ALIGNMENT,
-    SCALAR_CODES,
     array_dtype,
     block_size,
     has_tail,
@@ -23,7 +22,7 @@ from cortex.layout import (
     stride_of,
     values_of,
 )
-from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
+from cortex.schema import SCALAR_CODES, ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 
 _Coder: Any = native and native.Coder
 NativeFastSend: Any = native and native.FastSend
@@ -96,9 +95,7 @@ def make_coder(schema: Schema, cls: type, head: bytes = b"") -> Any:
         table = _Table(schema, cls)
     except _TooManyNames:
         return None
-    stamps = [k for k, field in enumerate(schema.fields, 1) if field.name == "stamp_ns"]
-    is_integer = [table.rows[k].kind == _NUMBER and chr(table.rows[k].code) not in "fd" for k in stamps]
-    stamp = stamps[0] if any(is_integer) else -1
+    stamp = schema.stamp_index + 1 if schema.stamp_index >= 0 else -1
     rows = b"".join(struct.pack("14q", *astuple(row)) for row in table.rows)
     return _Coder(rows, tuple(table.objects), stamp, head)
 

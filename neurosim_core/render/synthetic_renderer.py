@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.scene.bodies import BodyPoses
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.srgb import srgb_to_linear
 
 wp.set_module_options({"enable_backward": False})
 

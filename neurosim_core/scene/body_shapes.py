@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.scene import LinearRgb, Material, Texture
 from neurosim_core.scene.solids import Part, grid_surface, merge, picture_quad, without_slivers
 from neurosim_core.scene.source import Axis, SceneError
+from neurosim_core.scene.srgb import linear_to_srgb8
 from neurosim_core.settings import Settings
 
 _SIDES = 128

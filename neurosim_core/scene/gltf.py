@@ -22,7 +22,6 @@ import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
 from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Lamp,
@@ -33,6 +32,7 @@ from neurosim_core.scene.source import (
     rgb,
     unique_name,
 )
+from neurosim_core.scene.srgb import srgb_to_linear
 
 _MAX_DEPTH = 256
 _LABELS = ("semantic", "class", "category", "label")

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.scene.scene import Material, Texture
+from neurosim_core.scene.srgb import LINEAR
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,21 +25,6 @@ _LEVELS_RG = 2047
 _LEVELS_B = 1023
 _TEXEL_UNIT = wp.constant(wp.vec3(1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_B**2))
 """Linear light of a texel whose roots are coded by 1."""
-_CODE = np.arange(256) / 255.0
-_LINEAR = np.where(_CODE <= 0.04045, _CODE / 12.92, ((_CODE + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""Linear light of each 8-bit sRGB code. Reference: IEC 61966-2-1."""
-
-
-def srgb_to_linear(srgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the linear light of 8-bit sRGB values, in [0, 1], the same shape."""
-    return _LINEAR[srgb]
-
-
-def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
-    """Encode linear light in [0, 1] as 8-bit sRGB, rounded. Reference: IEC 61966-2-1."""
-    value = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1.0 / 2.4) - 0.055)
-    return (encoded * 255.0 + 0.5).astype(np.uint8)
 
 
 def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
@@ -122,12 +107,12 @@ def pack_textures(materials: Sequence[Material]) -> PackedTextures:
 
 def _packed_levels(texture: Texture) -> list[NDArray[np.uint32]]:
     """Return the packed texels of all levels of a texture, shape [H, W] each."""
-    codes = encode_texels(np.repeat(_LINEAR[:, None], 3, axis=1))  # each channel alone, as a table
+    codes = encode_texels(np.repeat(LINEAR[:, None], 3, axis=1))  # each channel alone, as a table
     masks = np.array([_LEVELS_RG, _LEVELS_RG << 11, _LEVELS_B << 22], np.uint32)
     red, green, blue = (codes & mask for mask in masks)
     srgb = texture.srgb
     finest = red[srgb[..., 0]] | green[srgb[..., 1]] | blue[srgb[..., 2]]
-    return [finest, *(encode_texels(level) for level in mip_chain(_LINEAR[srgb])[1:])]
+    return [finest, *(encode_texels(level) for level in mip_chain(LINEAR[srgb])[1:])]
 
 
 def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArray[np.float32]:

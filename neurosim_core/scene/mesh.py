@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,6 @@ from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import lights_of
-from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
 from neurosim_core.scene.source import (
@@ -26,6 +26,7 @@ from neurosim_core.scene.source import (
     Source,
     rgb,
 )
+from neurosim_core.scene.srgb import linear_to_srgb8
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
 
@@ -74,6 +75,16 @@ class MeshSceneConfig(SceneConfig):
     def load(self, *, pictures: bool = True) -> Scene:
         """Read the mesh file; see `load_mesh_scene`."""
         return load_mesh_scene(self, pictures=pictures)
+
+
+DEFAULT_KIND = "apartment"
+"""Kind of a scene whose settings neither say it nor have keys of a mesh."""
+
+
+def scene_kind(settings: Mapping[str, Any]) -> str:
+    """Return the kind of a scene as its settings say it, or show it by their keys."""
+    only_mesh = MeshSceneConfig.model_fields.keys() - {"kind"} | {"path"}
+    return str(settings.get("kind", DEFAULT_KIND if only_mesh.isdisjoint(settings) else "mesh"))
 
 
 def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:

@@ -13,7 +13,6 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.exchange.load import mesh_formats
 
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Part,
@@ -23,6 +22,7 @@ from neurosim_core.scene.source import (
     rgb,
     unique_name,
 )
+from neurosim_core.scene.srgb import srgb_to_linear
 
 
 def formats() -> frozenset[str]:

@@ -97,7 +97,8 @@ def check_both_ways(value: Any) -> None:
     assert codec.prepare(value, len(body)) == body
     assert codec.fixed_size in (None, len(body))
     if body:
-        assert codec.encode(value, len(body) - 1) is None
+        with pytest.raises(ValueError, match="exceeds the limit"):
+            codec.encode(value, len(body) - 1)
         assert isinstance(codec.prepare(value, len(body) - 1), Plan)
     memory = np.full(len(body) + 8, 0xAA, np.uint8)
     assert codec.prepare(value, -1).write(memory) == len(body)

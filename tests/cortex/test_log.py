@@ -22,7 +22,7 @@ from processes import SOON_S, wait_for
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
 from cortex.log import Log, LogError, LogWriter, Player, Recorder, TopicStats, open_log
 from cortex.log.format import CHUNK_BYTES
-from cortex.log.sink import Sink
+from cortex.log.writer import Sink
 from cortex.schema import Schema, schema_of
 
 MakeNode = Callable[..., Node]
