@@ -20,7 +20,7 @@ import warp as wp
 
 import neurosim_core
 from neurosim_core import run
-from neurosim_core.control import MODES, make_controller, mode_kernel
+from neurosim_core.control import MODES, Controller, mode_kernel
 from neurosim_core.render.antialias import antialiasing_kernels
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
@@ -118,7 +118,7 @@ def make_kernels() -> None:
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:
             paths = hover(HoverConfig(), position=[0.0, 0.0, 1.0]) if mode == "path" else None
-            make_controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)
+            Controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)
 
 
 def build(module: wp.Module) -> tuple[str, float]:

@@ -18,7 +18,6 @@ INTERFACE = 21
 
 
 def _load() -> Any:
-    """Return `cortex._native` if it is there and of this version."""
     if os.environ.get("CORTEX_PURE_PYTHON"):
         return None
     try:
@@ -46,5 +45,4 @@ def _require_gil() -> None:
 
 
 native: Any = _load()
-"""`cortex._native`, or None."""
 _require_gil()

@@ -8,17 +8,12 @@ together with others that hold the same types.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import cortex.messages
-from cortex import records
-from cortex.layout import (
-    LARGE_ARRAY_BYTES,
-    fixed_bytes,
-    has_tail,
-)
+from cortex import layout, records
 from cortex.message import is_message
 from cortex.schema import (
     ANY_DTYPE,
@@ -82,22 +77,13 @@ def generate(types: Sequence[type | Schema], *, namespace: str | None = None) ->
     for item in types:
         generator.message(item if isinstance(item, Schema) else schema_of(item))
     names = ", ".join(block.name for block in generator.blocks)
+    standard = "array complex cstddef cstdint limits optional stdexcept string string_view utility vector"
     return "\n".join(
         [
             f"// Written by `cortex cpp`; do not edit. Types: {names}.",
             "#pragma once",
             "",
-            "#include <array>",
-            "#include <complex>",
-            "#include <cstddef>",
-            "#include <cstdint>",
-            "#include <limits>",
-            "#include <optional>",
-            "#include <stdexcept>",
-            "#include <string>",
-            "#include <string_view>",
-            "#include <utility>",
-            "#include <vector>",
+            *(f"#include <{header}>" for header in standard.split()),
             "",
             "#include <cortex/codec.hpp>",
             "",
@@ -192,14 +178,8 @@ class _Generator:
         members: dict[str, int] = {}
         for member, value in kind.values:
             members[_identifier(member, members)] = value
-        lines = [
-            *_open(namespace),
-            f"enum class {name} : std::int32_t {{",
-            *(f"  {member} = {_int32(value)}," for member, value in members.items()),
-            "};",
-            *_close(namespace),
-        ]
-        self._add(qualified, key, lines)
+        listed = (f"  {member} = {_int32(value)}," for member, value in members.items())
+        self._add(qualified, key, _within(namespace, [f"enum class {name} : std::int32_t {{", *listed, "};"]))
         return f"::{qualified}"
 
     def message(self, schema: Schema) -> str:
@@ -213,18 +193,12 @@ class _Generator:
             taken = [name, *(member.name for member in members)]
             members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item))
         self._members[f"::{qualified}"] = members
-        lines = [
-            *_open(namespace),
-            *_struct(name, members),
-            *_close(namespace),
-            *self._codec(schema, f"::{qualified}", members),
-        ]
-        self._add(qualified, key, lines)
+        lines = _within(namespace, _struct(name, members))
+        self._add(qualified, key, lines + self._codec(schema, f"::{qualified}", members))
         return f"::{qualified}"
 
     def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
-        stamp = next((m for m in members if m.field.name == "stamp_ns" and _is_integer(m.field.type)), None)
-        unused = "" if stamp else "[[maybe_unused]] "
+        stamp = members[schema.stamp_index] if schema.stamp_index >= 0 else None
         stamp_code = f"static_cast<std::int64_t>(message.{stamp.name})" if stamp else "0"
         return [
             "namespace cortex {",
@@ -232,12 +206,11 @@ class _Generator:
             f"struct Codec<{cpp}> {{",
             f"  static constexpr std::string_view name = {_literal(schema.name)};",
             f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
-            "  static constexpr std::string_view schema =",
-            *_string_lines(schema.to_json()),
-            f"  static constexpr bool fixed = {_truth(not has_tail(schema))};",
-            f"  static constexpr bool stamped = {_truth(stamp is not None)};",
+            f"  static constexpr std::string_view schema = {_literal(schema.to_json())};",
+            f"  static constexpr bool fixed = {str(not layout.has_tail(schema)).lower()};",
+            f"  static constexpr bool stamped = {str(stamp is not None).lower()};",
             "",
-            f"  static std::int64_t stamp({unused}const {cpp}& message) noexcept {{",
+            f"  static std::int64_t stamp([[maybe_unused]] const {cpp}& message) noexcept {{",
             f"    return {stamp_code};",
             "  }",
             "",
@@ -296,8 +269,7 @@ def _row(row: Row) -> str:
 
 
 def _is_large(kind: ArrayType) -> bool:
-    """Whether an array of a fixed shape is so large that C++ has it as a view."""
-    return kind.is_fixed and fixed_bytes(kind) >= LARGE_ARRAY_BYTES
+    return kind.is_fixed and layout.fixed_bytes(kind) >= layout.LARGE_ARRAY_BYTES
 
 
 def _struct(name: str, members: list[_Member]) -> Iterator[str]:
@@ -312,10 +284,9 @@ def _struct(name: str, members: list[_Member]) -> Iterator[str]:
             notes.append(f"frame {_comment(member.field.frame)}")
         yield f"  {member.cpp} {member.name}{{}};" + (f"  // {', '.join(notes)}" if notes else "")
     equal = " &&\n           ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
-    unused = "" if members else "[[maybe_unused]] "
-    if members:
-        yield ""
-    yield f"  friend bool operator==({unused}const {name}& a, {unused}const {name}& b) {{"
+    yield ""
+    parameters = f"[[maybe_unused]] const {name}& a, [[maybe_unused]] const {name}& b"
+    yield f"  friend bool operator==({parameters}) {{"
     yield f"    return {equal};"
     yield "  }"
     yield f"  friend bool operator!=(const {name}& a, const {name}& b) {{ return !(a == b); }}"
@@ -335,10 +306,6 @@ def _array(kind: ArrayType) -> str:
     return cpp
 
 
-def _is_integer(kind: FieldType) -> bool:
-    return isinstance(kind, str) and "int" in kind
-
-
 def _identifier(name: str, taken: Sequence[str] | dict[str, int] = ()) -> str:
     safe = re.sub(r"[^A-Za-z0-9_]", "_", name)
     if not safe or safe[0].isdigit():
@@ -354,18 +321,10 @@ def _comment(text: str) -> str:
     return plain.replace("??", "? ?")  # a trigraph
 
 
-def _string_lines(text: str) -> Iterator[str]:
-    pieces = [text[start : start + 90] for start in range(0, len(text), 90)]
-    for index, piece in enumerate(pieces):
-        yield f"      {_literal(piece)}{';' if index == len(pieces) - 1 else ''}"
-
-
-def _open(namespace: str) -> list[str]:
-    return [f"namespace {namespace} {{"] if namespace else []
-
-
-def _close(namespace: str) -> list[str]:
-    return [f"}}  // namespace {namespace}"] if namespace else []
+def _within(namespace: str, lines: Iterable[str]) -> list[str]:
+    if not namespace:
+        return [*lines]
+    return [f"namespace {namespace} {{", *lines, f"}}  // namespace {namespace}"]
 
 
 def _literal(text: str) -> str:
@@ -382,7 +341,3 @@ def _literal(text: str) -> str:
 
 def _int32(value: int) -> str:
     return "std::numeric_limits<std::int32_t>::min()" if value == -(2**31) else str(value)
-
-
-def _truth(value: bool) -> str:
-    return "true" if value else "false"

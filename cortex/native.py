@@ -34,9 +34,7 @@ def make_coder(schema: Schema, cls: type, head: bytes = b"") -> Any:
         table = _ClassTable(schema, cls)
     except TooManyNames:
         return None  # Python does it
-    stamps = [k for k, field in enumerate(schema.fields, 1) if field.name == "stamp_ns"]
-    is_integer = [table.rows[k].kind is Kind.NUMBER and chr(table.rows[k].code) not in "fd" for k in stamps]
-    stamp = stamps[0] if any(is_integer) else -1
+    stamp = schema.stamp_index + 1 if schema.stamp_index >= 0 else -1
     rows = b"".join(struct.pack("8qP5q", *astuple(row)) for row in table.rows)
     return _Coder(rows, tuple(table.objects), stamp, head)
 

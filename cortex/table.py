@@ -18,7 +18,6 @@ from cortex.layout import (
     DTYPE_CODES,
     DTYPES,
     ITEM_ALIGNMENT,
-    SCALAR_CODES,
     array_dtype,
     block_size,
     has_tail,
@@ -27,7 +26,7 @@ from cortex.layout import (
     stride_of,
     values_of,
 )
-from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
+from cortex.schema import SCALAR_CODES, ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 
 
 class Kind(IntEnum):
@@ -101,7 +100,7 @@ class TooManyNames(ValueError):
 def _scope(kinds: list[FieldType]) -> _Scope:
     scope = {name: number for number, name in enumerate(sorted(shared_names(kinds)))}
     if len(scope) > NAMES_MAX:
-        raise TooManyNames
+        raise TooManyNames(f"more than {NAMES_MAX} dimensions of one message must agree")
     return scope
 
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:  # isort: off
         vehicle as vehicle,
     )
     from neurosim_core.config import (
-        ConfigError as ConfigError,
         SimulationConfig as SimulationConfig,
         load_config as load_config,
         to_yaml as to_yaml,
@@ -65,6 +64,7 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core.sensors.event_batch import EventCameraBatch as EventCameraBatch
     from neurosim_core.sensors.event_config import EventCameraConfig as EventCameraConfig
     from neurosim_core.sensors.events import EventCamera as EventCamera
+    from neurosim_core.settings_file import ConfigError as ConfigError
     from neurosim_core.sim.model import (
         Model as Model,
         make_model as make_model,

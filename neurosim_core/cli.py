@@ -6,6 +6,7 @@ import argparse
 import atexit
 import contextlib
 import faulthandler
+import functools
 import gc
 import logging
 import os
@@ -25,6 +26,8 @@ from neurosim_core.data import command as dataset
 from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
+from neurosim_core.scene.reader import SceneReader
+from neurosim_core.settings_file import scene_settings
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -308,11 +311,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Settings of the command line, by dotted key.
-
-    Raises:
-        ValueError: One is not KEY=VALUE.
-    """
+    """Settings of the command line, by dotted key."""
     overrides = read_settings(arguments.settings)
     for key, value in (
         ("duration_s", arguments.duration),
@@ -355,22 +354,29 @@ def _load(arguments: argparse.Namespace, overrides: dict[str, Any]) -> Simulatio
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    with (
-        Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
-        ThreadPoolExecutor(max_workers=1) as aside,
-    ):
-        from neurosim_core.warp_start import start_warp
-
-        aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
-        config = _load(arguments, _overrides(arguments))
-        if not arguments.print_config:
-            from neurosim_core.flight import fly, new_folder
+    overrides = _overrides(arguments)
     if arguments.print_config:
-        return _print_config(config)
-    folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-    report = fly(config, folder, rerun=not arguments.no_rrd, began_s=arguments.began_s)
+        return _print_config(_load(arguments, overrides))
+    with SceneReader(scene_settings(arguments.config, overrides)) as reader:
+        from rich.console import Console
+
+        with (
+            Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
+            ThreadPoolExecutor(max_workers=1) as aside,
+        ):
+            from neurosim_core.warp_start import start_warp
+
+            aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
+            config = _load(arguments, overrides)
+            from neurosim_core.flight import fly, new_folder
+        folder = new_folder(arguments.out, overwrite=arguments.overwrite)
+        report = fly(
+            config,
+            folder,
+            rerun=not arguments.no_rrd,
+            began_s=arguments.began_s,
+            scene=functools.partial(reader.scene, config.scene),
+        )
     return 130 if report.interrupted else 0
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import Annotated, Any, get_args
 
 import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     Field,
     ValidationError,
     field_validator,
@@ -22,31 +19,24 @@ from pydantic import (
 from neurosim_core.config_errors import describe_errors, explain, suggestion
 from neurosim_core.control import ControllerConfig, Se3ControllerConfig
 from neurosim_core.live.config import LinkConfig, LiveConfig
-from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
-from neurosim_core.live.sink import CortexSinkConfig  # noqa: F401  registers a kind
-from neurosim_core.registry import kinds, on_change
+from neurosim_core.registry import find
 from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
-from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
-from neurosim_core.scene.hall import HallConfig  # noqa: F401  registers a kind
-from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.scene.mesh import DEFAULT_KIND, scene_kind
 from neurosim_core.sensors.base import SensorConfig, expand_stereo
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
-from neurosim_core.settings import Settings, documentation
+from neurosim_core.settings import OfKind, Settings, documentation
+from neurosim_core.settings_file import ConfigError, beside, merge, nest, read_file
 from neurosim_core.sinks import SinkConfig, check_files, default_sinks
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
-
-
-class ConfigError(ValueError):
-    """A settings file or dict is wrong; the message names each key, its value and what is allowed."""
 
 
 def default_sensors() -> dict[str, SensorConfig]:
@@ -62,50 +52,23 @@ def default_sensors() -> dict[str, SensorConfig]:
 
 _DEFAULTS: dict[str, Callable[[], Mapping[str, Any]]] = {"sensors": default_sensors, "sinks": default_sinks}
 """Groups of named settings that have a default set; KEY+ changes the set or adds to it."""
-_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "control": "se3", "renderer": "warp"}
+_DEFAULT_KINDS = {
+    "scene": DEFAULT_KIND,
+    "renderer": "warp",
+    "vehicle": "multirotor",
+    "path": "tour",
+    "control": "se3",
+}
 """Kinds of settings that do not say which they are."""
-_KEYS = {"controller": "control"}  # of the settings of a seam, where they are not its name
-
-
-def _any_kind(seam: str, *, default: str | None = None) -> Any:
-    """Return the type of settings that are of one of the kinds of a seam.
-
-    Args:
-        seam: Which table.
-        default: The kind where none is said; then a name alone is a kind, too.
-    """
-    classes = list(kinds(seam).values())
-    union: Any = functools.reduce(operator.or_, classes)
-    if len(classes) > 1:
-        union = Annotated[union, Field(discriminator="kind")]
-
-    def complete(value: Any) -> Any:
-        if isinstance(value, str):
-            return {"kind": value}
-        if isinstance(value, Mapping) and "kind" not in value:
-            return {"kind": default, **value}
-        return value
-
-    return union if default is None else Annotated[union, BeforeValidator(complete)]
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-if TYPE_CHECKING:
-    AnySensor = SensorConfig
-    AnyScene = SceneConfig
-    AnyVehicle = VehicleConfig
-    AnyController = ControllerConfig
-    AnySink = SinkConfig
-    AnyRenderer = RendererConfig
-else:
-    AnySensor = _any_kind("sensor")
-    AnyScene = _any_kind("scene", default=_DEFAULT_KINDS["scene"])
-    AnyVehicle = _any_kind("vehicle", default=_DEFAULT_KINDS["vehicle"])
-    AnyController = _any_kind("controller", default=_DEFAULT_KINDS["control"])
-    AnySink = _any_kind("sink")
-    AnyRenderer = _any_kind("renderer", default=_DEFAULT_KINDS["renderer"])
-_ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
-"""Keys of a scene that say that it is of kind mesh."""
+AnySensor = Annotated[SensorConfig, OfKind("sensor")]
+AnyScene = Annotated[SceneConfig, OfKind("scene", default=_DEFAULT_KINDS["scene"])]
+AnyVehicle = Annotated[VehicleConfig, OfKind("vehicle", default=_DEFAULT_KINDS["vehicle"])]
+AnyController = Annotated[ControllerConfig, OfKind("controller", default=_DEFAULT_KINDS["control"])]
+AnySink = Annotated[SinkConfig, OfKind("sink")]
+AnyRenderer = Annotated[RendererConfig, OfKind("renderer", default=_DEFAULT_KINDS["renderer"])]
 _PATHS: tuple[type[Settings], ...] = get_args(get_args(PathConfig)[0])
 Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
 Links = dict[Name, LinkConfig]
@@ -148,7 +111,7 @@ class SimulationConfig(Settings):
     instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
     """How many instants of the fastest camera are rendered together; changes speed and memory, not the
     result."""
-    scene: AnyScene = ApartmentConfig()
+    scene: AnyScene = Field(default_factory=lambda: find("scene", _DEFAULT_KINDS["scene"])())
     """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
     bodies: dict[Name, BodyConfig] = Field(default_factory=dict)
     """What moves by itself in the scene, by name: {ball: {shape: {kind: sphere}, motion: {...}}}. Cameras see
@@ -259,30 +222,6 @@ class SimulationConfig(Settings):
         )
 
 
-def _take_new_kinds(seam: str) -> None:
-    """Let settings name kinds that were registered after this module was imported."""
-    if seam == "sink":
-        sinks: Any = dict[Name, _any_kind("sink")]  # type: ignore[misc]
-        SimulationConfig.model_fields["sinks"].annotation = sinks
-    elif seam == "sensor":
-        sensors: Any = Annotated[dict[Name, _any_kind("sensor")], AfterValidator(expand_stereo)]  # type: ignore[misc]
-        SimulationConfig.model_fields["sensors"].annotation = sensors
-        FleetMember.model_fields["sensors"].annotation = sensors | None
-    elif (key := _KEYS.get(seam, seam)) in _DEFAULT_KINDS:
-        field = SimulationConfig.model_fields[key]  # which keeps its validator
-        field.annotation = functools.reduce(operator.or_, kinds(seam).values())
-        field.discriminator = "kind" if len(kinds(seam)) > 1 else None
-        if key in FleetMember.model_fields:
-            FleetMember.model_fields[key].annotation = _any_kind(seam, default=_DEFAULT_KINDS[key]) | None
-    else:
-        return
-    for settings in (FleetMember, SimulationConfig):
-        settings.model_rebuild(force=True)
-
-
-on_change(_take_new_kinds)
-
-
 def load_config(
     source: str | Path | Mapping[str, Any] | None = None,
     *,
@@ -310,8 +249,8 @@ def load_config(
             out of range. The message has one line for each error.
     """
     origin = str(source) if isinstance(source, str | Path) else "config"
-    raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
-    patches = [_nest(key, value) for key, value in (overrides or {}).items()]
+    raw = read_file(Path(source)) if isinstance(source, str | Path) else dict(source or {})
+    patches = [nest(key, value) for key, value in (overrides or {}).items()]
     for group, defaults in _DEFAULTS.items():
         added = f"{group}+"
         if added in raw:
@@ -330,9 +269,9 @@ def load_config(
             }
     given = raw
     for patch in patches:
-        raw = _merge(raw, patch)
+        raw = merge(raw, patch)
     if isinstance(source, str | Path):
-        raw = _beside(raw, Path(source).resolve().parent)
+        raw = beside(raw, Path(source).resolve().parent)
     raw = _without_nulls(_with_default_kinds(raw))
     try:
         return SimulationConfig.model_validate(raw)
@@ -350,93 +289,14 @@ def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
     return "\n".join(_yaml_lines(config, indent=0, comments=comments)) + "\n"
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError:
-        raise ConfigError(
-            f"{path} is binary, no settings; a mesh is named in them: scene: {{kind: mesh, file: {path}}}"
-        ) from None
-    except FileNotFoundError:
-        if path.suffix.lower() not in ("", ".yaml", ".yml"):
-            raise ConfigError(
-                f"{path}: no such file; settings are YAML, in which a mesh is "
-                f"scene: {{kind: mesh, file: {path.name}}}, "
-                f"or say --set scene.kind=mesh --set scene.file={path}"
-            ) from None
-        raise ConfigError(
-            f"no settings file {path}: `neurosim run --print-config > {path}` makes one"
-        ) from None
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not YAML: {_in_one_line(error)}") from error
-    if raw is None:
-        return {}
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{path} must hold a mapping of keys to values, got a {type(raw).__name__}")
-    return raw
-
-
-def _in_one_line(error: yaml.YAMLError) -> str:
-    """Return where YAML ends to be YAML, and what to look for."""
-    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
-        return " ".join(str(error).split())
-    mark = error.problem_mark
-    tab = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
-    return f"line {mark.line + 1}, column {mark.column + 1}: {error.problem}{tab}"
-
-
-def _nest(key: str, value: Any) -> dict[str, Any]:
-    """Return {"a": {"b": value}} for the key "a.b"."""
-    nested = value
-    for part in reversed(key.split(".")):
-        nested = {part: nested}
-    return dict(nested)
-
-
-def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with the keys of `patch`; a group of another kind replaces the one it meets."""
-    if "kind" in patch and patch["kind"] != base.get("kind"):
-        return dict(patch)
-    merged = dict(base)
-    for key, value in patch.items():
-        old = merged.get(key)
-        merged[key] = _merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return merged
-
-
-def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Make relative files of scene, bodies and lenses absolute, as poses, from the settings file's folder."""
-    places: list[tuple[str, ...]] = [("scene",), ("path",)]
-    bodies = raw.get("bodies")
-    for name in bodies if isinstance(bodies, Mapping) else ():
-        places += [("bodies", name, "shape"), ("bodies", name, "surface")]
-    sensors = raw.get("sensors")
-    for name in sensors if isinstance(sensors, Mapping) else ():
-        places += [("sensors", name, "lens"), ("sensors", name, "pixel", "measured_noise")]
-    for place in places:
-        group: Any = raw
-        for key in place:
-            group = group.get(key) if isinstance(group, Mapping) else None
-        file = group.get("file") if isinstance(group, Mapping) else None
-        if isinstance(file, str) and not Path(file).expanduser().is_absolute():
-            patch: dict[str, Any] = {"file": str(folder / file)}
-            for key in reversed(place):
-                patch = {key: patch}
-            raw = _merge(raw, patch)
-    return raw
-
-
 def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
     """Add the default kind to top-level groups that come in several and do not say which they are."""
-    for key, item in SimulationConfig.model_fields.items():
+    for key, kind in _DEFAULT_KINDS.items():
         group = raw.get(key)
-        if isinstance(group, Mapping) and "kind" not in group and hasattr(item.default, "kind"):
-            kind = item.default.kind
-            if key == "scene" and not _ONLY_MESH.isdisjoint(group):
-                kind = "mesh"
-            elif key == "path" and not group.keys() <= type(item.default).model_fields.keys():
+        if isinstance(group, Mapping) and "kind" not in group:
+            if key == "scene":
+                kind = scene_kind(group)
+            elif key == "path" and not group.keys() <= TourConfig.model_fields.keys():
                 fitting = [one for one in _PATHS if group.keys() <= one.model_fields.keys()]
                 kind = fitting[0].model_fields["kind"].default if len(fitting) == 1 else kind
             raw = {**raw, key: {"kind": kind, **group}}

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from neurosim_core.settings import OfKind
+
 _GROUP = frozenset({"model_type", "model_attributes_type", "dict_type", "dataclass_type"})
 _LIST = frozenset({"tuple_type", "list_type"})
 _OTHER_TYPE = _LIST | {"missing", "too_long", "too_short"}
@@ -18,12 +20,7 @@ _SHOWN_MAX = 80
 
 
 def explain(model: type[BaseModel], error: ValidationError) -> list[str]:
-    """Return one line for each error: path of the key, what is allowed, and the value.
-
-    Args:
-        model: What was to be made.
-        error: Why it could not be.
-    """
+    """Return one line for each error: path of the key, what is allowed, and the value."""
     items: list[Mapping[str, Any]] = [*error.errors()]
     # a list of which an item is wrong is also said to be too short, and one that is too short to lack items
     items = list(_of_choices(model, items))
@@ -47,11 +44,8 @@ def describe_errors(
 ) -> str:
     """Return the text of an error: each error by the name that the user gave its key.
 
-    Args:
-        origin: What the settings are from.
-        errors: Lines that begin with a dotted key.
-        options: Names of keys that were given otherwise.
-        given: What is in the settings without these.
+    `errors`: lines that begin with a dotted key. `options`: names of keys that were given otherwise. `given`:
+    what is in the settings without these.
     """
     lines = dict.fromkeys(_by_option(line, options, given) for line in errors)
     elsewhere = any(line in errors for line in lines)
@@ -173,7 +167,7 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
 def _deeper(owner: type[BaseModel] | None, key: str) -> str:
     """Return "did you mean ...? " for a key that belongs one level deeper; nothing if it does not."""
     for name, field in owner.model_fields.items() if owner else ():
-        groups = [choice for choice in _alternatives(field.annotation) if _is_model(choice)]
+        groups = [choice for choice in _alternatives(field.rebuild_annotation()) if _is_model(choice)]
         if any(key in group.model_fields for group in groups):
             return f"did you mean '{name}.{key}'? "
     return ""
@@ -206,14 +200,15 @@ def _follow(model: type[BaseModel], loc: tuple[int | str, ...]) -> tuple[Any, li
     for part in loc:
         members = [a for a in _alternatives(annotation) if _is_model(a)]
         tagged = [m for m in members if _tag(m) == part]
-        if len(members) > 1 and tagged:  # the tag of a discriminated union: not a key
+        # the tag of a discriminated union, which may have one choice only: not a key
+        if tagged and (len(members) > 1 or part not in members[0].model_fields):
             annotation = tagged[0]
             continue
         keys.append(str(part))
         owner = members[0] if len(members) == 1 else None
         if owner is not None:
             field = owner.model_fields.get(str(part))
-            annotation = None if field is None else field.annotation
+            annotation = None if field is None else field.rebuild_annotation()
         else:
             annotation = _item_type(annotation, part)
     return annotation, keys
@@ -236,7 +231,9 @@ def _alternatives(annotation: Any) -> Iterator[Any]:
     """Yield the types that a value may be of."""
     origin = get_origin(annotation)
     if origin is Annotated:
-        yield from _alternatives(get_args(annotation)[0])
+        kinds = [mark for mark in get_args(annotation)[1:] if isinstance(mark, OfKind)]
+        for choice in kinds[0].choices() if kinds else get_args(annotation)[:1]:
+            yield from _alternatives(choice)
     elif origin in (Union, types.UnionType):
         for choice in get_args(annotation):
             yield from _alternatives(choice)

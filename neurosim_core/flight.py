@@ -26,6 +26,7 @@ from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
+from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
@@ -43,12 +44,8 @@ from neurosim_core.warp_start import has_kernels
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
     """Return the folder for a new flight; `fly` makes it once there is something to put in it.
 
-    Args:
-        out: Where the user wants it; None: ./flight, or ./flight-2, ... if there is one already.
-        overwrite: Replace a flight that is already in `out`.
-
-    Raises:
-        FileExistsError: `out` holds a flight and may not be overwritten.
+    `out`: where the user wants it; None: ./flight, or ./flight-2, ... if there is one already. `overwrite`:
+    replace a flight that is already in `out`.
     """
     if out is None:
         names = (Path("flight" if number == 1 else f"flight-{number}") for number in itertools.count(1))
@@ -70,6 +67,7 @@ def fly(
     rerun: bool = True,
     console: Console | None = None,
     began_s: float | None = None,
+    scene: Callable[[], Scene] | None = None,
 ) -> FlightReport:
     """Fly a configuration, hand its packets to its sinks, and leave config.yaml and their files in a folder.
 
@@ -84,6 +82,7 @@ def fly(
         rerun: Write flight.rrd, if that is among the sinks.
         console: Where to print; standard output if None.
         began_s: When the command began, as `time.perf_counter` says; None: now.
+        scene: Returns the scene of `config`; None: it is loaded here.
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
@@ -107,6 +106,7 @@ def fly(
     with _new_folder(folder), console.status("preparing") as status:
         model = make_model(
             config,
+            scene=scene,
             on_phase=lambda phase: status.update(f"preparing: {phase}"),
             meanwhile=functools.partial(_load, sinks=sinks),
         )
@@ -169,13 +169,7 @@ def fly(
 def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     """Return the Rerun file of a flight; write it from the recording if there is none, or to `save` if given.
 
-    Args:
-        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
-        save: Write here.
-
-    Raises:
-        FileNotFoundError: There is no flight.
-        ImportError: Rerun or h5py is not installed.
+    `flight`: the folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
     """
     recorded = flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
     # events.raw and events.csv may be different events: each has a Rerun file of its own
@@ -215,9 +209,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
 def header_of(model: Model, config: SimulationConfig | None = None) -> RecordingHeader:
     """Return what goes with the packets of a flight.
 
-    Args:
-        model: What is flown.
-        config: Settings that hold in place of those of the model.
+    `config`: settings that hold in place of those of the model.
     """
     config = model.config if config is None else config
     stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
@@ -236,13 +228,7 @@ def header_of(model: Model, config: SimulationConfig | None = None) -> Recording
 def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]:
     """Give what takes the packets of a flight, and write them to a file at the end.
 
-    Args:
-        file: A recording (.h5), or a film of it (.webp, .gif).
-        model: What is flown.
-
-    Raises:
-        ValueError: The file is neither, or a film has nothing to show.
-        OSError: The file cannot be written.
+    `file`: a recording (.h5), or a film of it (.webp, .gif).
     """
     if file.suffix not in (".h5", *FILMS):
         raise ValueError(f"a flight is saved to a file that ends in .h5, {' or '.join(FILMS)}, got {file}")

@@ -1,7 +1,7 @@
 """What can be extended: a table kind -> class for each seam, to which other packages add by an entry point.
 
 A package adds its own sensors, vehicles, ... by registering classes in a module that an entry point of the
-group `neurosim.plugins` names; the module is imported when a table is first looked at:
+group `neurosim.plugins` names; the module is imported when a kind is asked for that is not of Neurosim:
 
     [project.entry-points."neurosim.plugins"]
     my_sensors = "my_package.sensors"
@@ -26,11 +26,17 @@ ENTRY_POINT_GROUP = "neurosim.plugins"
 SEAMS = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise", "task")
 """What can be registered."""
 
+_OWN = {
+    "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
+    "renderer": {"remote": "live.remote_renderer"},
+    "sink": {"cortex": "live.sink"},
+}
+"""Modules of kinds that are imported when they are asked for; those of sensors are named for their kind."""
+
 Registered = TypeVar("Registered", bound=type)
 
 _logger = logging.getLogger(__name__)
 _tables: dict[str, dict[str, type]] = {seam: {} for seam in SEAMS}
-_listeners: list[Callable[[str], None]] = []
 _loaded = False
 
 
@@ -66,7 +72,6 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
         if check is not None:
             check()
         table[kind] = cls
-        _tell(seam)
         return cls
 
     return add
@@ -78,9 +83,18 @@ def kinds(seam: str) -> Mapping[str, type]:
     Raises:
         ValueError: There is no such seam.
     """
-    table = _table(seam)
+    table = registered(seam)
     load_plugins()
-    return MappingProxyType(table)
+    return table
+
+
+def registered(seam: str) -> Mapping[str, type]:
+    """Return the classes of a seam by kind that have been imported until now.
+
+    Raises:
+        ValueError: There is no such seam.
+    """
+    return MappingProxyType(_table(seam))
 
 
 def find(seam: str, kind: str) -> type:
@@ -89,19 +103,18 @@ def find(seam: str, kind: str) -> type:
     Raises:
         ValueError: There is no such seam or kind; the message has those that are known.
     """
-    table = kinds(seam)
+    table = _table(seam)
+    if kind not in table and kind in (own := _own_modules(seam)):
+        importlib.import_module(own[kind])
+    if kind not in table:
+        load_plugins()
     if kind not in table:
         raise ValueError(f"unknown {seam} kind {kind!r}, known: {sorted(table)}")
     return table[kind]
 
 
-def on_change(listener: Callable[[str], None]) -> None:
-    """Call `listener` with the seam's name whenever a class is registered from now on."""
-    _listeners.append(listener)
-
-
 def load_plugins() -> None:
-    """Import every module of `neurosim_core.sensors`, and those that entry points name, once in a process.
+    """Import every module of ours that registers a kind, and those that entry points name, once in a process.
 
     A foreign module that cannot be imported is left out with a warning: one broken package must not take the
     others down. What it has registered before it failed is forgotten.
@@ -110,9 +123,8 @@ def load_plugins() -> None:
     if _loaded:
         return
     _loaded = True
-    sensors = importlib.import_module("neurosim_core.sensors")
-    for module in pkgutil.iter_modules(sensors.__path__, f"{sensors.__name__}."):
-        importlib.import_module(module.name)
+    for module in (module for seam in SEAMS for module in _own_modules(seam).values()):
+        importlib.import_module(module)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
         before = {seam: dict(table) for seam, table in _tables.items()}
         try:
@@ -126,14 +138,16 @@ def load_plugins() -> None:
                 ]
                 for kind in broken:
                     del table[kind]
-                if broken:
-                    _tell(seam)
             _logger.warning("the plug-in %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
 
 
-def _tell(seam: str) -> None:
-    for listener in _listeners:
-        listener(seam)
+def _own_modules(seam: str) -> dict[str, str]:
+    """Return the modules of our own kinds of a seam; of sensors all, some of which have none."""
+    if seam == "sensor":
+        sensors = importlib.import_module("neurosim_core.sensors")
+        names = (module.name for module in pkgutil.iter_modules(sensors.__path__))
+        return {name: f"{sensors.__name__}.{name}" for name in names}
+    return {kind: f"neurosim_core.{module}" for kind, module in _OWN.get(seam, {}).items()}
 
 
 def _table(seam: str) -> dict[str, type]:

@@ -6,9 +6,11 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_schema
 
 from neurosim_core.docstrings import field_docs
+from neurosim_core.registry import find, kinds
 
 
 class Settings(BaseModel):
@@ -25,6 +27,52 @@ class Settings(BaseModel):
         allow_inf_nan=False,
         validate_default=True,
     )
+
+
+class OfKind:
+    """Settings of any kind of a seam: `Annotated[SensorConfig, OfKind("sensor")]`.
+
+    Which class they are of is looked up when they are read: only kinds that are in use are imported.
+    """
+
+    def __init__(self, seam: str, *, default: str | None = None) -> None:
+        """Say which settings.
+
+        Args:
+            seam: A table of the registry.
+            default: The kind where none is said; then a name alone is a kind, too.
+        """
+        self.seam = seam
+        self._default = default
+
+    def choices(self) -> list[type[BaseModel]]:
+        """Return the classes of all kinds."""
+        return [*kinds(self.seam).values()]
+
+    def __get_pydantic_core_schema__(self, base: type[BaseModel], _: GetCoreSchemaHandler) -> CoreSchema:
+        """Return how to read them; errors are those of a union that is discriminated by `kind`."""
+
+        def validate(value: Any) -> BaseModel:
+            if isinstance(value, base):
+                return value
+            if isinstance(value, str) and self._default is not None:
+                value = {"kind": value}
+            if not isinstance(value, Mapping):
+                raise PydanticKnownError("model_attributes_type")
+            kind = value.get("kind", self._default)
+            if kind is None:
+                raise PydanticKnownError("union_tag_not_found", {"discriminator": "'kind'"})
+            try:
+                settings: type[BaseModel] = find(self.seam, kind)
+            except (ValueError, TypeError):  # unknown; no name
+                known = ", ".join(map(repr, kinds(self.seam)))
+                context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": known}
+                raise PydanticKnownError("union_tag_invalid", context) from None
+            choice = core_schema.tagged_union_schema({kind: settings.__pydantic_core_schema__}, "kind")
+            read: BaseModel = SchemaValidator(choice).validate_python({"kind": kind, **value})
+            return read
+
+        return core_schema.no_info_plain_validator_function(validate)
 
 
 @functools.cache

@@ -33,6 +33,8 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 LONGEST = [Path(__file__).parent / name for name in (
     "live/test_restart.py", "cortex/test_cpp.py", "test_readme.py", "live/test_browser.py", "test_cli.py",
+    "live/test_loop.py", "vehicle/test_extreme_flights.py", "vehicle/test_adaptive.py",
+    "live/test_my_controller.py",
 )]  # fmt: skip
 """Files that come first: a long one at the end would be waited for by all processes but its own."""
 

@@ -314,7 +314,7 @@ def test_debug_shows_where_an_error_arose(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"nothing\.yaml") as error:
         cli.main(["--debug", "run", "nothing.yaml"])
-    assert error.traceback[-1].path.name == "config.py"
+    assert error.traceback[-1].path.name == "settings_file.py"
 
 
 @pytest.mark.parametrize("command", ["run", "serve", "fly", "up"])

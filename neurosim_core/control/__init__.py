@@ -8,7 +8,7 @@ from neurosim_core.control.config import (
 )
 from neurosim_core.control.follow import FollowMode, PathFollower
 from neurosim_core.control.host_controller import HostController
-from neurosim_core.control.modes import MODES, CommandMode, Controller, Mode, make_controller, mode_kernel
+from neurosim_core.control.modes import MODES, CommandMode, Controller, Mode, mode_kernel
 from neurosim_core.control.se3 import Se3Config
 
 __all__ = [
@@ -24,6 +24,5 @@ __all__ = [
     "PathFollower",
     "Se3Config",
     "Se3ControllerConfig",
-    "make_controller",
     "mode_kernel",
 ]

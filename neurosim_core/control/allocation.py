@@ -23,10 +23,8 @@ _ONE = wp.constant(wp.float64(1.0))
 class Motors:
     """What all rotors of a vehicle share."""
 
-    speed_min_rad_s: wp.float64
-    """Lowest speed [rad/s]."""
-    speed_max_rad_s: wp.float64
-    """Highest speed [rad/s]."""
+    speed_min_rad_s: wp.float64  # Lowest speed [rad/s]
+    speed_max_rad_s: wp.float64  # Highest speed [rad/s]
     lead: wp.float64
     """Time constant of the motors over the one they shall seem to have; 1 commands the speed that is
     wanted."""
@@ -84,12 +82,7 @@ def yaw_share(
 ) -> wp.float64:
     """Return the largest share of yaw torque, in [0, 1], that goes with the rest; -1 if none does.
 
-    Args:
-        matrix: See `allocation_matrix`.
-        low: Least squared rotor speed [rad^2/s^2].
-        high: Largest squared rotor speed [rad^2/s^2].
-        thrust_N: Collective thrust [N].
-        torque: Torque in B [N m].
+    Squared rotor speeds are within `low` and `high` [rad^2/s^2]; torque in B [N m]; see `allocation_matrix`.
     """
     least = _ZERO
     most = _ONE
@@ -119,17 +112,7 @@ def allocate(
     rotor_speed: wp.array2d[wp.float64],
     rotor_speed_command_out: wp.array2d[wp.float64],
 ) -> None:
-    """Write the rotor speed commands [rad/s] of one vehicle.
-
-    Args:
-        matrix: See `allocation_matrix`.
-        motors: Limits.
-        thrust_N: Collective thrust along z_B [N].
-        torque: Torque on the body, in B [N m].
-        vehicle: Row to read and write.
-        rotor_speed: Present speeds [rad/s], shape [N, R].
-        rotor_speed_command_out: Shape [N, R].
-    """
+    """Write the rotor speed commands [rad/s] of one vehicle for a thrust along z_B [N] and a torque in B."""
     rotors = matrix.shape[0]
     low = motors.speed_min_rad_s * motors.speed_min_rad_s
     high = motors.speed_max_rad_s * motors.speed_max_rad_s

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field
 
-from neurosim_core.control.modes import Controller, make_controller
+from neurosim_core.control.modes import Controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.registry import register
 from neurosim_core.settings import Settings
@@ -68,7 +68,7 @@ class Se3ControllerConfig(ControllerConfig):
     def make(self, context: ControllerContext) -> Controller:
         """Return the controller of all worlds."""
         paths = context.paths
-        return make_controller(
+        return Controller(
             "path",
             context.airframe,
             self.gains,

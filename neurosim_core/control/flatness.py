@@ -22,24 +22,18 @@ _ZERO = wp.constant(wp.float64(0.0))
 class AttitudeReference:
     """An attitude to follow, with its derivatives."""
 
-    orientation: wp.quatd
-    """q_WD of the desired body frame D, xyzw."""
-    body_rate: wp.vec3d
-    """w_WD in D [rad/s]."""
-    angular_acceleration: wp.vec3d
-    """Time derivative of `body_rate` [rad/s^2]."""
+    orientation: wp.quatd  # q_WD of the desired body frame D, xyzw
+    body_rate: wp.vec3d  # w_WD in D [rad/s]
+    angular_acceleration: wp.vec3d  # Time derivative of `body_rate` [rad/s^2]
 
 
 @wp.struct
 class Heading:
     """Yaw and its derivatives; y_D is kept orthogonal to `direction`, as in a Z-X-Y Euler sequence."""
 
-    direction: wp.vec3d
-    """b1 = (cos yaw, sin yaw, 0) in W."""
-    rate_rad_s: wp.float64
-    """Time derivative of yaw [rad/s]."""
-    acceleration_rad_s2: wp.float64
-    """Second time derivative of yaw [rad/s^2]."""
+    direction: wp.vec3d  # b1 = (cos yaw, sin yaw, 0) in W
+    rate_rad_s: wp.float64  # Time derivative of yaw [rad/s]
+    acceleration_rad_s2: wp.float64  # Second time derivative of yaw [rad/s^2]
 
 
 @wp.func
@@ -57,12 +51,7 @@ def attitude_reference(
     z. Where the thrust points below the horizon, (y, -y) both satisfy the heading and the one nearer to the
     body's is taken, so that a flip about any axis is continuous.
 
-    Args:
-        thrust: Thrust per mass in W (acceleration minus gravity) [m/s^2].
-        thrust_rate: Its time derivative (jerk) [m/s^3].
-        thrust_acceleration: Its second time derivative (snap) [m/s^4].
-        heading: Yaw and its derivatives.
-        orientation: Present q_WB; used in degenerate cases only.
+    Thrust is per mass, in W (acceleration minus gravity) [m/s^2], with its time derivatives.
     """
     magnitude = wp.length(thrust)
     y_B = wp.quat_rotate(orientation, wp.vec3d(_ZERO, wp.float64(1.0), _ZERO))

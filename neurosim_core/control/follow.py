@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import math
 import operator
-from typing import Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -22,9 +23,12 @@ from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
 from neurosim_core.vehicle.airframe import MultirotorConfig
+from neurosim_core.vehicle.arrays import allocate_arrays
 
 FollowMode = Literal["motor_speeds", "velocity", "position"]
 """What a follower commands: the rotors themselves, or setpoints for whatever flies the vehicle."""
+_YAW_RATE_PER_RAD = 2.0
+"""How fast an error of the heading is closed in mode velocity [1/s]."""
 
 
 class PathFollower:
@@ -69,7 +73,9 @@ class PathFollower:
         self.mode = mode
         self._gains = gains or Se3Config()
         self._cursor = PathCursor(path)
-        self._feedback = _Feedback(airframe.rotor_count)
+        # the state of the vehicle as a controller reads it, and views of the same memory to write it
+        self._feedback = allocate_arrays(1, airframe.rotor_count, wp.get_device("cpu"))
+        self._host = {name: array.numpy() for name, array in vars(self._feedback).items()}
         self._controller: PathController | None = None
         self._all = wp.ones(1, dtype=wp.int32, device="cpu")
         if mode == "motor_speeds":
@@ -108,35 +114,29 @@ class PathFollower:
         if self._controller is None:
             command = self._velocity(self._cursor.at(stamp_ns), position, orientation)
         else:
-            command = self._motor_speeds(
-                self._controller, stamp_ns, position, velocity, orientation, body_rate, rotor_speed
-            )
+            state = {
+                "position": position,
+                "velocity": velocity,
+                "orientation": orientation,
+                "body_rate": body_rate,
+                "rotor_speed": rotor_speed,
+            }
+            command = self._motor_speeds(self._controller, operator.index(stamp_ns), state)
         if not math.isfinite(sum(command.tolist())):
             raise ValueError(f"no finite command follows from the state at {stamp_ns} ns: it is not finite")
         return command
 
     def _motor_speeds(
-        self,
-        controller: PathController,
-        stamp_ns: int,
-        position: ArrayLike,
-        velocity: ArrayLike,
-        orientation: ArrayLike,
-        body_rate: ArrayLike,
-        rotor_speed: ArrayLike,
+        self, controller: PathController, stamp_ns: int, state: Mapping[str, ArrayLike]
     ) -> NDArray[np.float64]:
-        state = self._feedback
-        state.host_position[0] = position
-        state.host_velocity[0] = velocity
-        state.host_orientation[0] = orientation
-        state.host_body_rate[0] = body_rate
-        state.host_rotor_speed[0] = rotor_speed
-        stamp_ns = operator.index(stamp_ns)
-        if stamp_ns < state.host_stamp_ns[0]:
+        host = self._host
+        for name, value in state.items():
+            host[name][0] = value
+        if stamp_ns < host["stamp_ns"][0]:
             controller.begin(self._all)
-        state.host_stamp_ns[0] = stamp_ns
-        controller.update(state)
-        return np.array(state.host_rotor_speed_command[0])
+        host["stamp_ns"][0] = stamp_ns
+        controller.update(self._feedback)
+        return np.array(host["rotor_speed_command"][0])
 
     def error_m(self, stamp_ns: int, position: ArrayLike) -> float:
         """Return how far a position is from where the path is at a stamp [m]."""
@@ -154,24 +154,3 @@ class PathFollower:
         turn_rad = math.remainder(float(point["yaw"]) - heading_rad(orientation), math.tau)
         yaw_rate_rad_s = float(point["yaw_rate"]) + _YAW_RATE_PER_RAD * turn_rad
         return np.array([*(point["velocity"] + correction), yaw_rate_rad_s])
-
-
-_YAW_RATE_PER_RAD = 2.0
-"""How fast an error of the heading is closed in mode velocity [1/s]."""
-
-
-class _Feedback:
-    """The state of one vehicle as a controller reads it, and views of the same memory to write it."""
-
-    def __init__(self, rotor_count: int) -> None:
-        def zeros(shape: Any, dtype: Any) -> tuple[Any, NDArray[Any]]:
-            array = wp.zeros(shape, dtype=dtype, device="cpu")
-            return array, array.numpy()
-
-        self.position, self.host_position = zeros(1, wp.vec3d)
-        self.velocity, self.host_velocity = zeros(1, wp.vec3d)
-        self.orientation, self.host_orientation = zeros(1, wp.quatd)
-        self.body_rate, self.host_body_rate = zeros(1, wp.vec3d)
-        self.rotor_speed, self.host_rotor_speed = zeros((1, rotor_count), wp.float64)
-        self.stamp_ns, self.host_stamp_ns = zeros(1, wp.int64)
-        self.rotor_speed_command, self.host_rotor_speed_command = zeros((1, rotor_count), wp.float64)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.control.config import ControllerContext
-from neurosim_core.control.modes import Controller, make_controller
+from neurosim_core.control.modes import Controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.trajectory.path import PathCursor
@@ -74,9 +74,7 @@ class HostController:
             if not isinstance(setpoint, Setpoint):
                 raise TypeError(f"{type(self).__name__}.command must return a setpoint, got {setpoint!r}")
             if self._lower is None:
-                self._lower = make_controller(
-                    setpoint.mode, self.airframe, self._gains, count=len(self._cursors)
-                )
+                self._lower = Controller(setpoint.mode, self.airframe, self._gains, count=len(self._cursors))
             if setpoint.mode != self._lower.mode:
                 raise ValueError(
                     f"{type(self).__name__} commands {self._lower.mode}: it cannot go over to {setpoint.mode}"

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,misc,arg-type,call-overload,index,no-untyped-def"
+# mypy: disable-error-code="attr-defined,misc,arg-type,call-overload,index,assignment,no-untyped-def"
 """Command modes: what a setpoint is at each level, and the controller that turns it into rotor speeds.
 
     mode          setpoint row (float64)                          closes on
@@ -42,11 +42,12 @@ from neurosim_core.control.se3 import (
     velocity_wrench,
 )
 from neurosim_core.frames import as_rows
+from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
 from neurosim_core.vehicle.arrays import BLOCK_DIM
-from neurosim_core.vehicle.command_ranges import CommandRanges, command_ranges
+from neurosim_core.vehicle.command_ranges import command_ranges
 
 logger = logging.getLogger(__name__)
 wp.set_module_options({"enable_backward": False})
@@ -59,105 +60,76 @@ CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position
 class Feedback:
     """The arrays of a batch of vehicles that a controller reads, one element a vehicle."""
 
-    position: wp.array[wp.vec3d]
-    """p_WB [m]."""
-    velocity: wp.array[wp.vec3d]
-    """v_WB in W [m/s]."""
-    orientation: wp.array[wp.quatd]
-    """q_WB, xyzw."""
-    body_rate: wp.array[wp.vec3d]
-    """w_WB in B [rad/s]."""
-    rotor_speed: wp.array2d[wp.float64]
-    """[rad/s], shape [N, R]."""
-    stamp_ns: wp.array[wp.int64]
-    """Time since the start of the episode [ns]."""
+    position: wp.array[wp.vec3d]  # p_WB [m]
+    velocity: wp.array[wp.vec3d]  # v_WB in W [m/s]
+    orientation: wp.array[wp.quatd]  # q_WB, xyzw
+    body_rate: wp.array[wp.vec3d]  # w_WB in B [rad/s]
+    rotor_speed: wp.array2d[wp.float64]  # [rad/s], shape [N, R]
+    stamp_ns: wp.array[wp.int64]  # Time since the start of the episode [ns]
+
+
+@wp.struct
+class _Order:
+    """What one of the vehicles is to do."""
+
+    path: PathArrays
+    setpoint: wp.array2d[wp.float64]
+    vehicle: int
+    stamp_ns: wp.int64
 
 
 @wp.func
-def _vector3(rows: wp.array2d[wp.float64], row: int, first: int) -> wp.vec3d:
+def _vector3(order: _Order, first: int) -> wp.vec3d:
+    rows = order.setpoint
+    row = order.vehicle
     return wp.vec3d(rows[row, first], rows[row, first + 1], rows[row, first + 2])
 
 
 @wp.func
-def _thrust(parameters: Se3Parameters, setpoint: wp.array2d[wp.float64], vehicle: int) -> wp.float64:
-    return clip(setpoint[vehicle, 0], wp.float64(0.0), parameters.command_thrust_max_n)
+def _thrust(parameters: Se3Parameters, order: _Order) -> wp.float64:
+    return clip(order.setpoint[order.vehicle, 0], wp.float64(0.0), parameters.command_thrust_max_n)
 
 
 @wp.func
-def _rates(
-    parameters: Se3Parameters,
-    path: PathArrays,
-    setpoint: wp.array2d[wp.float64],
-    vehicle: int,
-    stamp_ns: wp.int64,
-    state: VehicleState,
-) -> Wrench:
+def _rates(parameters: Se3Parameters, order: _Order, state: VehicleState) -> Wrench:
     rate_max = wp.min(parameters.body_rate_max_rad_s, parameters.command_rate_max_rad_s)
-    rate = shorten(_vector3(setpoint, vehicle, 1), rate_max)
-    return rate_wrench(parameters, state, _thrust(parameters, setpoint, vehicle), rate, wp.vec3d())
+    rate = shorten(_vector3(order, 1), rate_max)
+    return rate_wrench(parameters, state, _thrust(parameters, order), rate, wp.vec3d())
 
 
 @wp.func
-def _attitude(
-    parameters: Se3Parameters,
-    path: PathArrays,
-    setpoint: wp.array2d[wp.float64],
-    vehicle: int,
-    stamp_ns: wp.int64,
-    state: VehicleState,
-) -> Wrench:
-    v = _vector3(setpoint, vehicle, 1)
-    w = setpoint[vehicle, 4]
+def _attitude(parameters: Se3Parameters, order: _Order, state: VehicleState) -> Wrench:
+    v = _vector3(order, 1)
+    w = order.setpoint[order.vehicle, 4]
     largest = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.max(wp.abs(v[2]), wp.abs(w)))
     q = wp.quatd(v[0], v[1], v[2], w) * scale_to_squarable(largest)
     reference = AttitudeReference()
     reference.orientation = q / wp.length(q)  # `wp.normalize` would make the identity of nan
-    return attitude_wrench(parameters, state, _thrust(parameters, setpoint, vehicle), reference)
+    return attitude_wrench(parameters, state, _thrust(parameters, order), reference)
 
 
 @wp.func
-def _velocity(
-    parameters: Se3Parameters,
-    path: PathArrays,
-    setpoint: wp.array2d[wp.float64],
-    vehicle: int,
-    stamp_ns: wp.int64,
-    state: VehicleState,
-) -> Wrench:
+def _velocity(parameters: Se3Parameters, order: _Order, state: VehicleState) -> Wrench:
     rate_max = parameters.command_rate_max_rad_s
-    heading = present_heading(state.orientation, clip(setpoint[vehicle, 3], -rate_max, rate_max))
-    velocity = shorten(_vector3(setpoint, vehicle, 0), parameters.command_speed_max_m_s)
+    heading = present_heading(state.orientation, clip(order.setpoint[order.vehicle, 3], -rate_max, rate_max))
+    velocity = shorten(_vector3(order, 0), parameters.command_speed_max_m_s)
     return velocity_wrench(parameters, state, velocity, wp.vec3d(), wp.vec3d(), wp.vec3d(), heading)
 
 
 @wp.func
-def _position(
-    parameters: Se3Parameters,
-    path: PathArrays,
-    setpoint: wp.array2d[wp.float64],
-    vehicle: int,
-    stamp_ns: wp.int64,
-    state: VehicleState,
-) -> Wrench:
+def _position(parameters: Se3Parameters, order: _Order, state: VehicleState) -> Wrench:
     point = PathPoint()
     limit = parameters.command_position_max_m
-    p = _vector3(setpoint, vehicle, 0)
+    p = _vector3(order, 0)
     point.position = wp.vec3d(clip(p[0], -limit, limit), clip(p[1], -limit, limit), clip(p[2], -limit, limit))
-    point.yaw = setpoint[vehicle, 3]
+    point.yaw = order.setpoint[order.vehicle, 3]
     return point_wrench(parameters, state, point)
 
 
 @wp.func
-def _path(
-    parameters: Se3Parameters,
-    path: PathArrays,
-    setpoint: wp.array2d[wp.float64],
-    vehicle: int,
-    stamp_ns: wp.int64,
-    state: VehicleState,
-) -> Wrench:
-    index = wp.min(vehicle, path.first_knot.shape[0] - 2)  # one path serves all
-    return point_wrench(parameters, state, evaluate_path(path, index, stamp_ns))
+def _path(parameters: Se3Parameters, order: _Order, state: VehicleState) -> Wrench:
+    index = wp.min(order.vehicle, order.path.first_knot.shape[0] - 2)  # one path serves all
+    return point_wrench(parameters, state, evaluate_path(order.path, index, order.stamp_ns))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,10 +157,7 @@ MODES: dict[str, Mode] = {
 def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
     """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time.
 
-    Args:
-        mode: Name of the mode.
-        terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only
-            applies the limits.
+    It compensates the given `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only applies the limits.
 
     Raises:
         ValueError: There is no such mode.
@@ -228,7 +197,12 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
                 force, torque = air_wrench(airframe, wp.vec4d(), linear, air_B, state.body_rate)
                 state.air_acceleration = wp.quat_rotate(state.orientation, force) / parameters.mass_kg
                 state.air_torque = torque
-            wrench = wrench_of(parameters, path, setpoint, vehicle, feedback.stamp_ns[vehicle], state)
+            order = _Order()
+            order.path = path
+            order.setpoint = setpoint
+            order.vehicle = vehicle
+            order.stamp_ns = feedback.stamp_ns[vehicle]
+            wrench = wrench_of(parameters, order, state)
             allocate(
                 matrix,
                 parameters.motors,
@@ -250,9 +224,17 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
 
 
 class Controller:
-    """A controller for a batch of vehicles of one kind, in one command mode; see `make_controller`.
+    """A controller for `count` vehicles of one kind, in one command mode.
 
     It has no memory: a command depends on the present state and setpoint only.
+
+    Args:
+        mode: What a setpoint is; see the table above.
+        vehicle: The vehicle's parameters; the controller knows all of them but the wind.
+        config: Gains and limits.
+        count: Vehicles in the batch.
+        device: Warp device; that of the vehicles.
+        paths: For mode `path`, and only there: one for all, or one for each vehicle.
 
     Attributes:
         mode: Name of the command mode.
@@ -261,31 +243,56 @@ class Controller:
             finite and out of range is clamped where it is read.
         ranges: What the vehicles can be asked for.
         clamped_count: Setpoints out of range that came from the host so far.
+
+    Raises:
+        TypeError: The count is no integer.
+        ValueError: The mode is unknown, paths are missing, superfluous or of the wrong number, or the rotors
+            cannot produce every torque.
     """
 
     def __init__(
         self,
+        mode: CommandMode,
+        vehicle: MultirotorConfig,
+        config: Se3Config | None = None,
         *,
-        mode: str,
-        layout: tuple[str, ...],
-        kernel: Any,
-        model: Sequence[Any],
-        count: int,
-        rotor_count: int,
-        device: Any,
-        ranges: CommandRanges,
+        count: int = 1,
+        device: Any = "cpu",
+        paths: Path | Sequence[Path] | None = None,
     ) -> None:
+        if mode not in MODES:
+            raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
+        if operator.index(count) < 1:
+            raise ValueError(f"count must be >= 1, got {count}")
+        layout = MODES[mode].layout
+        given = [] if paths is None else [paths] if isinstance(paths, Path) else list(paths)
+        if mode == "path" and len(given) not in (1, count):
+            raise ValueError(
+                f"mode 'path' takes one path, or one for each of {count} vehicles, got {len(given)}"
+            )
+        if mode != "path" and given:
+            raise ValueError(f"mode {mode!r} takes setpoints ({', '.join(layout)}), not paths")
+        gains = config or Se3Config()
         self.mode = mode
-        self.ranges = ranges
+        self.layout = layout * vehicle.rotor_count if mode == "motor_speeds" else layout
+        self.ranges = command_ranges(vehicle)
         self.clamped_count = 0
-        self.layout = layout
         self.count = count
-        self.rotor_count = rotor_count
-        self.device = device
-        self.setpoint = wp.zeros((count, len(layout)), dtype=wp.float64, device=device)
-        self._kernel = kernel
-        self._model = list(model)
-        self._bound: tuple[Any, Any] = (None, None)
+        self.rotor_count = vehicle.rotor_count
+        self.device = wp.get_device(device)
+        self.setpoint = wp.zeros((count, len(self.layout)), dtype=wp.float64, device=self.device)
+        matrix = allocation_matrix(vehicle)
+        terms = frozenset(vehicle.terms()).intersection(AIR_TERMS if gains.feed_forward_air else ())
+        self._launch = RecordedLaunch(mode_kernel(mode, terms), self.device, block_dim=BLOCK_DIM)
+        airframe = make_airframe(vehicle, self.device)
+        self._model = [
+            make_parameters(vehicle, gains, matrix),
+            airframe.airframe,
+            airframe.linear_weight,
+            wp.array(matrix, dtype=wp.float64, device=self.device),
+            upload_paths(given, self.device) if given else PathArrays(),
+        ]
+        self._bound: tuple[Any, list[Any]] = (None, [])
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
@@ -301,8 +308,8 @@ class Controller:
             ValueError: If the arrays are of another number of vehicles or rotors, or on another device.
         """
         if self._bound[0] is not arrays:
-            self._bound = (arrays, self._record(arrays))
-        self._bound[1].launch()
+            self._bound = (arrays, self._arguments(arrays))
+        self._launch.launch(self.count, self._bound[1])
 
     def begin(self, mask: Any) -> None:
         """Nothing is remembered."""
@@ -342,8 +349,8 @@ class Controller:
             self.clamped_count += len(beyond)
         return rows
 
-    def _record(self, arrays: Any) -> Any:
-        """Prepare the launch on some arrays."""
+    def _arguments(self, arrays: Any) -> list[Any]:
+        """Return the arguments of the kernel for some arrays."""
         shape = (self.count, self.rotor_count)
         if arrays.rotor_speed.shape != shape or arrays.rotor_speed.device != self.device:
             raise ValueError(
@@ -353,69 +360,4 @@ class Controller:
         feedback = Feedback()
         for name in ("position", "velocity", "orientation", "body_rate", "rotor_speed", "stamp_ns"):
             setattr(feedback, name, getattr(arrays, name))
-        return wp.launch(
-            self._kernel,
-            dim=self.count,
-            inputs=[*self._model, feedback, self.setpoint],
-            outputs=[arrays.rotor_speed_command],
-            device=self.device,
-            block_dim=BLOCK_DIM,
-            record_cmd=True,
-        )
-
-
-def make_controller(
-    mode: CommandMode,
-    vehicle: MultirotorConfig,
-    config: Se3Config | None = None,
-    *,
-    count: int = 1,
-    device: Any = "cpu",
-    paths: Path | Sequence[Path] | None = None,
-) -> Controller:
-    """Return a controller for `count` vehicles of one kind.
-
-    Args:
-        mode: What a setpoint is; see the table above.
-        vehicle: The vehicle's parameters; the controller knows all of them but the wind.
-        config: Gains and limits.
-        count: Vehicles in the batch.
-        device: Warp device; that of the vehicles.
-        paths: For mode `path`, and only there: one for all, or one for each vehicle.
-
-    Raises:
-        TypeError: If the count is no integer.
-        ValueError: If the mode is unknown, paths are missing, superfluous or of the wrong number, or the
-            rotors cannot produce every torque.
-    """
-    if mode not in MODES:
-        raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
-    if operator.index(count) < 1:
-        raise ValueError(f"count must be >= 1, got {count}")
-    given = [] if paths is None else [paths] if isinstance(paths, Path) else list(paths)
-    if mode == "path" and len(given) not in (1, count):
-        raise ValueError(f"mode 'path' takes one path, or one for each of {count} vehicles, got {len(given)}")
-    if mode != "path" and given:
-        raise ValueError(f"mode {mode!r} takes setpoints ({', '.join(MODES[mode].layout)}), not paths")
-    gains = config or Se3Config()
-    matrix = allocation_matrix(vehicle)
-    terms = frozenset(vehicle.terms()) & frozenset(AIR_TERMS) if gains.feed_forward_air else frozenset[str]()
-    layout = MODES[mode].layout
-    place = wp.get_device(device)
-    airframe = make_airframe(vehicle, place)
-    return Controller(
-        mode=mode,
-        layout=layout * vehicle.rotor_count if mode == "motor_speeds" else layout,
-        kernel=mode_kernel(mode, terms),
-        model=[
-            make_parameters(vehicle, gains, matrix),
-            airframe.airframe,
-            airframe.linear_weight,
-            wp.array(matrix, dtype=wp.float64, device=place),
-            upload_paths(given, place) if given else PathArrays(),
-        ],
-        count=count,
-        rotor_count=vehicle.rotor_count,
-        device=place,
-        ranges=command_ranges(vehicle),
-    )
+        return [*self._model, feedback, self.setpoint, arrays.rotor_speed_command]

@@ -76,50 +76,28 @@ class Se3Config(Settings):
 class Se3Parameters:
     """Vehicle, gains and limits, as kernels take them; see `Se3Config` for the gains."""
 
-    mass_kg: wp.float64
-    """Mass [kg]."""
-    gravity_m_s2: wp.float64
-    """Gravity [m/s^2]."""
-    inertia: wp.mat33d
-    """Inertia about the centre of mass, in B [kg m^2]."""
-    thrust_max_m_s2: wp.float64
-    """Highest collective thrust over mass [m/s^2]."""
-    motors: Motors
-    """Limits of the motors."""
-    position_per_velocity_per_s: wp.float64
-    """Position gain over velocity gain [1/s]."""
-    velocity_gain_per_s: wp.float64
-    """Acceleration per velocity error [1/s]."""
-    attitude_gain: wp.vec3d
-    """About the body axes [1/s^2]."""
-    rate_gain: wp.vec3d
-    """About the body axes [1/s]."""
-    speed_max_m_s: wp.float64
-    """Highest correcting velocity [m/s]."""
-    acceleration_max_m_s2: wp.float64
-    """Highest correcting acceleration [m/s^2]."""
-    body_rate_max_rad_s: wp.float64
-    """Highest body rate asked for [rad/s]."""
-    command_thrust_max_n: wp.float64
-    """Highest collective thrust that a command may ask for [N]."""
-    command_speed_max_m_s: wp.float64
-    """Highest speed that a command may ask for [m/s]."""
-    command_rate_max_rad_s: wp.float64
-    """Highest body or yaw rate that a command may ask for [rad/s]."""
-    command_position_max_m: wp.float64
-    """Largest coordinate that a command may ask for [m]."""
+    mass_kg: wp.float64  # Mass [kg]
+    gravity_m_s2: wp.float64  # Gravity [m/s^2]
+    inertia: wp.mat33d  # Inertia about the centre of mass, in B [kg m^2]
+    thrust_max_m_s2: wp.float64  # Highest collective thrust over mass [m/s^2]
+    motors: Motors  # Limits of the motors
+    position_per_velocity_per_s: wp.float64  # Position gain over velocity gain [1/s]
+    velocity_gain_per_s: wp.float64  # Acceleration per velocity error [1/s]
+    attitude_gain: wp.vec3d  # About the body axes [1/s^2]
+    rate_gain: wp.vec3d  # About the body axes [1/s]
+    speed_max_m_s: wp.float64  # Highest correcting velocity [m/s]
+    acceleration_max_m_s2: wp.float64  # Highest correcting acceleration [m/s^2]
+    body_rate_max_rad_s: wp.float64  # Highest body rate asked for [rad/s]
+    command_thrust_max_n: wp.float64  # Highest collective thrust that a command may ask for [N]
+    command_speed_max_m_s: wp.float64  # Highest speed that a command may ask for [m/s]
+    command_rate_max_rad_s: wp.float64  # Highest body or yaw rate that a command may ask for [rad/s]
+    command_position_max_m: wp.float64  # Largest coordinate that a command may ask for [m]
 
 
 def make_parameters(
     vehicle: MultirotorConfig, config: Se3Config, matrix: NDArray[np.float64]
 ) -> Se3Parameters:
-    """Return what kernels need to know of a vehicle and its gains.
-
-    Args:
-        vehicle: The vehicle.
-        config: Gains and limits.
-        matrix: See `allocation_matrix`.
-    """
+    """Return what kernels need to know of a vehicle, its gains and its `allocation_matrix`."""
     parameters = Se3Parameters()
     parameters.mass_kg = vehicle.mass_kg
     parameters.gravity_m_s2 = vehicle.gravity_m_s2
@@ -152,14 +130,10 @@ def make_parameters(
 class VehicleState:
     """State of one vehicle."""
 
-    position: wp.vec3d
-    """p_WB [m]."""
-    velocity: wp.vec3d
-    """v_WB in W [m/s]."""
-    orientation: wp.quatd
-    """q_WB, xyzw."""
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
+    position: wp.vec3d  # p_WB [m]
+    velocity: wp.vec3d  # v_WB in W [m/s]
+    orientation: wp.quatd  # q_WB, xyzw
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
     air_acceleration: wp.vec3d
     """What the air is known to add to the acceleration, in W [m/s^2]; 0 where it is not compensated."""
     air_torque: wp.vec3d
@@ -170,10 +144,8 @@ class VehicleState:
 class Wrench:
     """What the rotors are asked for."""
 
-    thrust_N: wp.float64
-    """Collective thrust along z_B [N]."""
-    torque: wp.vec3d
-    """Torque in B [N m]."""
+    thrust_N: wp.float64  # Collective thrust along z_B [N]
+    torque: wp.vec3d  # Torque in B [N m]
 
 
 @wp.func
@@ -241,16 +213,10 @@ def rate_wrench(
     body_rate: wp.vec3d,
     angular_acceleration: wp.vec3d,
 ) -> Wrench:
-    """Return the wrench that closes on a body rate; the lowest level, used by all above.
+    """Return the wrench that closes on a body rate [rad/s]; the lowest level, used by all above.
 
-    The rate error then obeys e' + rate_gain e = 0.
-
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        thrust_N: Collective thrust [N].
-        body_rate: Rate to close on, in B [rad/s].
-        angular_acceleration: Angular acceleration to have at no rate error, in B [rad/s^2].
+    The rate error then obeys e' + rate_gain e = 0; without one the angular acceleration is that given
+    [rad/s^2].
     """
     w = state.body_rate
     wrench = Wrench()
@@ -267,14 +233,7 @@ def rate_wrench(
 def attitude_wrench(
     parameters: Se3Parameters, state: VehicleState, thrust_N: wp.float64, reference: AttitudeReference
 ) -> Wrench:
-    """Return the wrench that closes on a moving attitude.
-
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        thrust_N: Collective thrust [N].
-        reference: Attitude, rate and angular acceleration of the desired frame D.
-    """
+    """Return the wrench of a thrust [N] that closes on a moving attitude."""
     q_DB = wp.quat_inverse(reference.orientation) * state.orientation
     sign = _TWO
     if q_DB[3] < _ZERO:
@@ -298,13 +257,7 @@ def thrust_wrench(
 ) -> Wrench:
     """Return the wrench that turns the rotors' thrust to where it gives an acceleration, and gives it.
 
-    Args:
-        parameters: Vehicle and gains.
-        state: Present state.
-        acceleration: Acceleration to have, in W [m/s^2].
-        jerk: Its time derivative [m/s^3].
-        snap: Its second time derivative [m/s^4].
-        heading: Where to look.
+    Acceleration, jerk and snap are in W [m/s^2, m/s^3, m/s^4].
     """
     thrust = reachable_thrust(
         acceleration - state.air_acceleration + wp.vec3d(_ZERO, _ZERO, parameters.gravity_m_s2),

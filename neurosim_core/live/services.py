@@ -14,8 +14,9 @@ from typing import Any
 
 from cortex import Node
 from cortex.messages import Parameters, SimulatorReply, Step
-from neurosim_core.config import ConfigError, SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live.topics import SERVICES, STEP_DEADLINE_S
+from neurosim_core.settings_file import ConfigError
 
 ANSWER_DEADLINE_S = 30.0
 """How long a request waits for its answer [s]."""
@@ -44,12 +45,7 @@ def change_parameters(
 ) -> SimulationConfig:
     """Return a configuration with other values.
 
-    Args:
-        config: The settings that hold.
-        values: New values by dotted key; see `CHANGEABLE`.
-
-    Raises:
-        ValueError: A key cannot be changed during a run, or a value is not allowed.
+    `values`: new values by dotted key; see `CHANGEABLE`.
     """
     for key, value in values.items():
         if not any(pattern.fullmatch(key) for pattern in _PATTERNS):
@@ -175,12 +171,8 @@ class Services:
     ) -> None:
         """Offer the services.
 
-        Args:
-            node: For all but `/step`.
-            step_node: For `/step`.
-            config: Returns the settings that hold.
-            state: Returns simulated time [ns] and phase.
-            on_request: Called from other threads when there is something to `take`.
+        `node`: for all but `/step`. `step_node`: for `/step`. `state`: returns simulated time [ns] and phase.
+        `on_request`: called from other threads when there is something to `take`.
         """
         self._config = config
         self._state = state

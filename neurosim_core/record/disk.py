@@ -24,17 +24,8 @@ class Disk:
         self._sealed_size = 0
         self._held: dict[tuple[int, int], bytes] = {}
 
-    @property
-    def failed(self) -> bool:
-        """Whether a write has failed."""
-        return self._error is not None
-
     def seal(self) -> None:
-        """Bring what was held back to disk.
-
-        Raises:
-            OSError: A write has failed.
-        """
+        """Bring what was held back to disk."""
         for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
             self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
         self._held.clear()
@@ -48,13 +39,12 @@ class Disk:
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move, as a file object does."""
-        begin = {
-            os.SEEK_SET: 0,
-            os.SEEK_CUR: self._offset,
-            os.SEEK_END: os.fstat(self._file.fileno()).st_size,
-        }
-        self._offset = begin[whence] + offset
-        return self._offset
+        if whence == os.SEEK_CUR:
+            offset += self._offset
+        elif whence == os.SEEK_END:
+            offset += os.fstat(self._file.fileno()).st_size
+        self._offset = offset
+        return offset
 
     def tell(self) -> int:
         """Return the place, as a file object does."""

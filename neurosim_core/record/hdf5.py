@@ -37,12 +37,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType, TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,22 +63,26 @@ DSEC_NAMES = {"t": "events/t", "x": "events/x", "y": "events/y", "polarity": "ev
 LARGE_ROW_BYTES = 4096
 """Rows of at least this size, such as pictures, are stored and read one at a time."""
 
-_FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never reads back
+_FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache
 _ROW_CHUNK = 1024
+_KEPT_ROWS = 16384
+"""Arrays of varying length are kept, not copied, from this length on. A shorter one may be a small part of a
+large block of memory, which it would hold."""
 _FIRST_FLUSH_BYTES = 65536
 _ATTRIBUTE_MAX_BYTES = 60000
-_DEFLATE_THREADS = 8
+_DEFLATE_THREADS_MAX = 16
 
 
 class RecordingWriter:
     """Writes packets to a file while they are measured. A context manager.
 
-    Packets of one sensor must come in the order of their stamps. Arrays are copied, so a caller may reuse its
-    buffers. The first flushes come early, so that a disk that is full soon still holds most of what came.
+    Packets of one sensor must come in the order of their stamps. Pictures and small arrays are copied; long
+    arrays of varying length, as those of events, are read later and must not change. The first flushes come
+    early, so that a disk that is full soon still holds most of what came.
 
-    Compression is gzip with shuffle, by ISA-L where that is installed, in threads: 35 to 52 M events/s on
-    16 cores, 2.8 to 3.3 of 13 bytes left; zlib takes five times as long for the same size. Blosc with zstd is
-    not faster, and nobody could read the file without its plug-in.
+    Threads compress each chunk as soon as it is full (gzip with shuffle, by ISA-L where that is installed),
+    and one more thread writes to the file. `write` waits only where that is `buffer_bytes` behind. What goes
+    wrong there is raised by the next call.
     """
 
     def __init__(
@@ -85,7 +91,7 @@ class RecordingWriter:
         header: RecordingHeader,
         *,
         flush_interval_s: float = 1.0,
-        buffer_bytes: int = 8_000_000,
+        buffer_bytes: int = 64_000_000,
     ) -> None:
         """Create the file, replacing one that exists.
 
@@ -93,7 +99,8 @@ class RecordingWriter:
             path: The file; its folder must exist.
             header: What goes with the packets.
             flush_interval_s: Longest wall-clock time between two flushes [s]; checked when a packet comes.
-            buffer_bytes: Flush when the packets in memory exceed this size.
+            buffer_bytes: Flush when the packets that came since the last flush exceed this size. As many may
+                still be in the hands of that flush.
 
         Raises:
             OSError: The file cannot be created.
@@ -104,12 +111,16 @@ class RecordingWriter:
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, _Stream] = {}
-        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS, os.cpu_count() or 1), "deflate")
+        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS_MAX, os.cpu_count() or 1), "deflate")
         self._order = 0
         self._newest_ns = 0
         self.kept_ns = 0
         """The file holds the packets up to this stamp, whatever happens [ns]."""
-        self._pending_bytes = 0
+        self._pending_bytes = self._flushing_bytes = 0
+        self._flushing: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._is_told = False
+        """Whether the failure was raised."""
         self._flushed_bytes = 4 * _FIRST_FLUSH_BYTES
         self._flushed_s = time.monotonic()
         try:
@@ -132,8 +143,8 @@ class RecordingWriter:
 
     @property
     def pending_bytes(self) -> int:
-        """Size of the packets that are in memory and not yet in the file [bytes]."""
-        return self._pending_bytes
+        """Size of the packets that are not yet in the file [bytes]."""
+        return self._pending_bytes + self._flushing_bytes
 
     def write(self, packet: Packet) -> None:
         """Add one packet.
@@ -144,13 +155,16 @@ class RecordingWriter:
                 class, a constant or a fixed shape has changed; or it has no sensor name.
             TypeError: A field of the packet's class is of a type that cannot be recorded.
         """
+        is_flushing = self._flushing is not None and self._flushing.is_alive()
+        if not is_flushing:
+            self._finish_flush()
         stream = self._streams.get(packet.sensor) or self._open_stream(packet)
         self._pending_bytes += stream.append(packet, self._order)
         self._order += 1
         self._newest_ns = max(self._newest_ns, packet.stamp_ns)
-        due = time.monotonic() - self._flushed_s >= self._flush_interval_s
-        if due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes // 4):
-            self.flush()
+        is_due = not is_flushing and time.monotonic() - self._flushed_s >= self._flush_interval_s
+        if is_due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes // 4):
+            self._begin_flush()
 
     def flush(self) -> None:
         """Bring everything that was written so far into the file.
@@ -158,20 +172,8 @@ class RecordingWriter:
         Raises:
             OSError: The disk is full or gone.
         """
-        for stream in self._streams.values():
-            stream.begin_rows(self._pool)
-        for stream in self._streams.values():
-            stream.write_rows()
-        self._file.flush()
-        self._disk.seal()
-        for stream in self._streams.values():
-            stream.commit()
-        self._file.flush()
-        self._disk.seal()
-        self.kept_ns = self._newest_ns
-        self._flushed_bytes += self._pending_bytes
-        self._pending_bytes = 0
-        self._flushed_s = time.monotonic()
+        self._begin_flush()
+        self._finish_flush()
 
     def close(self, *, complete: bool = True) -> None:
         """Write what is left, and mark the file as complete unless it is not. Closing twice is allowed.
@@ -185,7 +187,7 @@ class RecordingWriter:
         if not self._file:
             return
         try:
-            if not self._disk.failed:  # a failure is reported once
+            if not self._is_told:  # a failure is reported once
                 for stream in self._streams.values():
                     stream.finish()
                 self.flush()
@@ -209,12 +211,53 @@ class RecordingWriter:
             with contextlib.suppress(OSError):
                 self.close()
 
+    def _begin_flush(self) -> None:
+        """Let a thread write everything that came. A daemon: a disk that hangs must not hold up the exit."""
+        self._finish_flush()
+        for stream in self._streams.values():
+            stream.take()
+        self._flushing_bytes, self._pending_bytes = self._pending_bytes, 0
+        self._flushed_bytes += self._flushing_bytes
+        self._flushed_s = time.monotonic()
+        self._flushing = threading.Thread(
+            target=self._flush,
+            args=([*self._streams.values()], self._newest_ns),
+            name="recording",
+            daemon=True,
+        )
+        self._flushing.start()
+
+    def _finish_flush(self) -> None:
+        """Wait for the flush that is under way, and raise what went wrong."""
+        if self._flushing is not None:
+            self._flushing.join()
+            self._flushing = None
+            self._flushing_bytes = 0
+        if self._failure is not None:
+            self._is_told = True
+            raise self._failure
+
+    def _flush(self, streams: list[_Stream], newest_ns: int) -> None:
+        try:
+            for stream in streams:
+                stream.write_rows()
+            self._file.flush()
+            self._disk.seal()
+            for stream in streams:
+                stream.commit()
+            self._file.flush()
+            self._disk.seal()
+            self.kept_ns = newest_ns
+        except Exception as error:  # raised by `_finish_flush`
+            self._failure = error
+
     def _open_stream(self, packet: Packet) -> _Stream:
         name = packet.sensor
         if not name or "/" in name:
             raise ValueError(f"a packet needs a sensor name without '/', got {name!r}")
+        self._finish_flush()  # which would otherwise find half of a stream
         group = self._described.get(name) or self._file["sensors"].require_group(name)
-        stream = self._streams[name] = _Stream(group, packet)
+        stream = self._streams[name] = _Stream(group, packet, self._pool)
         if isinstance(packet, Events) and self._root_camera in (None, name):
             self._root_camera = name
             for key in ("events", "ms_to_idx", "t_offset"):
@@ -226,7 +269,15 @@ class _Column:
     """One array of the file that grows by rows, with the rows that are not yet in it."""
 
     def __init__(
-        self, group: Any, name: str, shape: tuple[int, ...], dtype: Any, *, chunk: int, compressed: bool
+        self,
+        group: Any,
+        name: str,
+        shape: tuple[int, ...],
+        dtype: Any,
+        *,
+        chunk: int,
+        compressed: bool,
+        pool: ThreadPoolExecutor,
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
@@ -235,58 +286,87 @@ class _Column:
             name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
         )
         self._shape = shape
+        self._chunk = chunk
+        self._pool = pool
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
+        self._deflates = compressed and self._dtype.kind != "O" and 0 not in shape
         self._rows: list[NDArray[Any]] = []
-        self._deflates = compressed and self._dtype.kind != "O"
-        self._last_chunk = np.empty((0, *shape), self._dtype)  # as far as it is filled, if that deflates
-        self._deflated: list[tuple[tuple[int, ...], Future[bytes]]] = []
+        """What came since the last flush; if that deflates, what the last chunk holds so far."""
+        self._begin = self._end = self._flushed_end = 0
+        """Where they begin and end, and where the last flush ended."""
+        self._deflated: list[tuple[int, Future[list[bytes]]]] = []
+        """Chunks that are not in the file, by their first row."""
+        self._taken: _Taken | None = None
 
     def append(self, rows: Any) -> int:
+        """Add rows, and let the pool compress the chunks that are full; return their size [bytes]."""
+        is_copied = not self._deflates or len(rows) < _KEPT_ROWS
         count = len(rows) if 0 in self._shape else -1
         block = (
-            np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(count, *self._shape)
-        )  # a copy
+            np.asarray(rows)
+            .astype(self._dtype, casting="same_kind", copy=is_copied)
+            .reshape(count, *self._shape)
+        )
         self._rows.append(block)
+        self._end += len(block)
+        left = (self._end - self._begin) % self._chunk
+        if self._deflates and self._end - self._begin >= self._chunk:
+            self._rows[-1], rest = np.split(block, [len(block) - left])
+            self._deflate()
+            self._rows = [rest.copy() if left < _KEPT_ROWS else rest]
+            self._begin = self._end - left
         return block.nbytes
 
-    def begin_rows(self, pool: ThreadPoolExecutor) -> None:
-        """Make room for the rows that came since the last flush, and let the pool compress them."""
-        if not self._rows:
+    def take(self) -> None:
+        """Set aside for `write_rows` what came since the last flush."""
+        if self._end == self._flushed_end:
             return
-        begin = self._dataset.shape[0]
-        rows = (
-            np.concatenate([self._last_chunk, *self._rows]) if self._deflates else np.concatenate(self._rows)
-        )
-        self._rows = []
-        begin_of_chunk = begin - len(self._last_chunk)
-        self._dataset.resize(begin_of_chunk + rows.shape[0], axis=0)
+        if self._deflates:
+            self._rows = [np.concatenate(self._rows)]  # lets go of what they are part of
+            if len(self._rows[0]):
+                self._deflate()
+        self._taken = _Taken(self._rows, self._begin, self._end, self._deflated)
+        self._deflated, self._flushed_end = [], self._end
         if not self._deflates:
-            if rows.size:
-                self._dataset[begin:] = rows
-            return
-        length, *room = self._dataset.chunks
-        filled = len(rows) % length
-        self._last_chunk = rows[len(rows) - filled :].copy()  # it may grow later
-        for first in range(0, len(rows) if rows.size else 0, length):
-            place = (begin_of_chunk + first, *[0] * len(room))
-            self._deflated.append((place, pool.submit(_deflate, rows[first : first + length], length)))
+            self._rows, self._begin = [], self._end
 
     def write_rows(self) -> None:
-        """Write what the pool has compressed."""
-        for place, chunk in self._deflated:
-            self._dataset.id.write_direct_chunk(place, chunk.result())
-        self._deflated = []
+        """Write what was set aside; from another thread."""
+        if self._taken is None:
+            return
+        rows, begin, end, deflated = self._taken
+        self._taken = None
+        self._dataset.id.set_extent((end, *self._shape))
+        for first, chunks in deflated:
+            for number, chunk in enumerate(chunks.result()):
+                place = (first + number * self._chunk, *[0] * len(self._shape))
+                self._dataset.id.write_direct_chunk(place, chunk)
+        if not self._deflates and 0 not in self._shape:
+            self._dataset[begin:] = np.concatenate(rows)
+
+    def _deflate(self) -> None:
+        self._deflated.append((self._begin, self._pool.submit(_deflate, (*self._rows,), self._chunk)))
+
+
+class _Taken(NamedTuple):
+    """Rows of a column that are to be written, or those chunks of them that deflate."""
+
+    rows: list[NDArray[Any]]
+    begin: int
+    end: int
+    deflated: list[tuple[int, Future[list[bytes]]]]
 
 
 class _Stream:
     """The packets of one sensor in the file."""
 
-    def __init__(self, group: Any, first: Packet) -> None:
+    def __init__(self, group: Any, first: Packet, pool: ThreadPoolExecutor) -> None:
         self._group = group
+        self._pool = pool
         self._type = type(first)
         self._columns: dict[str, _Column] = {}
         self._last_ns: int | None = None
-        self._written = 0
+        self._written = self._taken_count = 0
         schema = schema_of(self._type)
         self._fields = schema.fields
         for name in (field.name for field in schema.fields):
@@ -343,9 +423,11 @@ class _Stream:
         self._written += 1
         return size
 
-    def begin_rows(self, pool: ThreadPoolExecutor) -> None:
+    def take(self) -> None:
+        """Set aside for `write_rows` and `commit` what came since the last flush."""
         for column in self._columns.values():
-            column.begin_rows(pool)
+            column.take()
+        self._taken_count = self._written
 
     def write_rows(self) -> None:
         for column in self._columns.values():
@@ -353,7 +435,7 @@ class _Stream:
 
     def commit(self) -> None:
         """Declare what is in the file as complete."""
-        self._packet_count[()] = self._written
+        self._packet_count[()] = self._taken_count
 
     def finish(self) -> None:
         """End the millisecond index one entry after the last event: windows up to the end can be read."""
@@ -361,7 +443,9 @@ class _Stream:
             self._columns["ms_to_idx"].append(np.array([self._ends["event"]], dtype=np.uint64))
 
     def _add_rows(self, name: str, dtype: Any) -> None:
-        self._columns[name] = _Column(self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False)
+        self._columns[name] = _Column(
+            self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False, pool=self._pool
+        )
 
     def _add_field(self, field: FieldSchema, value: NDArray[Any]) -> None:
         path = DSEC_NAMES.get(field.name, field.name) if issubclass(self._type, Events) else field.name
@@ -376,7 +460,7 @@ class _Stream:
         elif count * value.dtype.itemsize >= LARGE_ROW_BYTES:
             chunk, compressed = 1, True
         self._columns[field.name] = _Column(
-            self._group, path, shape, dtype, chunk=chunk, compressed=compressed
+            self._group, path, shape, dtype, chunk=chunk, compressed=compressed, pool=self._pool
         )
 
     def _values(self, packet: Packet) -> dict[str, NDArray[Any]]:
@@ -463,11 +547,7 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
 
 
 def import_h5py() -> ModuleType:
-    """Return the module `h5py`.
-
-    Raises:
-        ImportError: It is not installed; the message says what to install.
-    """
+    """Return the module `h5py`."""
     try:
         import h5py
     except ImportError as error:
@@ -475,10 +555,19 @@ def import_h5py() -> ModuleType:
     return h5py
 
 
-def _deflate(rows: NDArray[Any], length: int) -> bytes:
-    """Return what HDF5's filters shuffle and gzip would make of a chunk of so many rows, faster."""
-    if len(rows) < length:
-        rows = np.concatenate([rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)])
-    shuffled = rows.reshape(-1, 1).view(np.uint8).T.tobytes()
-    deflated: bytes = (import_isal() or zlib).compress(shuffled, 1)
-    return deflated
+def _deflate(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
+    """Return what HDF5's filters shuffle and gzip would make of chunks of so many rows, faster.
+
+    The last chunk is filled up with zeros.
+    """
+    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    octets = np.ascontiguousarray(rows).reshape(-1, 1).view(np.uint8)
+    size = length * (rows.size // len(rows))
+    compress = (import_isal() or zlib).compress
+    chunks = []
+    for first in range(0, len(octets), size):
+        chunk = octets[first : first + size]
+        planes = np.zeros((chunk.shape[1], size), np.uint8)
+        planes[:, : len(chunk)] = chunk.T
+        chunks.append(compress(planes, 1))
+    return chunks

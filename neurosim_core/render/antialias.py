@@ -380,12 +380,8 @@ def antialiasing_kernels(
 ) -> tuple[wp.Kernel, ...]:
     """Return the kernels of the second pass: one on a CPU, three on CUDA (`antialias_groups.py`).
 
-    Their parameters: the index of the first thread; what `Antialiasing.launch` takes.
-
-    Args:
-        outputs: Outputs of the renderer, of which those in `RADIANCE` are written.
-        terms: Terms of the first pass.
-        is_cuda: Whether it is for CUDA.
+    Their parameters: the index of the first thread; what `Antialiasing.launch` takes. Of the outputs those in
+    `RADIANCE` are written; terms are those of the first pass.
     """
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
     if is_cuda:
@@ -416,15 +412,10 @@ class Antialiasing:
         thread_count: int | None,
         pixel_count: int,
     ) -> None:
-        """Choose the kernels and allocate what they share.
+        """Choose the kernels and allocate what they share, for launches of at most `pixel_count` pixels.
 
-        Args:
-            rays: `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4].
-            outputs: Outputs of the renderer.
-            terms: Terms of the first pass.
-            device: Where to render.
-            thread_count: Threads on a CPU device; all cores if None.
-            pixel_count: The most pixels of a launch.
+        Rays are `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4]; terms are those of
+        the first pass.
         """
         self._device, self._thread_count = device, thread_count
         is_cuda = wp.get_device(device).is_cuda
@@ -443,16 +434,7 @@ class Antialiasing:
         *,
         pixel_count: int,
     ) -> None:
-        """Write the light of the pixels.
-
-        Args:
-            scene: As for the first pass, as the next three.
-            view: Rays and poses.
-            bodies: Bodies that move.
-            worlds: Worlds that are rendered together.
-            out: Outputs of the first pass, which include the faces.
-            pixel_count: Pixels of the first pass: those of all tiles, instants and worlds.
-        """
+        """Write the light of the pixels of all tiles, instants and worlds; `out` has the faces."""
         inputs = [scene, view, bodies, worlds, self._rays]
         if self._lists is None:
             launch_split(

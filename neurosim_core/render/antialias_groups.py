@@ -147,16 +147,12 @@ class PixelPlace:
     world: int
     instant: int
     slot: int
-    left: int
-    """Column of the first pixel of the block."""
-    top: int
-    """Row of the first pixel of the block."""
+    left: int  # Column of the first pixel of the block
+    top: int  # Row of the first pixel of the block
     row: int
     col: int
-    outside: wp.bool
-    """The pixel is not in the picture."""
-    ray: int
-    """Index of its ray in a layer."""
+    outside: wp.bool  # The pixel is not in the picture
+    ray: int  # Index of its ray in a layer
 
 
 def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:

@@ -71,14 +71,7 @@ class BlindPixels:
         stride: int,
         dark_floor: float,
     ) -> None:
-        """Bring them to the device.
-
-        Args:
-            lenses: All of one size.
-            lens_of_world: Index of the lens of each world, device array of int32, shape [N].
-            stride: K, the most instants of a world per launch.
-            dark_floor: Radiance before the logarithm where there is no light.
-        """
+        """Bring them to the device; lenses are of one size, and each world has at most `stride` instants."""
         masks = [lens.blind_pixels() for lens in lenses]
         found = [np.zeros((0, 2), int) if mask is None else np.argwhere(mask) for mask in masks]
         self.count = max(map(len, found))
@@ -91,13 +84,7 @@ class BlindPixels:
         self._model = [places, lens_of_world, stride, float(np.log(dark_floor))]
 
     def darken(self, image_slot: Any, out: RenderOutputs, *, instant_count: int) -> None:
-        """Write what a pixel is that sees nothing: black, infinitely far, no surface.
-
-        Args:
-            image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
-            out: What was rendered.
-            instant_count: How many of the K instants of each world.
-        """
+        """Write what a pixel is that sees nothing: black, infinitely far, no surface."""
         if self.count:
             dim = self._lens_of_world.shape[0] * instant_count * self.count
             inputs = [*self._model, instant_count, image_slot]

@@ -26,10 +26,8 @@ class BlockLists:
     its blocks; the first instant; a bit for each of the two."""
     unresolved: wp.array[wp.vec2i]
     """Those with pixels that have to be rendered by rays, and a bit for each of these."""
-    count: wp.array[int]
-    """Length of the two lists, and how many entries of the first are taken."""
-    threads: int
-    """Threads of the kernel that goes through the second one."""
+    count: wp.array[int]  # Length of the two lists, and how many entries of the first are taken
+    threads: int  # Threads of the kernel that goes through the second one
 
 
 def make_lists(block_count: int, device: Any) -> BlockLists:

@@ -24,20 +24,14 @@ _SPHERE_MARGIN = 1.01
 class BodyData:
     """The arrays of bodies that the kernel reads; empty without bodies."""
 
-    mesh: wp.array[wp.uint64]
-    """Trees, each in the frame O of its body, shape [B]."""
-    first_face: wp.array[int]
-    """First face of each body in the arrays of `SceneData`, shape [B]."""
+    mesh: wp.array[wp.uint64]  # Trees, each in the frame O of its body, shape [B]
+    first_face: wp.array[int]  # First face of each body in the arrays of `SceneData`, shape [B]
     corner_normal: wp.array[wp.vec3]
     """Shading normals in O, on the front of the face, of all bodies one after another, shape [3F]."""
-    shading: wp.uint64
-    """What of the scene casts shadows on bodies; 0 if nothing does."""
-    p_OC: wp.array2d[wp.vec3]
-    """Position of the camera [m], shape [K, B]."""
-    q_OC: wp.array2d[wp.quat]
-    """Orientation of the camera, shape [K, B]."""
-    sphere_C: wp.array2d[wp.vec4]
-    """Centre and radius of a sphere around the body [m], shape [K, B]."""
+    shading: wp.uint64  # What of the scene casts shadows on bodies; 0 if nothing does
+    p_OC: wp.array2d[wp.vec3]  # Position of the camera [m], shape [K, B]
+    q_OC: wp.array2d[wp.quat]  # Orientation of the camera, shape [K, B]
+    sphere_C: wp.array2d[wp.vec4]  # Centre and radius of a sphere around the body [m], shape [K, B]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,13 +49,7 @@ class JoinedBodies:
 
 
 def join_bodies(bodies: Sequence[Body], *, material_count: int, instance_count: int) -> JoinedBodies:
-    """Put the faces of bodies one after another.
-
-    Args:
-        bodies: May be none.
-        material_count: Materials of the scene.
-        instance_count: Instances of the scene.
-    """
+    """Put the faces of bodies, if any, one after another, behind the materials and instances of the scene."""
     solids = [body.solid for body in bodies]
     vertex = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     material = material_count + np.cumsum([0, *(len(solid.materials) for solid in solids)])
@@ -112,15 +100,7 @@ def upload_bodies(
     shading: wp.Mesh | None,
     device: str,
 ) -> BodyArrays:
-    """Bring bodies to a device and build their trees.
-
-    Args:
-        bodies: At least one.
-        joined: Their faces.
-        scene_face_count: Faces of the scene, whose arrays those of the bodies follow.
-        shading: What of the scene casts shadows on bodies.
-        device: Where to.
-    """
+    """Bring bodies to a device and build their trees; `shading` of the scene casts shadows on them."""
     meshes = tuple(
         wp.Mesh(
             wp.array(body.solid.vertices, dtype=wp.vec3, device=device),
@@ -195,14 +175,7 @@ def place_camera(
     """Write where the camera is in the frames of the bodies at the first `instant_count` of K instants.
 
     Computed in float64 and rounded once: a body far from the origin of the world is seen as sharply.
-
-    Args:
-        arrays: The bodies.
-        poses: Where they are.
-        p_WC: Positions of the camera [m], shape [K].
-        q_WC: Orientations of the camera, xyzw, shape [K].
-        instant_count: How many instants to use.
-        data: Its arrays [K, B] are overwritten.
+    Positions [m] and orientations have shape [K]; the arrays [K, B] of `data` are overwritten.
     """
     wp.launch(
         _place_camera,

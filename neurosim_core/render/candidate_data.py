@@ -19,21 +19,16 @@ class CandidateListData:
     The structure is empty in kernels that do not use lists.
     """
 
-    instants: int
-    """M: consecutive instants that share a list."""
-    limit: int
-    """Capacity of a list."""
+    instants: int  # M: consecutive instants that share a list
+    limit: int  # Capacity of a list
     faces: wp.array[int]
     """The lists, shape [group, tile, limit], flattened; group g holds the instants from M g on."""
     count: wp.array2d[int]
     """Length of each list, shape [group, tile]; -1: there is none, rays traverse the tree."""
-    reach: wp.array2d[float]
-    """Distance up to which a list is complete [m], shape [group, tile]."""
+    reach: wp.array2d[float]  # Distance up to which a list is complete [m], shape [group, tile]
     bounds: wp.array[wp.vec4]
     """Least and largest x / z, least and largest y / z of the rays of a tile in C, shape [tile]."""
-    unresolved: wp.array[int]
-    """Pixels for the fallback kernel, in any order; empty on a CPU."""
+    unresolved: wp.array[int]  # Pixels for the fallback kernel, in any order; empty on a CPU
     unresolved_count: wp.array[int]
     """Number of unresolved pixels, including those that the array has no room for, shape [1]."""
-    fallback_threads: int
-    """Number of threads of the fallback kernel."""
+    fallback_threads: int  # Number of threads of the fallback kernel

@@ -30,17 +30,14 @@ from neurosim_core.render.candidate_data import UNRESOLVED
 def candidate_intersector(group: int) -> wp.Function:
     """Return the Warp function that intersects the ray of a pixel with a candidate list at several instants.
 
-    It returns a vector of `group` integers: for each instant the face that the ray hits first; -1: none;
-    UNRESOLVED. On CUDA the 64 threads of a block, the pixels of a tile, call it together and share the set-up
-    of triangles.
+    It returns a vector of `group` integers, a divisor of 64: for each instant the face that the ray hits
+    first; -1: none; UNRESOLVED. On CUDA the 64 threads of a block, the pixels of a tile, call it together and
+    share the set-up of triangles.
 
     Its parameters: the mesh; the lists; begin and length of the tile's list (length -1: no list); the
     distance up to which the list is complete, and the distance that counts as infinite [m];
     `CandidateListData.bounds` of the tile; positions [m] and orientations of the camera in W; the first
     instant and the number of instants; the direction of the pixel's ray in C, of unit length.
-
-    Args:
-        group: Most instants of a call; a divisor of 64.
     """
     found = wp.types.vector(length=group, dtype=int)
 
@@ -79,17 +76,7 @@ def intersect_tile(
 ):
     """Intersect all 64 rays of a tile at one instant with its list; for CPU kernels, vectorised over rays.
 
-    Args:
-        id: The mesh.
-        faces: Lists.
-        begin: Where the list of the tile begins.
-        count: Length of the list; -1: there is none.
-        reach: Distance up to which the list is complete [m].
-        far_m: Distance that counts as infinite [m].
-        bounds: `CandidateListData.bounds` of the tile.
-        q: Orientation of the camera in W.
-        origin: Of the rays, in W [m].
-        rays: Their directions in W, of unit length.
-        face_out: The face that each ray hits first; -1: none; or UNRESOLVED.
+    See `candidate_intersector`; rays are in W. It writes the face that each ray hits first; -1: none;
+    UNRESOLVED.
     """
     ...

@@ -42,13 +42,10 @@ _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
 _AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 6.0e-3))
 """Least number of instants, and largest pixel [rad] for which lists pay: with fewer instants, or with fewer
-tiles of larger pixels, the search takes as long as it saves. Measured on an H200, 240x180 to 1280x720, in a
-house of 145,844 triangles, and with tests of a third more time in halls of 20,000 to 2 million."""
+tiles of larger pixels, the search takes as long as it saves."""
 _AUTO_FACES_MAX = 7.0
 """Largest product of the number of triangles, as cut for the light, and the solid angle of a pixel [sr] for
-which lists pay. In that house it is 6.6 at 346x260, where a frame's first pass takes 11.7 us with lists and
-13.1 without, and with each triangle cut into four 5.6 at 640x480 (24 and 39 us) and 19 at 346x260 (14.3 and
-13.3)."""
+which lists pay."""
 _UNRESOLVED_SHARE = 8
 """One in so many pixels may be unresolved; if there are more, the fallback kernel renders all pixels."""
 _THREADS_PER_MULTIPROCESSOR = 1280
@@ -65,12 +62,7 @@ def choose_candidate_lists(
 ) -> CandidateListConfig | None:
     """Return the settings of candidate lists for a renderer; None: rays traverse the tree.
 
-    Args:
-        requested: `RenderConfig.candidate_lists`.
-        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `ray_layers` gives them.
-        instant_count: The most instants of a launch, of one world.
-        face_count: Triangles of the scene.
-        is_cuda: Whether the device is CUDA.
+    Rays are those of `ray_layers`; a launch has at most `instant_count` instants of one world.
     """
     if requested != "auto":
         return requested
@@ -113,18 +105,10 @@ class CandidateLists:
         has_fallback: bool,
         thread_count: int | None = None,
     ) -> None:
-        """Allocate the lists.
+        """Allocate the lists, for at most `instant_count` instants per launch.
 
-        Args:
-            tree: What rays hit.
-            rays: Rays of the pixels in C, shape [layer, H * W, 4].
-            width: Columns of the picture [px].
-            height: Rows of the picture [px].
-            extent_m: Largest coordinate of the mesh [m].
-            config: Settings of the lists.
-            instant_count: K, the most instants per launch.
-            has_fallback: Unresolved pixels are left to another kernel (`raycast.fallback_kernel`).
-            thread_count: Threads on a CPU device; all cores if None.
+        Rays are those of `ray_layers`; `extent_m` is the largest coordinate of the mesh. With a fallback,
+        unresolved pixels are left to another kernel (`raycast.fallback_kernel`).
 
         Raises:
             ValueError: A ray does not look forward enough (`tile_bounds`), or there are more than 2^31 - 1
@@ -159,14 +143,7 @@ class CandidateLists:
         *,
         instant_count: int,
     ) -> None:
-        """Fill the lists with the triangles that rays may hit at the first `instant_count` poses.
-
-        Args:
-            rays: Rays of the pixels in C, shape [layer, H * W].
-            p_WC: Position of the camera [m], shape [K].
-            q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
-            instant_count: How many of the K instants are rendered.
-        """
+        """Fill the lists with the triangles that rays may hit at the first `instant_count` poses."""
         groups = -(-instant_count // self.data.instants)
         self.data.unresolved_count.zero_()
         launch_split(

@@ -105,12 +105,7 @@ class EmbreeTree:
     def __init__(
         self, vertices: NDArray[np.float32], faces: NDArray[np.int32], *, quick: bool = False
     ) -> None:
-        """Build the tree; the arrays are copied.
-
-        Args:
-            vertices: Positions [m], shape [V, 3].
-            faces: Vertex indices, shape [F, 3].
-            quick: Build `quick`, too.
+        """Build the tree, and `quick` if asked; vertices [m], shape [V, 3], and faces, [F, 3], are copied.
 
         Raises:
             EmbreeError: Embree cannot be used here, or is out of memory.
@@ -161,10 +156,6 @@ def packet_caster(width: int, *, origins: bool = False) -> Any:
     the first and the second corner; normal of the front, of any length.
 
     The last bits of a hit may depend on the other rays of its packet.
-
-    Args:
-        width: `packet_width()`.
-        origins: Rays have origins of their own.
     """
 
     @wp.func_native(read_native(__file__, "cast_packet", WIDTH=width))

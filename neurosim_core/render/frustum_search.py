@@ -29,21 +29,16 @@ _COSINE_MIN = wp.constant(0.2)
 class _Frustum:
     """The rays of a tile in several instants: z along the axis, all of them between four planes."""
 
-    origin: wp.vec3
-    """In W [m], as the axes; what follows is relative to it."""
+    origin: wp.vec3  # In W [m], as the axes; what follows is relative to it
     x: wp.vec3
     y: wp.vec3
     z: wp.vec3
-    slope_low: wp.vec2
-    """Least x / z and y / z of the rays."""
+    slope_low: wp.vec2  # Least x / z and y / z of the rays
     slope_high: wp.vec2
-    foot_low: wp.vec2
-    """Where the lower planes cross z = 0: x >= foot_low[0] + slope_low[0] z."""
+    foot_low: wp.vec2  # Where the lower planes cross z = 0: x >= foot_low[0] + slope_low[0] z
     foot_high: wp.vec2
-    near: float
-    """Least z [m]."""
-    far: float
-    """Largest z [m]."""
+    near: float  # Least z [m]
+    far: float  # Largest z [m]
 
 
 @wp.func_native(read_native(__file__, "block_max"))

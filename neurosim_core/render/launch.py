@@ -10,9 +10,11 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
+
+Part = TypeVar("Part")
 
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
@@ -46,6 +48,14 @@ def _pool(thread_count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
 
 
+def share(work: Callable[[Part], object], parts: Sequence[Part]) -> None:
+    """Do all parts of a work side by side, the first of them in this thread."""
+    others = [_pool(core_count()).submit(work, part) for part in parts[1:]]
+    work(parts[0])
+    for other in others:
+        other.result()
+
+
 def kernel_variant(name: str, *terms: str) -> Callable[[Callable[..., Any]], Any]:
     """Return the decorator of a kernel with a module of its own: `name`, and what is compiled in."""
     module = wp.get_module(f"{name}." + ("_".join(terms).replace(" ", "_") or "exact"))
@@ -64,16 +74,9 @@ def launch_split(
 ) -> None:
     """Launch a kernel of one dimension: on CUDA as one launch, on the CPU in slices on all cores.
 
-    The call returns when a CPU has finished; it does not wait for a CUDA device. Threads of the kernel must
-    not depend on each other. Slices begin at multiples of 64.
-
-    Args:
-        kernel: Its first parameter is the index of its first thread, an int.
-        dim: Number of threads.
-        inputs: Parameters after the first.
-        outputs: Parameters after the inputs.
-        device: Where to launch.
-        thread_count: Threads of the pool; None: one for each core.
+    The call returns when a CPU has finished; it does not wait for a CUDA device. The first parameter of the
+    kernel is the index of its first thread, before inputs and outputs; threads must not depend on each other.
+    Slices begin at multiples of 64.
     """
     threads = thread_count or core_count()
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64

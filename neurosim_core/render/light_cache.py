@@ -26,11 +26,9 @@ SIZE_MAX = 256 * 2**20
 def cached_arrays(
     inputs: tuple[object, ...], compute: Callable[[], dict[str, NDArray[Any]]]
 ) -> dict[str, NDArray[Any]]:
-    """Return what `compute` returned for the same inputs before, or call it and keep what it returns.
+    """Return the arrays that `compute` returned for the same inputs before, or call it and keep them.
 
-    Args:
-        inputs: All that the result depends on: arrays by their bytes, the rest by its `repr`.
-        compute: Returns arrays by name.
+    Inputs are all that the result depends on: arrays count by their bytes, the rest by its `repr`.
     """
     digest = hashlib.blake2b(digest_size=16)
     for part in inputs:

@@ -366,12 +366,8 @@ def _group_corners(
 def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
     """Give buried points (a floor under a carpet) the mean light of the neighbours that are not, in place.
 
-    They are not seen, but faces reach from them into the open, and would be dark there.
-
-    Args:
-        light: Light of each group on each side, shape [G, 2, 3]; overwritten.
-        openness: Share of the ambient light, shape [G, 2].
-        faces: Groups of the corners of each face, shape [F, 3].
+    They are not seen, but faces reach from them into the open, and would be dark there. Shapes: light of each
+    group on each side [G, 2, 3], openness [G, 2], groups of the corners of each face [F, 3].
     """
     a, b, c = np.ascontiguousarray(faces.T)
     one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
@@ -404,7 +400,7 @@ def _shading_faces(scene: Scene) -> NDArray[np.int32]:
 def bake_light(
     scene: Scene, mesh: RefinedMesh, config: LightingConfig, *, device: str, embree: bool = False
 ) -> NDArray[np.float32]:
-    """Compute the light that a white surface reflects at each corner of each face, on both sides.
+    """Return the light that a white surface reflects at each corner of each face, on both sides.
 
     Corners in the same place with the same shading normal share one value: the rays are spread over them.
     Point lights are dimmed by the share of shadow rays that reach them. Ambient light is dimmed by the mean
@@ -413,13 +409,6 @@ def bake_light(
     shadow, so a light may sit inside its lamp. Buried points take the light of their neighbours. Directions
     are fixed: the same scene gives the same light. Rays stop early where a well spread part of them agrees.
     On a CPU the light of a large scene is kept on disk (`light_cache`).
-
-    Args:
-        scene: Materials, lights and the triangles that cast shadows.
-        mesh: Where light is wanted: the scene, refined.
-        config: Numbers of rays, radii.
-        device: Where to compute.
-        embree: Cast the rays with Embree, on a CPU.
 
     Returns:
         Linear light, shape [2, F, 3, 3]: front and back, face, corner, RGB.

@@ -68,22 +68,15 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
 class RenderOutputs:
     """The arrays of outputs; those not requested are empty. All but the first two have image slots."""
 
-    log_radiance: wp.array3d[float]
-    """log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]."""
-    face: wp.array3d[int]
-    """Index of the face that the last ray of a pixel hits, -1: none, shape [K, H, W]."""
-    rgb: wp.array4d[wp.uint8]
-    """sRGB of exposure times radiance, shape [M, H, W, 3]."""
-    radiance: wp.array3d[wp.vec3]
-    """Exposure times linear radiance, of which 1 is white, shape [M, H, W]."""
-    depth: wp.array3d[float]
-    """Planar z [m], inf where nothing is hit, shape [M, H, W]."""
-    range: wp.array3d[float]
-    """Length of the ray [m], inf where nothing is hit, shape [M, H, W]."""
+    log_radiance: wp.array3d[float]  # log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]
+    face: wp.array3d[int]  # Index of the face that the last ray of a pixel hits, -1: none, shape [K, H, W]
+    rgb: wp.array4d[wp.uint8]  # sRGB of exposure times radiance, shape [M, H, W, 3]
+    radiance: wp.array3d[wp.vec3]  # Exposure times linear radiance, of which 1 is white, shape [M, H, W]
+    depth: wp.array3d[float]  # Planar z [m], inf where nothing is hit, shape [M, H, W]
+    range: wp.array3d[float]  # Length of the ray [m], inf where nothing is hit, shape [M, H, W]
     normal: wp.array3d[wp.vec3]
     """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
-    instance: wp.array3d[int]
-    """-1 where nothing is hit, shape [M, H, W]."""
+    instance: wp.array3d[int]  # -1 where nothing is hit, shape [M, H, W]
     returns: wp.array3d[wp.vec3]
     """Length of the ray [m], inf where nothing is hit; |cosine| of incidence; luma of the albedo; shape
     [M, H, W]."""

@@ -24,14 +24,8 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
     """Return the Warp function, for CPU kernels only, that adds the radiance of a packet's hits to a total.
 
     Its parameters are the scene; then of each lane: ray, of unit length; spread [rad]; face, -1: nothing was
-    hit; distance [m]; u and v, the weights of the first and the second corner; the normal of the front. The
-    last is the radiance of each lane so far, to add to.
-
-    Args:
-        lanes: Rays of a packet.
-        textured: Some material has a texture; it is filtered trilinearly.
-        emissive: Some material emits light.
-        unit_normals: Normals are of unit length already.
+    hit; distance [m]; u and v, the weights of the first and the second corner; the normal of the front, of
+    unit length if so said. The last is the radiance of each lane so far, to add to.
     """
 
     def shade_packet(
@@ -70,15 +64,10 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
     left out, and the radiance is the mean of the others; four layers of 2 x 2 pixels are a packet if their
     number is a multiple of four, so the last bits may differ from those of packets of one layer.
 
-    Its parameters: the scene; rays of pixels, as `ViewData` has them, contiguous; the first of the
-    packet, and the columns of the picture; position and orientation of the camera; the distance beyond which
-    hits do not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4.
-    The last is the log radiance, of which these pixels are written.
-
-    Args:
-        width: `embree.packet_width()`.
-        textured: Some material has a texture; it is filtered trilinearly.
-        emissive: Some material emits light.
+    Its parameters: the scene; rays of pixels, as `ViewData` has them, contiguous; the first of the packet,
+    and the columns of the picture; position and orientation of the camera; the distance beyond which hits do
+    not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4. The last
+    is the log radiance, of which these pixels are written.
     """
 
     def render_packet(
@@ -120,10 +109,6 @@ def face_caster(width: int, *, timed: bool) -> Any:
 
     It casts the rays of the last layer. Its parameters: the scene; the view; the rest as of `packet_program`,
     but for its last, of which these pixels are written.
-
-    Args:
-        width: `embree.packet_width()`.
-        timed: Rays have times of their own, the same in all layers.
     """
 
     @wp.func_native(read_native(__file__, "cast_faces", N=16, SIDE=4, WIDTH=width, TIMED=timed))

@@ -39,20 +39,14 @@ class LensData:
     cy: wp.float64
     k: _coefficients
     """Polynomials: k1, k2, p1, p2, k3, k4, k5, k6; equidistant: k1 to k4; double sphere: xi, alpha, w2."""
-    limit: wp.float64
-    """Polynomials: largest sqrt(x^2 + y^2) / z; else the largest angle from the axis [rad]."""
-    table: wp.array2d[wp.vec3d]
-    """Of a ray table: the unit rays of the pixels; nan: none."""
+    limit: wp.float64  # Polynomials: largest sqrt(x^2 + y^2) / z; else the largest angle from the axis [rad]
+    table: wp.array2d[wp.vec3d]  # Of a ray table: the unit rays of the pixels; nan: none
     guess: wp.array2d[wp.vec2]
     """Of a ray table: column and row of the pixel that looks about where a direction does [px]."""
 
 
 def make_lens_data(lens: Lens, device: Any = "cpu") -> Any:
-    """Return a lens for the function that `projector` makes of its kind.
-
-    Args:
-        lens: One of the kinds of `lenses.AnyLens`.
-        device: Where a table of rays goes.
+    """Return a lens, one of `lenses.AnyLens`, for the function that `projector` makes of its kind.
 
     Raises:
         ValueError: The lens does not say where points are.

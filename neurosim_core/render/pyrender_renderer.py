@@ -81,13 +81,8 @@ def upload_pyrender_scene(
     """Light a scene and hand it to pyrender.
 
     Each side of a surface is a copy with its own light; OpenGL culls the one that is turned away. Faces that
-    emit show only their emission. Bodies keep the light that they have at stamp 0, wherever they move.
-
-    Args:
-        scene: What to render.
-        config: How to light it; mip levels and samples are OpenGL's own.
-        device: Where light is baked.
-        bodies: What moves in the scene.
+    emit show only their emission. Bodies keep the light that they have at stamp 0, wherever they move. Mip
+    levels and samples are OpenGL's own.
 
     Raises:
         PyrenderError: pyrender is not installed or there is no OpenGL.
@@ -138,16 +133,7 @@ def _mesh(
     materials: Sequence[Material],
     exposure: float,
 ) -> Any:
-    """Return faces as pyrender.Mesh.
-
-    Args:
-        pyrender: The module.
-        mesh: The faces.
-        light: What a white surface shows, linear, shape [2, F, 3, 3]: front and back, face, corner, RGB.
-        material_of: Index into `materials` of each face, shape [F].
-        materials: How they look.
-        exposure: Factor from linear radiance to the linear value 1.0 of a picture.
-    """
+    """Return faces as pyrender.Mesh; shapes: linear light [2, F, 3, 3] (`bake_light`), `material_of` [F]."""
     sides = []
     for index, material in enumerate(materials):
         chosen = np.flatnonzero(material_of == index)
@@ -187,27 +173,18 @@ def _texture(pyrender: Any, srgb: NDArray[np.uint8]) -> Any:
 
 
 class PyrenderRenderer:
-    """Renders rgb and depth, one pose after another, through OpenGL.
+    """Renders rgb and depth of `renderer.Renderer` on the host, one pose after another, through OpenGL.
 
-    Attributes:
-        rgb: uint8 on the host, shape [M, H, W, 3]; the display curve is a power of 1 / 2.2, not sRGB.
-        depth: float32 on the host, shape [M, H, W].
-        log_radiance: None; so are normal and instance.
+    The display curve of rgb is a power of 1 / 2.2, not sRGB.
     """
 
     def __init__(
         self, scene: PyrenderScene, lens: PinholeConfig, *, outputs: Collection[str], image_count: int = 1
     ) -> None:
-        """Allocate the outputs and open an OpenGL context.
-
-        Args:
-            scene: `upload_pyrender_scene`.
-            lens: The camera.
-            outputs: Some of "rgb", "depth".
-            image_count: M, number of image slots.
+        """Allocate the outputs and open an OpenGL context; parameters as of `make_renderer`.
 
         Raises:
-            ValueError: Another output is asked for.
+            ValueError: Another output than rgb and depth is asked for.
             PyrenderError: There is no OpenGL.
         """
         unknown = sorted(set(outputs) - {"rgb", "depth"})

@@ -24,16 +24,11 @@ UNFUSED = {"fuse_fp": False}
 class Hit:
     """The first intersection of a ray."""
 
-    face: int
-    """-1: the ray hits nothing, and the other fields have no meaning."""
-    t: float
-    """Distance along the ray [m]."""
-    u: float
-    """Weight of the first corner."""
-    v: float
-    """Weight of the second corner."""
-    normal: wp.vec3
-    """Unit normal of the face's front."""
+    face: int  # -1: the ray hits nothing, and the other fields have no meaning
+    t: float  # Distance along the ray [m]
+    u: float  # Weight of the first corner
+    v: float  # Weight of the second corner
+    normal: wp.vec3  # Unit normal of the face's front
 
 
 @wp.func_native(read_native(__file__, "intersect_face"))

@@ -30,14 +30,10 @@ def _rays_through(
 
 @functools.lru_cache(maxsize=1)
 def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return rays through the centres of pixels and, for several samples, through points spread over them.
+    """Return rays through the centres of pixels and, for n > 1 samples, through n points spread over them.
 
-    The points are a lattice: along rows and along columns each n-th of a pixel has one of the n.
-
-    Args:
-        lens: Rays of the pixels.
-        sample_count: n.
-        fill_factor: Share of the pixel's area, around its centre, that the points are spread over.
+    The points are a lattice over a share of the pixel's area around its centre: along rows and along columns
+    each n-th of a pixel has one of the n.
 
     Returns:
         Direction in C and spread [rad], shape [1 or 1 + n, H * W, 4].

@@ -43,12 +43,7 @@ class RayTiming(Protocol):
         """How long before the stamp the first ray is cast [ns]."""
 
     def times(self, lens: Lens, sample_count: int) -> RayTimes | None:
-        """Return the times of the rays of a lens; None: all are cast at the stamp.
-
-        Args:
-            lens: For its size.
-            sample_count: Rays per pixel that the settings ask for.
-        """
+        """Return the times of the rays of a lens, of so many samples; None: all are cast at the stamp."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 
 A node holds the boxes of its two children side by side, and a leaf holds the corners of its triangles: one
 step of a ray reads 64 bytes in one place where `wp.mesh_query_ray` reads four times 16, and a triangle is
-read at once where that reads three arrays one after the other. On an H200, in a house of 145,844 triangles, a
-picture of 640x480 takes 85 us in place of 138, and 45 in place of 90 where others fill the gaps.
+read at once where that reads three arrays one after the other (docs/decisions/ray-tree.md).
 
 Triangles are intersected by Woop's test, with the operations and so the bits of `wp.mesh_query_ray`. Of two
 triangles at the same distance the one with the lesser index counts, unless the ray nearly grazes them: then
@@ -29,8 +28,7 @@ wp.set_module_options({"enable_backward": False})
 class RayTree:
     """A tree for `intersect_tree`. A child is the index of a node or, below zero, -1 - that of a triangle."""
 
-    root: int
-    """The first child."""
+    root: int  # The first child
     nodes: wp.array[wp.vec4]
     """Four rows a node: low x, high x, low y, high y of its first child; the same of its second; low and high
     z of the first, then of the second; both children, as the bits of integers."""
@@ -75,11 +73,7 @@ def _lay_out(
 
 
 def make_ray_tree(mesh: wp.Mesh) -> RayTree:
-    """Return the tree of a mesh as it is now; waits for the device.
-
-    Args:
-        mesh: Made with `bvh_constructor="sah"`, with at least one triangle.
-    """
+    """Return the tree of a mesh (`bvh_constructor="sah"`, not empty) as it is now; waits for the device."""
     face_count = mesh.indices.shape[0] // 3
     device, node_limit = mesh.device, 2 * face_count
     tree = RayTree()
@@ -99,11 +93,6 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
 def intersect_tree(tree: RayTree, origin: wp.vec3, ray: wp.vec3, far_m: float) -> wp.vec4:
     """Return the first hit of a ray: distance, u and v of `ray_intersection.Hit`, and the bits of the face.
 
-    Args:
-        tree: The scene.
-        origin: Origin of the ray [m].
-        ray: Direction of the ray, of unit length.
-        far_m: Beyond this distance the ray hits nothing [m]: the face is -1. A ray that is not finite hits
-            nothing.
+    Beyond `far_m` the ray, of unit length, hits nothing: the face is -1. So does one that is not finite.
     """
     ...

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import warp as wp
 
-from neurosim_core.registry import find, kinds, register
+from neurosim_core.registry import find, kinds, register, registered
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
@@ -232,7 +232,7 @@ def make_renderer(
             pinholes.
     """
     kind: Any
-    for kind in kinds("renderer").values():
+    for kind in registered("renderer").values():
         if isinstance(scene, kind.scene_type):
             renderer: Renderer = kind.make(
                 scene,

@@ -67,12 +67,6 @@ def upload_scene(
 ) -> SceneArrays:
     """Bring a scene to a device: refine and light it, pack its textures, build its tree.
 
-    Args:
-        scene: What to render.
-        config: How to light it, and who casts rays on a CPU.
-        device: "cpu", "cuda:0", …
-        bodies: What moves in the scene.
-
     Raises:
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
     """

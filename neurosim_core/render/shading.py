@@ -59,10 +59,8 @@ def pixel_shader(terms: RenderTerms) -> wp.Function:
 def surface_shader(terms: RenderTerms, *, beyond: bool = False) -> wp.Function:
     """Return the function that says what light comes from what stands still, or from the sky.
 
-    Args:
-        terms: Of the kernel.
-        beyond: A hit may lie beyond the edges of its face: the texture goes on there, the light does not. The
-            texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
+    With `beyond` a hit may lie beyond the edges of its face: the texture goes on there, the light does not.
+    The texture is looked up twice, by the `slope` of the weights along the footprint [1/rad].
     """
     if terms.baked and not (beyond or terms.finest_level):
         return _baked_shader(textured=terms.textured, emissive=terms.emissive)

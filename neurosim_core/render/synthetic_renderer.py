@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.scene.bodies import BodyPoses
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.srgb import srgb_to_linear
 
 wp.set_module_options({"enable_backward": False})
 
@@ -147,14 +147,9 @@ def _draw(
 
 
 class SyntheticRenderer:
-    """Draws test cards. `render` neither allocates nor waits for a CUDA device.
+    """Draws test cards: log radiance without the pose, rgb and depth of `renderer.Renderer`.
 
-    Outputs that were not asked for are None; so are normal and instance.
-
-    Attributes:
-        log_radiance: float32, shape [K, H, W]; without the pose.
-        rgb: uint8, shape [M, H, W, 3].
-        depth: float32, shape [M, H, W].
+    `render` neither allocates nor waits for a CUDA device.
     """
 
     def __init__(
@@ -166,17 +161,11 @@ class SyntheticRenderer:
         instant_count: int,
         image_count: int = 1,
     ) -> None:
-        """Draw the card into every picture.
-
-        Args:
-            scene: Where to compute, and the dark floor.
-            lens: The size of the pictures.
-            outputs: Some of `OUTPUTS`.
-            instant_count: K, the most instants per call.
-            image_count: M, number of image slots.
+        """Draw the card into every picture; parameters as of `make_renderer`.
 
         Raises:
-            ValueError: Another output is asked for, none is, or a picture is too small for a pose.
+            ValueError: An output beyond `OUTPUTS` is asked for, none is, or a picture is too small for a
+                pose.
         """
         if not set(outputs) <= set(OUTPUTS) or not outputs:
             raise ValueError(
@@ -263,14 +252,7 @@ class SyntheticRenderer:
 
 
 def read_pose(data: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the pose that a test card shows.
-
-    Args:
-        data: A picture of a `SyntheticRenderer`: uint8 [H, W, 3], or float32 [H, W] or [H, W, 1].
-
-    Returns:
-        p_WC [m] and q_WC (xyzw), shape [7].
-    """
+    """Return the pose p_WC [m] and q_WC (xyzw), shape [7], that a test card shows, rgb or depth."""
     size = 28 if data.dtype == np.uint8 else 7
     return np.frombuffer(np.ravel(data)[:size].tobytes(), dtype=np.float32)
 

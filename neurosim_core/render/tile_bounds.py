@@ -32,18 +32,11 @@ def looks_forward(rays: NDArray[np.float32]) -> bool:
 
 
 def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """Return the least and largest x / z and the least and largest y / z of the rays of each tile.
+    """Return the least and largest x / z and y / z of the rays of each tile, shape [tile, 4], row by row.
 
     They are widened by 1e-5 rad, more than rounding. A ray that reaches z = 1 after the length L, and a plane
-    x = (s + ds) z where it has the slope s, are ds / (L sqrt(1 + s^2)) apart [rad].
-
-    Args:
-        rays: Rays in C, shape [layer, H * W, 3 or more].
-        width: Columns of the picture [px].
-        height: Rows of the picture [px].
-
-    Returns:
-        Bounds, shape [tile, 4], tiles row by row.
+    x = (s + ds) z where it has the slope s, are ds / (L sqrt(1 + s^2)) apart [rad]. Rays are in C, shape
+    [layer, H * W, 3 or more].
 
     Raises:
         ValueError: A ray does not look forward (z <= 0), or is too close to 90 degrees from the axis: |x / z|

@@ -20,22 +20,15 @@ class ViewData:
     rays: wp.array2d[wp.vec4]
     """Direction in C and spread [rad], shape [layer, H * W]: the centres of pixels; further layers are the
     samples whose mean is the radiance."""
-    width: int
-    """Columns of a picture [px]."""
-    height: int
-    """Rows of a picture [px]."""
-    instant_count: int
-    """How many of the K instants are rendered, of each world."""
+    width: int  # Columns of a picture [px]
+    height: int  # Rows of a picture [px]
+    instant_count: int  # How many of the K instants are rendered, of each world
     p_WC: wp.array[wp.vec3]
     """Position of the camera [m], shape [K]; with `RenderTerms.timed` [K, J], flattened."""
-    q_WC: wp.array[wp.quat]
-    """Orientation of the camera's optical frame, xyzw, likewise."""
-    pose_count: int
-    """With `RenderTerms.timed`: J, instants of one picture."""
-    pose: wp.array2d[int]
-    """With `RenderTerms.timed`: which of them each ray has, shape [layer, H * W]."""
-    image_slot: wp.array[int]
-    """Where the images of an instant go, shape [K]; -1: nowhere."""
+    q_WC: wp.array[wp.quat]  # Orientation of the camera's optical frame, xyzw, likewise
+    pose_count: int  # With `RenderTerms.timed`: J, instants of one picture
+    pose: wp.array2d[int]  # With `RenderTerms.timed`: which of them each ray has, shape [layer, H * W]
+    image_slot: wp.array[int]  # Where the images of an instant go, shape [K]; -1: nowhere
 
 
 def make_view(rays: Any, width: int, height: int) -> ViewData:
@@ -49,14 +42,10 @@ def make_view(rays: Any, width: int, height: int) -> ViewData:
 class WorldData:
     """Worlds that are rendered together; arrays of instants have the shape [world, K], flattened."""
 
-    stride: int
-    """K: capacity for instants of each world."""
-    active: wp.array[int]
-    """1: the world is rendered; 0: its outputs are left unchanged, shape [world]."""
-    scenes: wp.array[SceneData]
-    """With `RenderTerms.world_scenes`: all scenes."""
-    scene: wp.array[int]
-    """With `RenderTerms.world_scenes`: index of the scene of each world, shape [world]."""
+    stride: int  # K: capacity for instants of each world
+    active: wp.array[int]  # 1: the world is rendered; 0: its outputs are left unchanged, shape [world]
+    scenes: wp.array[SceneData]  # With `RenderTerms.world_scenes`: all scenes
+    scene: wp.array[int]  # With `RenderTerms.world_scenes`: index of the scene of each world, shape [world]
     lens: wp.array[int]
     """With `RenderTerms.world_lenses`: index of the lens of each world, shape [world]; a layer of rays holds
     the lenses one after another."""
@@ -104,33 +93,22 @@ def tile_finder(terms: RenderTerms) -> wp.Function:
 class TilePlace:
     """A tile in one instant."""
 
-    rendered: wp.bool
-    """False: its world is inactive, or none of the outputs is wanted of the instant."""
+    rendered: wp.bool  # False: its world is inactive, or none of the outputs is wanted of the instant
     world: int
-    tile: int
-    """Its index in the world."""
-    instant: int
-    """Row of the arrays of instants."""
-    left: int
-    """Column of its first pixel."""
-    top: int
-    """Row of its first pixel."""
-    first_ray: int
-    """Index of the first ray of the world's lens in a layer."""
-    slot: int
-    """Where images go, -1: nowhere."""
+    tile: int  # Its index in the world
+    instant: int  # Row of the arrays of instants
+    left: int  # Column of its first pixel
+    top: int  # Row of its first pixel
+    first_ray: int  # Index of the first ray of the world's lens in a layer
+    slot: int  # Where images go, -1: nowhere
 
 
 @cache
 def tile_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:
     """Return the Warp function that locates a tile in one instant.
 
-    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; view and worlds.
-
-    Args:
-        terms: Of the kernel.
-        images: Outputs that have image slots are written.
-        instants: Outputs that all instants have are written.
+    Its parameters: the tile, as `tile_finder` counts; the instant, of a world; view and worlds. Outputs are
+    written that have image slots (`images`), or that all instants have (`instants`).
     """
     find_tile = tile_finder(terms)
 

@@ -80,18 +80,10 @@ class WarpRenderer:
 
     Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
     are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
-    triangles, run side by side. `render` neither allocates nor waits for a device. Outputs that are not
-    requested are None. See `outputs.RenderOutputs` for what they are.
+    triangles, run side by side. `render` neither allocates nor waits for a device. Outputs are those of
+    `renderer.Renderer`.
 
     Attributes:
-        log_radiance: float32, shape [N K, H, W].
-        rgb: uint8, shape [M, H, W, 3].
-        radiance: vec3, shape [M, H, W].
-        depth: float32, shape [M, H, W].
-        range: float32, shape [M, H, W].
-        normal: vec3, shape [M, H, W].
-        instance: int32, shape [M, H, W].
-        returns: vec3, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W]; of several
             lenses, one after the other.
         candidates: Candidate lists of tiles; None: rays traverse the tree.
@@ -110,17 +102,7 @@ class WarpRenderer:
         worlds: RenderWorlds = ONE_WORLD,
         times: RayTimes | None = None,
     ) -> None:
-        """Allocate the outputs and choose the kernel.
-
-        Args:
-            arrays: The scene; `upload_scene`.
-            lens: Rays of the pixels.
-            outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
-            instant_count: K, the most instants of a world per launch.
-            image_count: M, number of image slots, of all worlds together.
-            thread_count: Threads on a CPU device; all cores if None.
-            worlds: Who is rendered together.
-            times: When rays are cast (`ray_times_of`); None: all at the stamp.
+        """Allocate the outputs and choose the kernel; parameters as of `make_renderer`.
 
         Raises:
             ValueError: An output is unknown, none is requested, the instants have more than 2^31 - 1 rays of
@@ -204,15 +186,7 @@ class WarpRenderer:
         bodies: BodyPoses | None = None,
         active: Any = None,
     ) -> None:
-        """Render the first `instant_count` poses of each world into the outputs.
-
-        Args:
-            p_WC: Position of the camera [m], shape [N K]; with `times` [N K J], at the instants of the rays.
-            q_WC: Orientation of the camera's optical frame, xyzw, likewise.
-            image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
-            instant_count: How many of the K instants of each world are rendered.
-            bodies: Where bodies are at each of these poses; not needed without bodies.
-            active: With several worlds, which need it: 1 where a world is rendered, int32, shape [N].
+        """Render the first `instant_count` poses of each world into the outputs; see `Renderer.render`.
 
         Raises:
             ValueError: The scene has bodies and there are no poses of them, or no `active` of several worlds.

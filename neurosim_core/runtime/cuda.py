@@ -44,12 +44,7 @@ def size_class(size: int) -> int:
 
 
 def make_stream(device: Any, *, high_priority: bool = False) -> wp.Stream | None:
-    """Return a new stream; None on a CPU.
-
-    Args:
-        device: Where.
-        high_priority: Its launches go before those of other streams that are waiting.
-    """
+    """Return a new stream; None on a CPU. With high priority its launches go before others that wait."""
     place = wp.get_device(device)
     return wp.Stream(place, priority=-1 if high_priority else 0) if place.is_cuda else None
 
@@ -70,12 +65,7 @@ class _On:
 
 
 def use_stream(stream: wp.Stream | None, *, after: bool = True) -> AbstractContextManager[Any]:
-    """Launch what follows on a stream.
-
-    Args:
-        stream: Which; None: stay.
-        after: It follows what the present stream holds. If not, milestones say what it follows.
-    """
+    """Launch what follows on a stream (None: stay), after what the present one holds unless fences say it."""
     return nullcontext() if stream is None else _On(stream, after)
 
 
@@ -119,13 +109,11 @@ class GraphCache:
         self.dropped_count = 0
 
     def run(self, key: Hashable, launch: Callable[[], Any], *, stream: wp.Stream | None = None) -> None:
-        """Do what `launch` does.
+        """Do what `launch` does, on a stream (None: the present one); same key, same launches and arguments.
 
-        Args:
-            key: Same key, same launches with the same arguments.
-            launch: Called the first time, which compiles and warms up, and the second time to record it. What
-                it returns is kept as long as the graph: arrays that nothing else holds.
-            stream: Where, and milestones say what it follows; None: on the present stream.
+        It is called the first time, which compiles and warms up, and the second time to record it. What it
+        returns is kept as long as the graph: arrays that nothing else holds. On a stream fences say what it
+        follows.
         """
         if self._device.is_cpu:
             launch()
@@ -247,9 +235,8 @@ class HostCopy:
     def fetch_into(self, room: NDArray[Any], row: int) -> None:
         """Launch the copy of one row into memory of the caller's; on a CPU it is done at once.
 
-        Args:
-            room: Contiguous, like a row; on CUDA pinned, and left alone until the device has come past this.
-            row: Which.
+        The room is contiguous, like a row; on CUDA pinned, and left alone until the device has come past
+        this.
         """
         address = room.__array_interface__["data"][0]
         place = self._places.get(address)

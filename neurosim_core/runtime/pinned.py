@@ -35,11 +35,7 @@ class PinnedMapping:
     made_count: ClassVar[int] = 0
 
     def __init__(self, memory: Any, device: Any) -> None:
-        """Pin it.
-
-        Args:
-            memory: All of the mapping, to read and write, such as an `mmap`; no part of it is pinned.
-            device: Who copies into it, a CUDA device.
+        """Pin all of a mapping such as an `mmap`, to read and write, for a CUDA device.
 
         Raises:
             PinError: That is not possible.

@@ -167,8 +167,7 @@ class Motion:
     sway: wp.vec3d
     sway_hz: wp.float64
     sway_rad: wp.float64
-    orbit_e1: wp.vec3d
-    """Times the radius, as `orbit_e2`."""
+    orbit_e1: wp.vec3d  # Times the radius, as `orbit_e2`
     orbit_e2: wp.vec3d
     orbit_hz: wp.float64
     orbit_rad: wp.float64
@@ -297,13 +296,8 @@ def pose_bodies(
 ) -> None:
     """Write where bodies are at the first `count` of the given slots; launches one kernel.
 
-    Args:
-        motions: `upload_motions`; of several worlds, which share the instants out in their order.
-        stamps_ns: Stamps [ns], shape [slot, vehicle]: `Trace.stamps`.
-        slots: Slots of the instants, shape [K].
-        count: How many of them to use.
-        poses: Overwritten.
-        vehicle: Whose stamps count.
+    Motions of several worlds (`upload_motions`) share the instants out in their order. Stamps [ns] have shape
+    [slot, vehicle] (`Trace.stamps`).
     """
     body_count = poses.p_WO.shape[1]
     worlds = motions.shape[0] // max(body_count, 1)
@@ -336,11 +330,8 @@ def _throw_bodies(
 def throw_bodies(motions: wp.array[Motion], position: Any, velocity: Any, acceleration: Vector3) -> None:
     """Let the bodies of each world fly from where they are at t = 0; launches one kernel.
 
-    Args:
-        motions: `upload_motions`; overwritten, but for what turns and swings.
-        position: p_WO at t = 0 [m], device array of vec3d, shape [world, B].
-        velocity: Velocity then in W [m/s], likewise.
-        acceleration: Of all of them, in W [m/s^2].
+    Motions are overwritten, but for what turns and swings. Position [m] and velocity in W [m/s] at t = 0 are
+    device arrays of vec3d, shape [world, B]; all have one acceleration, in W [m/s^2].
     """
     inputs = [position, velocity, wp.vec3d(*acceleration)]
     wp.launch(_throw_bodies, dim=position.shape, inputs=inputs, outputs=[motions], device=motions.device)
@@ -349,16 +340,9 @@ def throw_bodies(motions: wp.array[Motion], position: Any, velocity: Any, accele
 def body_poses(
     bodies: Mapping[str, BodyConfig], stamps_ns: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where bodies are, on the host.
+    """Return p_WO [m], shape [K, B, 3], and q_WO, xyzw, shape [K, B, 4], of bodies by name, at K stamps [ns].
 
     Exact to rounding: the error of a phase or angle grows as 1e-16 of its size.
-
-    Args:
-        bodies: Settings by name (`SimulationConfig.bodies`).
-        stamps_ns: Times since the start of the episode [ns], shape [K], integers.
-
-    Returns:
-        p_WO [m], shape [K, B, 3], and q_WO, xyzw, shape [K, B, 4].
 
     Raises:
         TypeError: Stamps are not integers.

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.scene import LinearRgb, Material, Texture
 from neurosim_core.scene.solids import Part, grid_surface, merge, picture_quad, without_slivers
 from neurosim_core.scene.source import Axis, SceneError
+from neurosim_core.scene.srgb import linear_to_srgb8
 from neurosim_core.settings import Settings
 
 _SIDES = 128
@@ -127,12 +127,7 @@ class Solid:
 
 
 def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) -> Solid:
-    """Return the triangles of a shape.
-
-    Args:
-        shape: What it is.
-        surface: How it looks; None: grey, and a mesh as its file says.
-        name: Of the body, for messages and materials.
+    """Return the triangles of a shape; without a surface it is grey, and a mesh as its file says.
 
     Raises:
         SceneError: A file cannot be used, or a mesh is asked to wear a pattern.

@@ -18,22 +18,13 @@ def find_corners(
     crease_rad: float,
     turn_rad: float,
 ) -> NDArray[np.float32]:
-    """Return the corners of a mesh, in the order of their coordinates.
+    """Return the corners of a mesh, in the order of their coordinates [m], shape [C, 3].
 
     An edge is *sharp* if it has one face or more than two, if its faces belong to two groups, or if their
     normals differ by more than `crease_rad`. A vertex is a corner if sharp edges leave it in directions that
     are not on one line, by `turn_rad`. A vertex inside a plane or on its straight rim is none, though the
-    triangles there may share no edges.
-
-    Args:
-        vertices: Positions [m], shape [V, 3]; they may be split where texture coordinates differ.
-        faces: Vertex indices, shape [F, 3].
-        groups: What each face belongs to, shape [F]; None: all to the same.
-        crease_rad: Angle between two normals [rad].
-        turn_rad: Angle between two edges, or between one and the continuation of the other [rad].
-
-    Returns:
-        Positions [m], shape [C, 3].
+    triangles there may share no edges. Vertices [V, 3] may be split where texture coordinates differ;
+    `groups` say what each face belongs to, shape [F]; None: all to the same.
     """
     _, first, weld = np.unique(
         np.rint(vertices[faces.reshape(-1)] / _WELD_M).astype(np.int64),

@@ -57,14 +57,10 @@ class FreeSpaceConfig(Settings):
 class DistanceField:
     """Distance to the scene, on a device."""
 
-    mesh: wp.uint64
-    """Triangles of the scene (`wp.Mesh.id`)."""
-    distance: wp.array3d[wp.float32]
-    """Exact distance at voxel centres [m], shape [nx, ny, nz]."""
-    origin: wp.vec3
-    """Centre of voxel (0, 0, 0) [m]."""
-    voxel: wp.float32
-    """Spacing [m]."""
+    mesh: wp.uint64  # Triangles of the scene (`wp.Mesh.id`)
+    distance: wp.array3d[wp.float32]  # Exact distance at voxel centres [m], shape [nx, ny, nz]
+    origin: wp.vec3  # Centre of voxel (0, 0, 0) [m]
+    voxel: wp.float32  # Spacing [m]
 
 
 @wp.func
@@ -205,11 +201,7 @@ class FreeSpace:
     """Where `arrays` and `mesh` are."""
 
     def clearance(self, points: ArrayLike) -> Array:
-        """Return the exact distance to the nearest triangle or bound [m], negative outside the bounds.
-
-        Args:
-            points: World frame [m], shape [n, 3].
-        """
+        """Return the exact distance [m] of points [n, 3] to the nearest triangle or bound; < 0 outside."""
         rows = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         on_device: Any = wp.array(rows.astype(np.float32), dtype=wp.vec3, device=self.device)
         out: Any = wp.empty(len(rows), dtype=wp.float32, device=self.device)
@@ -219,11 +211,7 @@ class FreeSpace:
         return np.minimum(out.numpy().astype(np.float64), self._to_bounds(rows))
 
     def interpolated(self, points: ArrayLike) -> Array:
-        """Return the clearance [m] as the grid has it, trilinear: within 0.87 voxel of the exact one.
-
-        Args:
-            points: World frame [m], shape [n, 3].
-        """
+        """Return the clearance [m] as the grid has it, trilinear: within 0.87 voxel of the exact one."""
         rows = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         place = ((rows - self.origin_m) / self.voxel_m).T
         grid = scipy.ndimage.map_coordinates(self.distance, place, order=1, mode="nearest", prefilter=False)
@@ -233,11 +221,9 @@ class FreeSpace:
         """Return which voxel centres can be reached from the seed at a clearance, shape [nx, ny, nz].
 
         Neighbours (also diagonal ones) in the result can be connected by straight lines that keep the
-        clearance everywhere. The region is the one that holds the seed; where the seed itself has less
-        clearance than asked, it is the largest that can be reached from it at any clearance.
-
-        Args:
-            clearance_m: Least distance to triangles and to the bounds of the scene [m], >= 0.
+        clearance, to triangles and to the bounds of the scene, everywhere. The region is the one that holds
+        the seed; where the seed itself has less clearance than asked, it is the largest that can be reached
+        from it at any clearance.
         """
         return _reachable(self, clearance_m)
 
@@ -247,9 +233,6 @@ class FreeSpace:
         A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
         (12 m^3). Where a surface passes, there is no solid to be inside of. Outside is what is beyond the
         grid or open to that, and does not hold the seed.
-
-        Args:
-            point_m: In the world [m], shape [3].
 
         Raises:
             ValueError: The point is inside a solid, outside, or out of sight.
@@ -333,11 +316,6 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     one; outside a building some direction is open. Where no such region has 12 m^3 (a terrain with rocks),
     the largest region that has a surface below is taken, and else the largest. A large closed solid in the
     open, such as a block that stands for a building, is taken for a room: say `seed_m` then.
-
-    Args:
-        scene: Triangles.
-        config: Resolution and seed.
-        device: Where distances are computed and where the map for kernels is kept.
 
     Raises:
         ValueError: The seed of the configuration is not in free space, or the scene has none.

@@ -12,6 +12,7 @@ import json
 import math
 import struct
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
 from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Lamp,
@@ -32,6 +32,7 @@ from neurosim_core.scene.source import (
     rgb,
     unique_name,
 )
+from neurosim_core.scene.srgb import srgb_to_linear
 
 _MAX_DEPTH = 256
 _LABELS = ("semantic", "class", "category", "label")
@@ -39,13 +40,11 @@ _LABELS = ("semantic", "class", "category", "label")
 
 
 def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> Source:
-    """Read the default scene of a glTF file.
+    """Read the default scene of a glTF file, .gltf or .glb.
 
-    Args:
-        path: The .gltf or .glb file.
-        textures_required: Whether a texture file that is not there is an error, or noted and left out.
-        pictures: Decode textures from now on in threads: the first look at one waits for it, and raises what
-            is wrong with it. Else they are decoded at that first look, if ever.
+    A texture file that is not there is an error if `textures_required`, else noted and left out. With
+    `pictures` textures are decoded from now on in threads: the first look at one waits for it, and raises
+    what is wrong with it. Else they are decoded at that first look, if ever.
 
     Raises:
         SceneError: If the file is truncated, malformed, or needs an extension that is not read.
@@ -229,7 +228,7 @@ class _Reader:
         source = self.source
         coordinates = self._materials()
         world = self._world()
-        primitives: dict[int, list[dict[str, Any]]] = {}
+        primitives: dict[int, list[tuple[Part, Any]]] = {}
         taken: set[str] = set()
         for index, matrix in world.items():
             node = self.file.tree["nodes"][index]
@@ -241,15 +240,12 @@ class _Reader:
             if node["mesh"] not in primitives:
                 primitives[node["mesh"]] = self._primitives(mesh, coordinates)
             name = unique_name(node.get("name") or mesh.get("name") or f"node {index}", taken)
-            for primitive in primitives[node["mesh"]]:
-                arrays, place = dict(primitive), matrix
-                skin = arrays.pop("skin")
+            for primitive, skin in primitives[node["mesh"]]:
+                part = replace(primitive, name=name, matrix=matrix, instance=len(source.instance_names))
                 if "skin" in node and skin is not None:
-                    arrays = self._posed(arrays, skin, self.file.entry("skins", node["skin"]), world)
-                    place = np.eye(4)
-                source.parts.append(
-                    Part(name=name, matrix=place, instance=len(source.instance_names), **arrays)
-                )
+                    part.positions = self._posed(part, skin, self.file.entry("skins", node["skin"]), world)
+                    part.matrix, part.normals = np.eye(4), None
+                source.parts.append(part)
             source.instance_names.append(name)
             extras = {**_extras(mesh), **_extras(node)}
             if label := next((extras[key] for key in _LABELS if isinstance(extras.get(key), str)), ""):
@@ -257,7 +253,8 @@ class _Reader:
         self._orientation()
         return source
 
-    def _primitives(self, mesh: dict[str, Any], coordinates: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def _primitives(self, mesh: dict[str, Any], coordinates: list[dict[str, Any]]) -> list[tuple[Part, Any]]:
+        """Return the parts of a mesh, without a name and a place, and how each is skinned."""
         parts = []
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", 4)
@@ -307,23 +304,23 @@ class _Reader:
                     if "POSITION" in target:
                         positions = positions + weight * self.file.accessor(target["POSITION"])
                 normals = None
-            parts.append(
-                {
-                    "positions": positions,
-                    "faces": faces,
-                    "normals": normals,
-                    "uv": uv,
-                    "corner_color": colors,
-                    "material": material,
-                    "skin": skin,
-                }
+            part = Part(
+                name="",
+                positions=positions,
+                faces=faces,
+                matrix=np.eye(4),
+                normals=normals,
+                uv=uv,
+                corner_color=colors,
+                material=material,
             )
+            parts.append((part, skin))
         return parts
 
     def _posed(
-        self, arrays: dict[str, Any], skin: Any, entry: dict[str, Any], world: dict[int, NDArray[np.float64]]
-    ) -> dict[str, Any]:
-        """Skin vertices with the joints where the node tree has them; the mesh node's matrix is unused."""
+        self, part: Part, skin: Any, entry: dict[str, Any], world: dict[int, NDArray[np.float64]]
+    ) -> NDArray[np.float64]:
+        """Return skinned vertices, with the joints where the node tree has them."""
         joints, weights = skin
         bind = np.tile(np.eye(4), (len(entry["joints"]), 1, 1))
         if "inverseBindMatrices" in entry:
@@ -331,11 +328,10 @@ class _Reader:
         pose = np.stack([world.get(joint, np.eye(4)) for joint in entry["joints"]]) @ bind
         total = weights.sum(axis=1, keepdims=True)
         blend = np.einsum("vk,vkij->vij", weights / np.where(total > 0.0, total, 1.0), pose[joints])
-        positions = np.einsum("vij,vj->vi", blend[:, :3, :3], arrays["positions"]) + blend[:, :3, 3]
         note = "Skinned meshes stand in the pose of the file's node tree; animation is not played."
         if note not in self.source.notes:
             self.source.notes.append(note)
-        return {**arrays, "positions": positions, "normals": None}
+        return np.einsum("vij,vj->vi", blend[:, :3, :3], part.positions) + blend[:, :3, 3]
 
     def _lamp(self, index: int, matrix: NDArray[np.float64]) -> None:
         light = self.file.tree["extensions"]["KHR_lights_punctual"]["lights"][index]

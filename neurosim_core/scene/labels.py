@@ -26,11 +26,9 @@ class Labels(NamedTuple):
 def label_scenes(scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | None) -> Labels:
     """Return what the instances of scenes are, with the same classes in all.
 
-    Args:
-        scenes: Each as the renderer has it (`SceneArrays`).
-        classes: Patterns of names, such as "chair*", by class; the first class that matches counts, whatever
-            the case. None: an instance is what its file says, or what its name says without the number at its
-            end, so that chair_1 and Chair.002 are chairs.
+    Patterns of names, such as "chair*", are given by class; the first class that matches counts, whatever the
+    case. None: an instance is what its file says, or what its name says without the number at its end, so
+    that chair_1 and Chair.002 are chairs.
     """
     found = [
         [(name, _class_of(name, scene.scene.instance_labels, classes)) for name in scene.instance_names]

@@ -78,14 +78,9 @@ def lights_of(
 ) -> tuple[Light, ...]:
     """Return the lights of a file, or lamps hung where it has none, and add a sentence to the notes.
 
-    Args:
-        source: What the file says.
-        light_scale: Factor of its lights; None: what brings them to `LEVEL`.
-        triangles: Of the scene [m], shape [F, 3, 3].
-        notes: Appended to.
-        turn: Takes directions and places of the file to metres with z up, shape [3, 3].
-        shift_m: Added to places [m], shape [3].
-        path: The file, for messages.
+    `light_scale` is a factor of its lights; None: what brings them to `LEVEL`. `turn` [3, 3] takes directions
+    and places of the file to metres with z up, and `shift_m` is added to places; triangles are those of the
+    scene [m].
 
     Raises:
         SceneError: There are no lights to scale by `light_scale`.

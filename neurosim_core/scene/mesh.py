@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,6 @@ from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import lights_of
-from neurosim_core.scene.materials import linear_to_srgb8
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
 from neurosim_core.scene.source import (
@@ -26,6 +26,7 @@ from neurosim_core.scene.source import (
     Source,
     rgb,
 )
+from neurosim_core.scene.srgb import linear_to_srgb8
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
 
@@ -76,18 +77,25 @@ class MeshSceneConfig(SceneConfig):
         return load_mesh_scene(self, pictures=pictures)
 
 
+DEFAULT_KIND = "apartment"
+"""Kind of a scene whose settings neither say it nor have keys of a mesh."""
+
+
+def scene_kind(settings: Mapping[str, Any]) -> str:
+    """Return the kind of a scene as its settings say it, or show it by their keys."""
+    only_mesh = MeshSceneConfig.model_fields.keys() - {"kind"} | {"path"}
+    return str(settings.get("kind", DEFAULT_KIND if only_mesh.isdisjoint(settings) else "mesh"))
+
+
 def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     """Read a mesh file: every instance in metres, z up, with materials, textures and lights.
 
     Every assumption that was made is a sentence in the scene's `notes`. Transparent and metallic materials
     become opaque Lambertian ones. Vertex and face colours become a texture in which each face has its own two
-    by two texels: bilinear lookup between three texel centres gives the linear blend of its corners.
-    Lights come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings.
-
-    Args:
-        config: The file, and how it is meant.
-        pictures: Decode textures now. Else those of glTF are decoded when they are first looked at, if ever:
-            until then no library is imported for them, and an emissive texture counts as white.
+    by two texels: bilinear lookup between three texel centres gives the linear blend of its corners. Lights
+    come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings. Without `pictures`
+    textures of glTF are decoded when they are first looked at, if ever: until then no library is imported for
+    them, and an emissive texture counts as white.
 
     Raises:
         SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is
@@ -101,20 +109,19 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     notes.insert(0, sentence)
     if not any(len(part.faces) for part in source.parts):
         raise SceneError(f"{path}: empty, there are no triangles in it")
-    parts = _placed(source.parts, path)
+    parts = source.parts
+    thin = [_place(part, path) for part in parts]
     axis, sentence = _up_axis(config, source, parts, unit_m)
     notes.insert(1, sentence)
     turn = unit_m * _TURN[axis]
     for part in parts:
-        part["positions"] = part["positions"] @ turn.T + config.position_m
-        if part["normals"] is not None:
-            part["normals"] = part["normals"] @ _TURN[axis].T
-    boxes = np.stack(
-        [extent(part["positions"].take(part["faces"], axis=0)) for part in parts if len(part["faces"])]
-    )
+        part.positions = part.positions @ turn.T + config.position_m
+        if part.normals is not None:
+            part.normals = part.normals @ _TURN[axis].T
+    boxes = np.stack([extent(part.positions.take(part.faces, axis=0)) for part in parts if len(part.faces)])
     origin = _origin(boxes)
     for part in parts:
-        part["positions"] = part["positions"] - origin
+        part.positions = part.positions - origin
     if origin.any():
         notes.append(
             f"The scene lies far from the origin: {origin.tolist()} m was subtracted from its coordinates; "
@@ -122,7 +129,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         )
     _check_extent(boxes - origin, path)
 
-    positions, faces, keep = _joined(parts, notes, path)
+    positions, faces, keep = _joined(parts, thin, notes, path)
     triangles = positions.take(faces, axis=0)
     with ThreadPoolExecutor(max_workers=1) as aside:
         shift_m, told = np.array(config.position_m) - origin, list[str]()
@@ -199,9 +206,7 @@ def _unit(config: MeshSceneConfig, source: Source) -> tuple[float, str]:
     return source.unit_m, f"Unit: {source.unit_m:g} m; {source.unit_reason}."
 
 
-def _up_axis(
-    config: MeshSceneConfig, source: Source, parts: list[dict[str, Any]], unit_m: float
-) -> tuple[Axis, str]:
+def _up_axis(config: MeshSceneConfig, source: Source, parts: list[Part], unit_m: float) -> tuple[Axis, str]:
     if config.up_axis is not None:
         return config.up_axis, f"Up axis: {config.up_axis}, as declared."
     looks = _looks_up(parts, unit_m)
@@ -221,7 +226,7 @@ def _up_axis(
     )
 
 
-def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
+def _looks_up(parts: list[Part], unit_m: float) -> Axis | None:
     """Return the axis, y or z, along which a building stands in the file; None if no building is seen.
 
     A building is flatter along its up axis than 0.6 of both other extents and as high as `_STOREY_M`. More
@@ -229,7 +234,7 @@ def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
     or more, which a lone box has not. Upright surface faces both other axes, at least half of one full wall
     each, which a stage set, a hill or a ball on a plane has not.
     """
-    triangles = unit_m * np.concatenate([part["positions"].take(part["faces"], axis=0) for part in parts])
+    triangles = unit_m * np.concatenate([part.positions.take(part.faces, axis=0) for part in parts])
     lowest, highest = extent(triangles)
     size = highest - lowest
     axis = int(np.argmin(size))
@@ -273,50 +278,28 @@ def _check_extent(boxes: NDArray[np.float64], path: Path) -> None:
         )
 
 
-def _placed(parts: list[Part], path: Path) -> list[dict[str, Any]]:
-    """Return parts with their transforms applied, in file units and axes."""
-    placed = []
-    for part in parts:
-        bad = 0
-        if not np.isfinite(part.positions).all():  # those in no face may be anything
-            bad = int((~np.isfinite(part.positions[part.faces.reshape(-1)]).all(axis=1)).sum())
-        if bad or not np.isfinite(part.matrix).all():
-            what = f"{bad} corners of its faces" if bad else "its transform"
-            raise SceneError(
-                f"{path}: {part.name!r} has NaN or infinite numbers in {what}; finite ones are needed"
-            )
-        linear = part.matrix[:3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):  # vertices in no face may be anything
-            positions = part.positions @ linear.T + part.matrix[:3, 3]
-        determinant = np.linalg.det(linear)
-        faces = part.faces[:, ::-1] if determinant < 0.0 else part.faces
-        color = part.corner_color
-        if color is not None and determinant < 0.0:
-            color = color[:, ::-1]
-        normals = part.normals
-        if normals is not None:
-            # cofactors turn normals, also where the matrix is singular; a mirror would turn them inside out
-            cofactor = np.stack(
-                [
-                    np.cross(linear[1], linear[2]),
-                    np.cross(linear[2], linear[0]),
-                    np.cross(linear[0], linear[1]),
-                ]
-            )
-            normals = normals @ cofactor.T * (-1.0 if determinant < 0.0 else 1.0)
-        placed.append(
-            {
-                "positions": positions,
-                "faces": faces,
-                "thin": _is_thin(part.positions.take(part.faces, axis=0)),
-                "normals": normals,
-                "uv": part.uv,
-                "color": color,
-                "material": part.material,
-                "instance": part.instance,
-            }
+def _place(part: Part, path: Path) -> NDArray[np.bool_]:
+    """Apply the transform of a part, for file units and axes; return which of its faces are lines."""
+    bad = 0
+    if not np.isfinite(part.positions).all():  # those in no face may be anything
+        bad = int((~np.isfinite(part.positions[part.faces.reshape(-1)]).all(axis=1)).sum())
+    if bad or not np.isfinite(part.matrix).all():
+        what = f"{bad} corners of its faces" if bad else "its transform"
+        raise SceneError(
+            f"{path}: {part.name!r} has NaN or infinite numbers in {what}; finite ones are needed"
         )
-    return placed
+    thin, linear = _is_thin(part.positions.take(part.faces, axis=0)), part.matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):  # vertices in no face may be anything
+        part.positions = part.positions @ linear.T + part.matrix[:3, 3]
+    mirrored = np.linalg.det(linear) < 0.0
+    if mirrored:
+        part.faces = part.faces[:, ::-1]
+        part.corner_color = None if part.corner_color is None else part.corner_color[:, ::-1]
+    if part.normals is not None:
+        # cofactors turn normals, also where the matrix is singular; a mirror would turn them inside out
+        cofactor = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])
+        part.normals = part.normals @ cofactor.T * (-1.0 if mirrored else 1.0)
+    return thin
 
 
 def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -329,14 +312,14 @@ def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _joined(
-    parts: list[dict[str, Any]], notes: list[str], path: Path
+    parts: list[Part], thin_of: list[NDArray[np.bool_]], notes: list[str], path: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Return the vertices of all parts as a scene rounds them, faces that have an area, and which have."""
-    start = np.cumsum([0, *(len(part["positions"]) for part in parts)])
-    positions = np.concatenate([part["positions"] for part in parts]).astype(np.float32).astype(np.float64)
-    faces = np.concatenate([part["faces"] + first for part, first in zip(parts, start, strict=False)])
+    start = np.cumsum([0, *(len(part.positions) for part in parts)])
+    positions = np.concatenate([part.positions for part in parts]).astype(np.float32).astype(np.float64)
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, start, strict=False)])
     # in the file's numbers, where a line is still exactly one, and as the scene stores them
-    thin = np.concatenate([part["thin"] for part in parts]) | _is_thin(positions.take(faces, axis=0))
+    thin = np.concatenate(thin_of) | _is_thin(positions.take(faces, axis=0))
     if thin.any():
         notes.append(f"{int(thin.sum())} of {len(faces)} faces have no area and are dropped.")
     if thin.all():
@@ -345,7 +328,7 @@ def _joined(
 
 
 def _assembled(
-    parts: list[dict[str, Any]],
+    parts: list[Part],
     positions: NDArray[np.float64],
     faces: NDArray[np.int64],
     keep: NDArray[np.bool_],
@@ -353,17 +336,17 @@ def _assembled(
     notes: list[str],
 ) -> dict[str, Any]:
     """Join parts into the arrays of a scene, without unused vertices; see `_joined`."""
-    count = [len(part["faces"]) for part in parts]
-    material = np.repeat([part["material"] for part in parts], count)[keep]
-    instance = np.repeat([part["instance"] for part in parts], count)[keep]
-    owner = np.repeat(np.arange(len(parts)), [len(part["positions"]) for part in parts])
-    uv = np.concatenate([np.zeros((len(p["positions"]), 2)) if p["uv"] is None else p["uv"] for p in parts])
+    count = [len(part.faces) for part in parts]
+    material = np.repeat([part.material for part in parts], count)[keep]
+    instance = np.repeat([part.instance for part in parts], count)[keep]
+    owner = np.repeat(np.arange(len(parts)), [len(part.positions) for part in parts])
+    uv = np.concatenate([np.zeros((len(p.positions), 2)) if p.uv is None else p.uv for p in parts])
     used_uv = uv[faces.reshape(-1)]
     if not np.isfinite(used_uv).all():
         notes.append("Texture coordinates that are not finite are taken as 0.")
         uv = np.where(np.isfinite(uv), uv, 0.0)
     normals = np.concatenate(
-        [np.zeros((len(p["positions"]), 3)) if p["normals"] is None else p["normals"] for p in parts]
+        [np.zeros((len(p.positions), 3)) if p.normals is None else p.normals for p in parts]
     )
     length = np.linalg.norm(normals, axis=1)
     given = np.isfinite(length) & (length > 0.0)
@@ -380,10 +363,8 @@ def _assembled(
                 f"{int(lacking.sum())} faces come without normals; they are computed, sharp at creases."
             )
 
-    colors = [
-        np.ones((n, 3, 3)) if p["color"] is None else p["color"] for p, n in zip(parts, count, strict=True)
-    ]
-    tinted = np.repeat([p["color"] is not None for p in parts], count)[keep]
+    colors = [np.ones((len(p.faces), 3, 3)) if p.corner_color is None else p.corner_color for p in parts]
+    tinted = np.repeat([p.corner_color is not None for p in parts], count)[keep]
     materials = list(source.materials)
     color_uv: NDArray[np.float64] | None = None
     if tinted.any():

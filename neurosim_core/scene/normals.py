@@ -23,11 +23,8 @@ def smooth_normals(
     Corners that meet at one position are joined when a chain of faces leads from one to the other over edges
     that are no creases; joined corners get the mean of their faces' normals, weighted by the corners' angles
     (Thürmer and Wüthrich 1998), so the result does not depend on how a surface is cut into triangles.
-
-    Args:
-        positions: Of each vertex, shape [V, 3]. Vertices at equal positions are one, as at a texture seam.
-        faces: Vertex indices, shape [F, 3]; of no face is the area zero.
-        group: Which object each vertex belongs to, shape [V]; objects are not smoothed into each other.
+    Vertices at equal positions are one, as at a texture seam; the objects that `group` tells apart are not
+    smoothed into each other; of no face is the area zero.
 
     Returns:
         Unit normals, shape [N, 3], and for each corner the index of its normal, shape [F, 3].

@@ -83,16 +83,10 @@ def flight_height_m(space: FreeSpace) -> float:
     return float(space.origin_m[2] + space.voxel_m * wide[len(wide) // 2])
 
 
-def report_scene(
-    file: Path | Scene, out: Path | None = None, *, device: str = "cpu", console: Console | None = None
-) -> None:
-    """Say what is in a scene, and draw it.
+def report_scene(file: Path | Scene, out: Path | None = None, *, console: Console | None = None) -> None:
+    """Say on a console (None: standard output) what is in a scene, of a file or loaded already, and draw it.
 
-    Args:
-        file: A mesh file, or a scene that is loaded already.
-        out: Where the picture goes; None: the scene's name with .png, in the working directory.
-        device: Where free space is mapped and the picture is rendered.
-        console: Where the table is printed; None: standard output.
+    The picture goes to `out`; None: the scene's name with .png, in the working directory.
 
     Raises:
         SceneError: The file cannot be used.
@@ -109,7 +103,7 @@ def report_scene(
     notes = list(scene.notes)
     more = {}
     try:
-        space = make_free_space(scene, FreeSpaceConfig(), device=device)
+        space = make_free_space(scene, FreeSpaceConfig(), device="cpu")
         notes += space.notes
         if not space.reachable(CLEARANCE_M).any():
             space = None
@@ -126,12 +120,12 @@ def report_scene(
         notes.append(f"Loaded in {loaded_s:.2f} s.")
     out = Path(f"{scene.name}.png") if out is None else out
     out.parent.mkdir(parents=True, exist_ok=True)
-    scene_picture(scene, space, device=device).save(out)
+    scene_picture(scene, space).save(out)
     for note in (*notes, f"Picture: {out}"):
         console.print(f"- {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def scene_picture(scene: Scene, space: FreeSpace | None, *, device: str = "cpu") -> Image.Image:
+def scene_picture(scene: Scene, space: FreeSpace | None) -> Image.Image:
     """Draw a scene, cut open at about eye height, from above, with the plan of its free space if it has any.
 
     Returns:
@@ -144,7 +138,7 @@ def scene_picture(scene: Scene, space: FreeSpace | None, *, device: str = "cpu")
     # under the ceiling of the storey that one flies in, over most furniture; things are whole
     cut_m = min(max(fly_m + 0.5, low + 0.5 * (high - low)), high - 0.15 * (high - low))
     opened = cut_open(scene, high if high - low < 1.8 else cut_m)
-    arrays = upload_scene(opened, RenderConfig(samples_per_pixel=4, lighting=lighting), device)
+    arrays = upload_scene(opened, RenderConfig(samples_per_pixel=4, lighting=lighting), "cpu")
     arrays.data.sky = wp.vec3(1.0 / arrays.exposure)  # white paper
     picture = Image.new("RGB", _SIZE, _PAPER)
     picture.paste(Image.fromarray(_look(arrays, *_view_from_above(opened.bounds_m), _VIEW)), (0, 0))
@@ -171,11 +165,7 @@ def scene_picture(scene: Scene, space: FreeSpace | None, *, device: str = "cpu")
 
 
 def cut_open(scene: Scene, height_m: float) -> Scene:
-    """Return the scene without what is above a height; triangles that cross it are cut.
-
-    Args:
-        scene: Triangles.
-        height_m: Where to cut, z [m].
+    """Return the scene without what is above a height z [m]; triangles that cross it are cut.
 
     Raises:
         ValueError: If nothing is below the height.

@@ -43,6 +43,10 @@ class Texture:
         """Look at the texels now: raises what is wrong with their picture."""
         self.srgb  # noqa: B018
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process gets: the texels, in place of what paints them."""
+        return {"name": self.name, "_source": self.srgb}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Material:

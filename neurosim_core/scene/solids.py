@@ -100,11 +100,9 @@ def picture_quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike) -> Par
 
 
 def frame(size: ArrayLike, *, profile: ArrayLike) -> Part:
-    """A mitred moulding around a rectangle in the plane y = 0 that faces -y.
+    """A mitred moulding around a rectangle, of width and height, in the plane y = 0 that faces -y.
 
-    Args:
-        size: Width along x and height along z of the rectangle [m].
-        profile: Distance outwards from the rectangle and y [m], from outside to inside, shape [N, 2].
+    The profile is distance outwards from the rectangle and y [m], from outside to inside, shape [N, 2].
     """
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     rings = []
@@ -121,13 +119,10 @@ def frame(size: ArrayLike, *, profile: ArrayLike) -> Part:
 
 
 def grid_surface(points: Array, uv: Array, *, normals: Array | None = None) -> Part:
-    """A smooth surface through a grid of points.
+    """A smooth surface through a grid of points [m], [M, N, 3], with texture coordinates [m], [M, N, 2].
 
-    Args:
-        points: Positions [m], shape [M, N, 3]; the front is on the side of d/dN x d/dM reversed, that is of
-            (rightwards along N) x (forwards along M).
-        uv: Texture coordinates [m], shape [M, N, 2].
-        normals: Unit normals, shape [M, N, 3]; from the grid itself when not given.
+    The front is on the side of d/dN x d/dM reversed, that is of (rightwards along N) x (forwards along M).
+    Normals come from the grid itself when not given.
     """
     rows, columns = points.shape[:2]
     if normals is None:
@@ -209,11 +204,8 @@ def _planar_uv(positions: Array, side: NDArray[np.int64], grain: int) -> Array:
 def box(size: ArrayLike, *, edge: float = 0.0, segments: int = 1, grain: int = 0) -> Part:
     """A box about the origin, sharp or rounded.
 
-    Args:
-        size: Outer edge lengths [m].
-        edge: Radius of edges and corners [m]; at most nearly half the shortest edge is used.
-        segments: Facets per half edge; 1 makes 108 triangles, 2 make 300, a sharp box has 12.
-        grain: Axis that u follows.
+    `edge` is the radius of edges and corners [m]; at most nearly half the shortest edge is used. 1 segment
+    per half edge makes 108 triangles, 2 make 300, a sharp box has 12. u follows the axis `grain`.
     """
     half = 0.5 * np.asarray(size, float)
     radius = min(edge, 0.98 * float(half.min()))
@@ -228,11 +220,8 @@ def cushion(
 ) -> Part:
     """A soft body |x/a|^p + |y/b|^q + |z/c|^r = 1 about the origin: from an egg (2) to nearly a box (8).
 
-    Args:
-        size: Outer edge lengths [m].
-        power: Exponents per axis.
-        segments: Facets along each edge; 12 * segments^2 triangles.
-        folds: Phases of two waves of 6 mm that crease its top, as of a blanket; none leave it smooth.
+    It has 12 * segments^2 triangles. `folds` are the phases of two waves of 6 mm that crease its top, as of a
+    blanket; none leave it smooth.
     """
     half = 0.5 * np.asarray(size, float)
     exponent = np.asarray(power, float)
@@ -261,15 +250,11 @@ def lathe(
     stretch: tuple[float, float] = (1.0, 1.0),
     power: float = 2.0,
 ) -> Part:
-    """A body turned about the z axis.
+    """A body turned about the z axis, of so many sides.
 
-    Args:
-        profile: Radius and height [m] of the outline, shape [N, 2], counter-clockwise seen with the axis on
-            the left: from the bottom outwards and up.
-        sides: Facets around.
-        crease: Bend of the outline from which on an edge is sharp [rad].
-        stretch: Scale along x and y.
-        power: Shape seen from above, |x|^p + |y|^p = 1: 2 is a circle, 8 nearly a square.
+    The profile is radius and height [m] of the outline, shape [N, 2], counter-clockwise seen with the axis on
+    the left: from the bottom outwards and up; an edge is sharp from a bend of `crease` on [rad]. Seen from
+    above it is |x|^p + |y|^p = 1, stretched along x and y: 2 is a circle, 8 nearly a square.
     """
     outline = np.asarray(profile, float)
     segment = np.diff(outline, axis=0)
@@ -308,13 +293,7 @@ def cylinder(size: tuple[float, float, float], *, sides: int = 24, edge: float =
 
 
 def tube(path: ArrayLike, *, radius: ArrayLike, sides: int = 8) -> Part:
-    """A round bar along a path, closed at both ends.
-
-    Args:
-        path: Points [m], shape [N, 3].
-        radius: Radius [m], one or per point.
-        sides: Facets around.
-    """
+    """A round bar along points [m], shape [N, 3], closed at both ends; one radius, or one per point."""
     spine = np.asarray(path, float)
     radii = np.broadcast_to(np.asarray(radius, float), (len(spine),))
     tangent = unit(np.gradient(spine, axis=0))

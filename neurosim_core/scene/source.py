@@ -22,7 +22,7 @@ class SceneError(ValueError):
     """A scene file cannot be used; the message names the file, what is wrong and what would do."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(kw_only=True, eq=False)
 class Part:
     """Triangles that share a material and belong to one instance."""
 

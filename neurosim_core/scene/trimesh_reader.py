@@ -13,7 +13,6 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.exchange.load import mesh_formats
 
-from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.source import (
     Part,
@@ -23,6 +22,7 @@ from neurosim_core.scene.source import (
     rgb,
     unique_name,
 )
+from neurosim_core.scene.srgb import srgb_to_linear
 
 
 def formats() -> frozenset[str]:
@@ -63,12 +63,7 @@ class _TextureStore:
 
 
 def read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> Source:
-    """Read a file.
-
-    Args:
-        path: Of the file.
-        suffix: Its format; one of `formats`.
-        textures_required: A picture that is not there is an error.
+    """Read a file of one of `formats`; a picture that is not there is an error if `textures_required`.
 
     Raises:
         SceneError: It cannot be read.

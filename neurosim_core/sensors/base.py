@@ -125,9 +125,7 @@ class Sampler(ABC):
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
         """Return one sample of one world as a packet; None: it is lost, and the sequence shows the gap.
 
-        Args:
-            rows: The sample's element of each array, on the host.
-            header: `stamp_ns`, `sequence` and `sensor` of the packet.
+        `rows` has the sample's element of each array, on the host; the packet passes the header on.
         """
 
     def reset(self, mask: Any) -> None:  # noqa: B027  (most sensors have no memory)
@@ -307,11 +305,9 @@ class PictureSensorConfig(RenderedConfig):
         return {}
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet.
+        """Return a picture as a packet, which keeps it and passes the header on.
 
-        Args:
-            picture: The output of the renderer on the host, shape [H, W] or [H, W, C]; the packet's to keep.
-            header: `stamp_ns`, `sequence` and `sensor` of the packet.
+        The picture is the output of the renderer on the host, shape [H, W] or [H, W, C].
         """
         raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
 
@@ -408,10 +404,8 @@ class WorldFrameSensor(Protocol):
     def find(self, clock_ns: Any, offsets_ns: tuple[int, ...], parity: int) -> None:
         """Look at the frames of a step; launches only, on CUDA.
 
-        Args:
-            clock_ns: Time of each world at the begin of the step [ns], int64, shape [N].
-            offsets_ns: From there to the last frame seen before (<= 0), and to each frame [ns].
-            parity: Which of the two states is the present one.
+        `clock_ns` is the time of each world at the begin of the step [ns], int64, shape [N]; `offsets_ns`
+        lead from there to the last frame seen before (<= 0), and to each frame [ns].
         """
 
     def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
@@ -443,11 +437,7 @@ class FrameSensorConfig(CameraConfig):
         raise NotImplementedError(f"{type(self).__name__} must say how it is made")
 
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
-        """Return for how many results of each world there is room in a step.
-
-        Args:
-            world_count: Number of worlds N.
-            event_capacity: What the user asks for; None: as the sensor likes.
+        """Return for how many results of each world there is room in a step, as asked or as the sensor likes.
 
         Raises:
             ValueError: They are more than can be counted.

@@ -26,10 +26,7 @@ What a ray hits of a moving body is a point of the body, and moves with it: wher
 function of time. The corners of the bounding boxes of bodies count as well, whether something hides them or
 not, if the box overlaps the picture and the corner is no further outside of it than the picture is large.
 
-It pays where a flight has slow and fast parts, as renders follow the speed. At an even speed it does not: in
-the generated apartment at 0.54 m/s, 96x72 pixels and 0.1 to 0.2 px, a fixed rate of the same error needed
-3 to 7 % fewer renders, and 14 to 18 % less CPU time. What a render costs should be more than what the choice
-costs for the ticks between two renders: on a fast GPU and a small picture a fixed rate may be cheaper.
+It pays where a flight has slow and fast parts (docs/decisions/adaptive-sampling.md).
 
 Limit: an object of the scene that no ray hits is not seen to move. It is narrower than the spacing, and it
 moves at most by f |t| / z px relative to the far background, for the translation t of the camera between two
@@ -65,9 +62,7 @@ from neurosim_core.sensors.displacement_kernels import (
 )
 
 PROBE_SPACING_PX = 16
-"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render. Flying sideways
-through the generated apartment and a furnished house at 346x260, what moved most by a grid of 3 px moved at
-most 5 % further than allowed over 480 renders; with 32 px it was 14 %, with 8 px 2 %."""
+"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render."""
 
 _BLOCK = 64
 """Ticks that are chosen from together; on CUDA all pairs of them are compared."""
@@ -104,19 +99,11 @@ class DisplacementRule:
         p_BC: wp.vec3d,
         q_BC: wp.quatd,
         motions: Any = None,
-        spacing_px: int = PROBE_SPACING_PX,
     ) -> None:
         """Allocate the buffers.
 
-        Args:
-            arrays: The scene.
-            lens: Of the camera.
-            max_displacement_px: How far a point may move between two renders [px].
-            rate: The clock whose ticks are chosen from.
-            p_BC: Position of the camera on the body [m].
-            q_BC: Orientation of the camera against the body, xyzw.
-            motions: Of the bodies, device array of `scene.bodies.Motion`; None: as the scene has them.
-            spacing_px: Distance between probes [px].
+        `rate` is the clock whose ticks are chosen from; `motions` of the bodies are a device array of
+        `scene.bodies.Motion`, by default as the scene has them.
         """
         self.coarse_count = 0
         self._limit_px = max_displacement_px
@@ -125,9 +112,9 @@ class DisplacementRule:
         self._mesh = arrays.mesh_id
         self._device = device = arrays.device
         self._on_cpu = wp.get_device(device).is_cpu
-        self._spacing_px = float(spacing_px)
-        self._columns = math.ceil(lens.width / spacing_px) + 2  # one beyond each border
-        self._probe_count = self._columns * (math.ceil(lens.height / spacing_px) + 2) + 4
+        self._spacing_px = float(PROBE_SPACING_PX)
+        self._columns = math.ceil(lens.width / PROBE_SPACING_PX) + 2  # one beyond each border
+        self._probe_count = self._columns * (math.ceil(lens.height / PROBE_SPACING_PX) + 2) + 4
         self._lens = Pinhole()
         self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens.intrinsics()
         self._lens.width, self._lens.height = lens.width, lens.height
@@ -186,23 +173,17 @@ class DisplacementRule:
         slots: Sequence[int],
         stamps_ns: Sequence[int],
         forced: Sequence[bool],
-        *,
-        vehicle: int = 0,
     ) -> list[int]:
         """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
 
-        Args:
-            states: Where the flight is, as in `Trace.states`, float64, shape [slot, vehicle, >= 13].
-            slots: Slots of consecutive ticks of the clock.
-            stamps_ns: Their stamps [ns], later than those of the call before.
-            forced: Ticks that are rendered in any case; the very first always is.
-            vehicle: Which vehicle carries the camera.
+        Slots are of `states` (`Trace.states`) and of consecutive ticks of the clock, later than those of the
+        call before. Ticks that are `forced` are rendered in any case; the very first always is.
         """
         self.coarse_count = 0
         chosen: list[int] = []
         for begin in range(0, len(slots), self._block):
             block = slice(begin, begin + self._block)
-            self._load(states, slots[block], stamps_ns[block], vehicle)
+            self._load(states, slots[block], stamps_ns[block])
             found = [begin + tick for tick in self._choose(forced[block])]
             self._last_ns = stamps_ns[found[-1]] if found else self._last_ns
             chosen += found
@@ -232,7 +213,7 @@ class DisplacementRule:
             )
         return chosen
 
-    def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int], vehicle: int) -> None:
+    def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int]) -> None:
         """Bring the poses of a block to the device."""
         count = len(slots)
         first = self._rate.first_tick(stamps_ns[0])
@@ -246,7 +227,7 @@ class DisplacementRule:
         wp.launch(
             load_poses,
             dim=count,
-            inputs=[*self._mount, states, vehicle, self._slots, self._step_s],
+            inputs=[*self._mount, states, 0, self._slots, self._step_s],
             outputs=[self._poses],
             device=self._device,
         )

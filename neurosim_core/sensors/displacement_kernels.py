@@ -44,12 +44,9 @@ class Poses:
 class Bodies:
     """What moves by itself; empty if nothing does. Row 0: at the last render; a row more than in `Poses`."""
 
-    mesh: wp.array[wp.uint64]
-    """Trees in the frames of the bodies, shape [B]."""
-    corners: wp.array2d[wp.vec3d]
-    """Of the bounding boxes, in the frames of the bodies [m], shape [B, 8]."""
-    p_WO: wp.array2d[wp.vec3d]
-    """Shape [row, B]."""
+    mesh: wp.array[wp.uint64]  # Trees in the frames of the bodies, shape [B]
+    corners: wp.array2d[wp.vec3d]  # Of the bounding boxes, in the frames of the bodies [m], shape [B, 8]
+    p_WO: wp.array2d[wp.vec3d]  # Shape [row, B]
     q_WO: wp.array2d[wp.quatd]
 
 

@@ -22,32 +22,29 @@ Rate = Annotated[float, Field(ge=0.0, le=1e6)]
 Decades = Annotated[float, Field(ge=0.0, le=2.0)]
 
 
+class _ThresholdNoiseConfig(NoiseTermConfig):
+    """Thresholds that differ from the nominal ones by normal numbers."""
+
+    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold upwards, in log radiance."""
+    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold downwards, in log radiance."""
+    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
+    """Smaller thresholds are raised to this one."""
+
+
 @register("noise", "threshold_spread")
-class ThresholdSpreadConfig(NoiseTermConfig):
+class ThresholdSpreadConfig(_ThresholdNoiseConfig):
     """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
 
     compiled = ("spread",)
 
-    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold upwards, in log radiance."""
-    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold downwards, in log radiance."""
-    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
-    """Smaller thresholds are raised to this one."""
-
 
 @register("noise", "threshold_jitter")
-class ThresholdJitterConfig(NoiseTermConfig):
+class ThresholdJitterConfig(_ThresholdNoiseConfig):
     """Thresholds that are drawn anew after each event, around those of the pixel, as in ESIM."""
 
     compiled = ("jitter",)
-
-    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold upwards, in log radiance."""
-    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold downwards, in log radiance."""
-    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
-    """Smaller thresholds are raised to this one."""
 
 
 @register("noise", "lin_log")

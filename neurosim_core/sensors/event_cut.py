@@ -49,14 +49,8 @@ def prepare(
 ) -> None:
     """Set `late` on keys that come after the end of a window within its microsecond; threads are the room.
 
-    Keys beyond the count get to sort behind all others.
-
-    Args:
-        told: How many keys there are, and what else `decode_windows` is told.
-        bounds: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
-        window_count: How many there are.
-        time_shift: Bits of a key below its microseconds.
-        keys: Keys, in any order; overwritten.
+    Keys beyond the count get to sort behind all others. `bounds` are the ends of windows from the keys' time
+    origin [ns], at least 1 us apart; what else is `told` is for `decode_windows`.
     """
     event = wp.tid()
     if wp.int64(event) < told[COUNT]:
@@ -83,17 +77,7 @@ def carry_over(
     keys_out: wp.array[wp.int64],
     first_out: wp.int32,
 ) -> None:
-    """Copy keys, from and to a position, with a time origin that is later, and clear `late`.
-
-    Args:
-        keys: Where they are.
-        first: The first of them.
-        count: How many; at most the threads.
-        origin_step_us: How much later the origin is [us].
-        time_shift: Bits of a key below its microseconds.
-        keys_out: Where they go.
-        first_out: Where the first of them goes.
-    """
+    """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
     event = wp.tid()
     if event < count:
         keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
@@ -132,15 +116,7 @@ def find_ends(
     # Out:
     end_out: wp.array[wp.int32],
 ) -> None:
-    """Find where each window ends in the sorted keys.
-
-    Args:
-        keys: Keys after `prepare`, sorted.
-        key_count: Number of keys.
-        stamps: Ends of windows from the keys' time origin [ns], shape [window].
-        time_shift: Bits of a key below its microseconds.
-        end_out: Index of the first key after each window, shape [window].
-    """
+    """Find the first key after each window, in sorted keys that `prepare` has seen; see there."""
     window = wp.tid()
     end_out[window] = count_until(stamps[window], keys, key_count, time_shift)
 
@@ -149,8 +125,7 @@ def find_ends(
 class Event:
     """What a key says."""
 
-    time_us: wp.int64
-    """From the keys' time origin."""
+    time_us: wp.int64  # From the keys' time origin
     x: wp.uint16
     y: wp.uint16
     polarity: wp.uint8
@@ -183,18 +158,7 @@ def decode(
     y_out: wp.array[wp.uint16],
     polarity_out: wp.array[wp.uint8],
 ) -> None:
-    """Take keys apart into time [us], column, row and polarity, arrays of shape [event].
-
-    Args:
-        keys: Keys.
-        time_origin_us: Origin of the keys' time [us].
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        t_out: Time [us].
-        x_out: Column.
-        y_out: Row.
-        polarity_out: 1: brighter, 0: darker.
-    """
+    """Take keys apart into time [us], column, row and polarity, arrays of shape [event]."""
     event = wp.tid()
     found = take_apart(keys[event], row_shift, time_shift)
     t_out[event] = time_origin_us + found.time_us
@@ -220,18 +184,8 @@ def decode_windows(
 ) -> None:
     """Do what `find_ends` and `decode` do, for at least one key; threads are the room.
 
-    Args:
-        told: How many keys there are; for how many the columns have room, an even number; and the origin of
-            their time [us].
-        bounds: Ends of windows from there [ns].
-        window_count: How many there are.
-        keys: Keys after `prepare`, sorted.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        columns_8: One block of memory, given as three types: in it are the columns, one after the other.
-        columns_2: The same block.
-        columns_1: The same block.
-        end_out: Index of the first key after each window, shape [window].
+    `told` are: how many keys there are; for how many the columns have room, an even number; the origin of
+    their time [us]. The columns are one block of memory, given as three types, one after the other in it.
     """
     event = wp.tid()
     count = wp.int32(told[COUNT])

@@ -40,18 +40,7 @@ def as_frames(value: Any, shape: tuple[int, ...], device: Any) -> Any:
 def check_stack(
     log_radiance: Any, stamps: NDArray[np.int64], shape: tuple[int, int], device: Any, *, after_ns: int
 ) -> None:
-    """Check that a Warp array is a stack of frames for a camera.
-
-    Args:
-        log_radiance: Frames.
-        stamps: Their times [ns], shape [K].
-        shape: Rows and columns of the camera.
-        device: Of the camera.
-        after_ns: Time of the frame before [ns].
-
-    Raises:
-        ValueError: It is not.
-    """
+    """Refuse a Warp array that is no stack of frames for a camera, or stamps [ns] not after a stamp."""
     count = len(stamps)
     fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == shape
     if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):

@@ -63,15 +63,7 @@ class Labeller(Protocol):
 
 
 class EventKeys:
-    """The keys of one camera, of all that has been read from its scans.
-
-    Args:
-        pixel_count: Pixels of the camera.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        device: Where they are.
-        on_host: Take events apart for the host.
-        labels: Is told of the events of each cut; None: nobody is.
+    """The keys of one camera, of all that has been read from its scans; `labels` is told of each cut.
 
     Attributes:
         keys: The first `count` of them are keys, in any order; its room is at least that.
@@ -191,9 +183,7 @@ class EventKeys:
     def cut(self, ends_ns: Sequence[int], end_bit: int) -> tuple[list[Any], list[int]]:
         """Sort the keys and return them as columns, and the index of the first event after each window.
 
-        Args:
-            ends_ns: Ends of the windows [ns], at least one.
-            end_bit: Beyond the highest bit that a key may have.
+        There is one end of a window at least [ns]; `end_bit` is beyond the highest bit that a key may have.
         """
         count = self.count
         if count == 0:

@@ -239,16 +239,7 @@ class EventLabels:
             wp.copy(self._flown, self._history.count)
 
     def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
-        """Launch the search for the truth of events, and its copy to the host.
-
-        Args:
-            count: How many there are.
-            t: Their times [us], int64.
-            x: In it are their columns, uint16.
-            y: In it are their rows, uint16.
-            first_x: Where the columns begin.
-            first_y: Where the rows begin.
-        """
+        """Launch the search for the truth of events, and its copy to the host; see `Labeller.launch`."""
         self._count, self._taken = count, 0
         if not self._geometry or count == 0:
             return

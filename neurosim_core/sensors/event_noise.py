@@ -155,16 +155,9 @@ def read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
 
 
 class PixelNoise:
-    """The pixels of an event camera that are not ideal: what stays, what they remember, and their scan.
+    """The pixels of an event camera that are not ideal: what stays, and what they remember, in a ring.
 
-    Args:
-        config: What they are like.
-        pixel_count: How many there are.
-        ring_size: How many states are kept.
-        seed: Seed of the run, 0 <= seed < 2^64.
-        sensor: Name of the camera; two of them with different names have independent noise.
-        device: Warp device.
-        terms: The terms to compile in; by default those that the configuration asks for.
+    Cameras with different names have independent noise.
 
     Attributes:
         terms: The terms that are compiled in.

@@ -98,20 +98,13 @@ class Memory:
 
     reference: wp.array[wp.float64]
     """What `base` is to an ideal pixel; changes at resets (refractory, spontaneous) and events (jitter)."""
-    event_count: wp.array[wp.int32]
-    """Events since the reset, which number the draws of thresholds."""
-    filtered: wp.array[wp.float64]
-    """Output of the photoreceptor."""
-    exposure_ns: wp.array[wp.float64]
-    """Light since the reset, in units of white, times time."""
-    held_ns: wp.array[wp.float64]
-    """Time in reset that is left; negative: not in reset."""
-    next_ns: wp.array[wp.int64]
-    """Time of the next noise event that may be, since the reset."""
-    noise_count: wp.array[wp.int32]
-    """Its number."""
-    voltage: wp.array[wp.float64]
-    """Of the Brownian motion, in thresholds."""
+    event_count: wp.array[wp.int32]  # Events since the reset, which number the draws of thresholds
+    filtered: wp.array[wp.float64]  # Output of the photoreceptor
+    exposure_ns: wp.array[wp.float64]  # Light since the reset, in units of white, times time
+    held_ns: wp.array[wp.float64]  # Time in reset that is left; negative: not in reset
+    next_ns: wp.array[wp.int64]  # Time of the next noise event that may be, since the reset
+    noise_count: wp.array[wp.int32]  # Its number
+    voltage: wp.array[wp.float64]  # Of the Brownian motion, in thresholds
 
 
 def terms_of(config: EventCameraConfig) -> tuple[str, ...]:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,15 +16,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.launch import core_count
+from neurosim_core.render.launch import core_count, share
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.sensors import event_worlds_scan
-from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+from neurosim_core.sensors.event_states import PixelStates
 from neurosim_core.warp_start import refuse_forked_process
 
 _log = logging.getLogger(__name__)
@@ -123,104 +119,33 @@ class Scan:
 
 
 class Pixels:
-    """The pixels of one camera.
+    """The pixels of one camera that is fed stacks, on a CPU in chunks for its cores.
 
-    Args:
-        config: Thresholds, limits, and what is not ideal.
-        width: Columns.
-        height: Rows.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        ring_size: States that there is room for: one more than scans may be under way.
-        device: Where they are.
-        sensor: Name of the sensor, for its noise.
-        seed: Seed of the run.
-        terms: What is compiled in beyond ideal pixels: some of `event_noise_model.TERMS`.
-
-    Attributes:
-        base: Log radiance of the reset, shape [pixel].
-        noise: What is not ideal; None: nothing.
-        screened: Frames that are quiet are skipped first, as is fast on a CPU.
+    `states` has one more than scans may be under way.
     """
 
-    def __init__(
-        self,
-        config: EventCameraConfig,
-        *,
-        width: int,
-        height: int,
-        row_shift: int,
-        time_shift: int,
-        ring_size: int,
-        device: Any,
-        sensor: str,
-        seed: int,
-        terms: Sequence[str],
-    ) -> None:
-        self._thresholds: Any = wp.array(
-            [(config.threshold_on, config.threshold_off)], dtype=wp.vec2d, device=device
-        )
+    def __init__(self, states: PixelStates, *, width: int, height: int, device: Any) -> None:
+        self.states = states
         self._width, self._height = width, height
-        self._row_shift, self._time_shift = row_shift, time_shift
         self._device = device
-        pixel_count = width * height
-        self.base = self._empty(pixel_count, wp.float32)
-        self._last = [self._empty((1, pixel_count), wp.float32) for _ in range(ring_size)]
-        self._crossed = [self._empty((1, pixel_count), wp.vec2i) for _ in range(ring_size)]
-        self._lead = wp.zeros((1, pixel_count), dtype=wp.int32, device=device)
-        self._scan: Any = event_worlds_scan.scan
-        self.noise: PixelNoise | None = None
-        if terms:
-            self.noise = PixelNoise(
-                config,
-                pixel_count=pixel_count,
-                ring_size=ring_size,
-                seed=seed,
-                sensor=sensor,
-                device=device,
-                terms=terms,
-            )
-            self._scan = event_worlds_scan.make_noisy_scan(frozenset(terms))
-            self._begin_noise = make_begin(signal_terms(terms))
-            wp.load_module(self._begin_noise.module, device=device)
-            self._models: Any = wp.array([self.noise.model], dtype=PixelModel, device=device)
-            self._memories: list[Any] = [
-                wp.array([self.noise.memory(slot)], dtype=Memory, device=device) for slot in range(ring_size)
-            ]
-        self.screened = device.is_cpu and self.noise is None
-        scratch = pixel_count if self.screened else 0
-        self._quiet_range = [self._empty((1, scratch), wp.float32) for _ in range(2)]
         self._table = self._empty((1, 1, height), wp.int32)
         self._overflow = wp.ones(1, dtype=wp.int32, device=device)
         self._bounds = self._chunk_bounds()
-        self._key_room = _KEYS_PER_PIXEL * pixel_count
+        self._key_room = _KEYS_PER_PIXEL * width * height
         self._scan_number = itertools.count()
-        self._pool: ThreadPoolExecutor | None = None
-        for module in (event_worlds_scan, self._scan.module):
-            wp.load_module(module, device=device)
+
+    @property
+    def noise(self) -> PixelNoise | None:
+        """What is not ideal; None: nothing."""
+        return self.states.noise[0] if self.states.noise else None
 
     def reset(self, log_radiance: wp.array2d[wp.float32], stamp_ns: int) -> None:
         """Make a frame every pixel's reference; the first state of the ring is the one that follows."""
-        wp.copy(self.base, log_radiance.flatten())
-        wp.copy(self._last[0].flatten(), self.base)
-        self._crossed[0].zero_()
-        if self.noise is not None:
-            self.noise.set_reset(stamp_ns)
-            wp.copy(self._models, wp.array([self.noise.model], dtype=PixelModel, device=self._device))
-            phase_stream, random_phase = self.noise.phase()
-            wp.launch(
-                self._begin_noise,
-                dim=(1, self.base.shape[0]),
-                inputs=[
-                    self._models,
-                    phase_stream,
-                    wp.array([random_phase], dtype=wp.bool, device=self._device),
-                    self._overflow,
-                    self.base.reshape((1, -1)),
-                ],
-                outputs=[self._memories[0]],
-                device=self._device,
-            )
+        wp.copy(self.states.base.flatten(), log_radiance.flatten())
+        wp.copy(self.states.last[0], self.states.base)
+        self.states.crossed[0].zero_()
+        self.states.set_reset(stamp_ns)
+        self.states.begin_noise(self._overflow, 0)
 
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
@@ -228,7 +153,7 @@ class Pixels:
 
     def next_state(self, state: int) -> int:
         """Return where in the ring the state after another is."""
-        return (state + 1) % len(self._last)
+        return (state + 1) % len(self.states.last)
 
     @property
     def chunk_count(self) -> int:
@@ -236,12 +161,7 @@ class Pixels:
         return len(self._bounds)
 
     def make_scan(self, frame_count: int, *, keys: wp.array[wp.int64] | None = None) -> Scan:
-        """Return buffers for stacks of at most `frame_count` frames.
-
-        Args:
-            frame_count: Most frames.
-            keys: Where its keys go if there is one chunk; None: to buffers of its own.
-        """
+        """Return buffers for stacks of at most so many frames; keys of one chunk go to `keys`, if given."""
         first_time = len(self._bounds) * _COUNTERS_ROOM
         inputs = HostInput(wp.zeros(first_time + frame_count + 2, dtype=wp.int64, device=self._device))
         chunks = []
@@ -304,48 +224,18 @@ class Pixels:
 
         def launch(chunk: Chunk) -> None:
             scan.inputs.upload()
-            stack = self._stack(scan, chunk)
-            extent = [0, chunk.first_pixel, chunk.end_pixel, len(scan.stamps_ns)]
-            pixel_count = chunk.end_pixel - chunk.first_pixel
-            base = self.base.reshape((1, -1))
-            if self.screened:
-                wp.launch(
-                    event_worlds_scan.screen,
-                    dim=(1, -(-pixel_count // TILE_SIZE)),
-                    inputs=[self._thresholds, *extent, stack, base, self._crossed[before]],
-                    outputs=[*self._quiet_range, self._lead],
-                    device=self._device,
-                )
-            block = BLOCK_SIZE if self._device.is_cuda else 1
-            ideal = self.noise is None
-            memory = [[] if ideal else [self._memories[slot]] for slot in (before, after)]
-            wp.launch(
-                self._scan,
-                dim=(
-                    1,
-                    -(-pixel_count // block) * block,
-                ),  # whole blocks: their threads reserve slots together
-                block_dim=BLOCK_SIZE,
-                inputs=[
-                    self._thresholds if ideal else self._models,
-                    self._width,
-                    self._row_shift,
-                    self._time_shift,
-                    *extent,
-                    event_worlds_scan.COUNT if tabulate else event_worlds_scan.ALL,
-                    *([self._lead] if ideal else []),
-                    base,
-                    self._last[before],
-                    self._crossed[before],
-                    *memory[0],
-                    stack,
-                ],
-                outputs=[self._last[after], self._crossed[after], *memory[1]],
-                device=self._device,
+            self.states.launch(
+                self._stack(scan, chunk),
+                before,
+                after,
+                frame_count=len(scan.stamps_ns),
+                part=event_worlds_scan.COUNT if tabulate else event_worlds_scan.ALL,
+                pixels=(chunk.first_pixel, chunk.end_pixel),
             )
             chunk.counters_on_host.fetch(0, _COUNTERS)
 
-        self._share(launch, scan.chunks)
+        refuse_forked_process()
+        share(launch, scan.chunks)  # several on a CPU, one for each core
 
     def _stack(self, scan: Scan, chunk: Chunk) -> Any:
         """Return what the kernels take for a chunk of a scan: the arrays of one world."""
@@ -359,16 +249,6 @@ class Pixels:
         stack.keys = chunk.keys.reshape((1, -1))
         stack.counters = chunk.counters.reshape((1, -1))
         return stack
-
-    def _share(self, launch: Callable[[Chunk], None], chunks: list[Chunk]) -> None:
-        """Launch for all chunks; there are several on a CPU, which go to its cores."""
-        refuse_forked_process()
-        if len(chunks) > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
-        futures = [self._pool.submit(launch, chunk) for chunk in chunks[1:]] if self._pool else []
-        launch(chunks[0])
-        for future in futures:
-            future.result()
 
     def _chunk_bounds(self) -> list[tuple[int, int]]:
         pixel_count = self._width * self._height

@@ -72,22 +72,16 @@ class _Bus:
     seed: wp.uint64
     stream: wp.uint32
     pixel_shift: wp.int32
-    free: wp.array[wp.int64]
-    """When the bus is free, shape [1]."""
+    free: wp.array[wp.int64]  # When the bus is free, shape [1]
     ready: wp.array[wp.int64]
     """With a handshake: when the event of a pixel is read, shape [pixel]; else empty."""
     # by rows only
-    place: wp.array[wp.int64]
-    """Row, column and polarity of events that wait, shape [queue_length]."""
-    following: wp.array[wp.int32]
-    """The next event of the same row, or the next free place."""
-    head: wp.array[wp.int32]
-    """First event of each row; -1: none."""
+    place: wp.array[wp.int64]  # Row, column and polarity of events that wait, shape [queue_length]
+    following: wp.array[wp.int32]  # The next event of the same row, or the next free place
+    head: wp.array[wp.int32]  # First event of each row; -1: none
     tail: wp.array[wp.int32]
-    asked: wp.array[wp.int64]
-    """When the first event of each row came."""
-    rows: wp.array[wp.int32]
-    """Rows in the order in which they are read, a ring."""
+    asked: wp.array[wp.int64]  # When the first event of each row came
+    rows: wp.array[wp.int32]  # Rows in the order in which they are read, a ring
 
 
 @wp.func
@@ -173,15 +167,8 @@ def _read_events(
 ) -> None:
     """Read events one by one; the time at which each will be read is known when it comes.
 
-    Args:
-        bus: Parameters and memory.
-        arrivals: Keys of `_by_nanosecond`, sorted.
-        count: How many.
-        origin_ns: Origin of the keys, since the reset [ns].
-        first_out: Where the keys of the events read go.
-        keys_out: Keys of events at the time when they are read.
-        dropped_ns_out: When lost events came, from the keys' origin [ns].
-        counters: Overwritten; see _READ and the others.
+    `arrivals` are sorted keys of `_by_nanosecond`, with their origin from the reset [ns]; what is read goes
+    to `keys_out` from `first_out` on; of lost events the time from the keys' origin is noted [ns].
     """
     free = bus.free[0]
     read = wp.int32(0)
@@ -292,20 +279,9 @@ def _read_rows(
 
 
 class Readout:
-    """The arbiter of one event camera and the events that wait for it.
+    """The arbiter of one event camera and the events that wait for it, `waiting_count` now.
 
-    Args:
-        config: Its parameters.
-        height: Rows of the sensor [px].
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        pixel_shift: Bits of a key below its column, without what is not of the place of the pixel.
-        device: Where the keys are.
-        seed: Seed of the run, for late stamps.
-        sensor: Name of the camera, likewise.
-
-    Attributes:
-        waiting_count: Events that wait now.
+    `pixel_shift`: bits of a key below its column, without what is not of the place of the pixel.
     """
 
     def __init__(
@@ -380,14 +356,9 @@ class Readout:
     ) -> int:
         """Replace the keys of events that have happened by those of events that are read; return how many.
 
-        Args:
-            keys: Overwritten from `first` on; room for `count` + `waiting_count` keys is needed there.
-            first: Where they begin.
-            count: Events that have happened since the last call, in any order.
-            spare: Overwritten; at least `count` keys, on CUDA twice as many.
-            order: On CUDA overwritten, room like that of `spare`.
-            origin_us: Origin of the keys' time [us].
-            now_ns: All events until then have happened [ns].
+        All events until `now_ns` have happened: `count` keys from `first` on, in any order; room for
+        `waiting_count` more is needed there. `spare` and, on CUDA, `order` are overwritten; they have room
+        for `count` keys, on CUDA for twice as many.
         """
         wp.launch(
             _by_nanosecond,

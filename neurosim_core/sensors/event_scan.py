@@ -197,33 +197,13 @@ def scan_pixel(
 ) -> None:
     """Take one pixel from its state before a stack to that after it.
 
-    All threads of a block come here together, also those whose pixel is past the end.
-
-    Args:
-        threshold_on: Step of log radiance upwards.
-        threshold_off: Step of log radiance downwards.
-        width: Pixels per row.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        pixel: Which.
-        end_pixel: End of the pixels.
-        lane: Number of the thread in its block.
-        log_radiance: Frames, shape [frame, pixel], contiguous.
-        stamps: Of the state and of each frame, from the origin [ns].
-        frame_count: Frames to scan.
-        lead: Frames at the start that are known to be quiet, shape [pixel].
-        row_limit: Rows whose events are kept, shape [frame].
-        base: Log radiance of the reset, shape [pixel].
-        last: Last sample, shape [pixel].
-        crossed: Levels crossed upwards and downwards, shape [pixel].
-        tabulate: Only count events, by frame and row.
-        last_out: `last` after the stack.
-        crossed_out: `crossed` after the stack.
-        keys_out: Where keys go, as many as there is room for.
-        counters_out: Where the next key goes, which counts events kept (written or not); invalid samples; and
-            the flat index of the first of these in the stack, as frame_count * pixel_count minus it: zero
-            both before.
-        table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
+    All threads of a block come here together, also those whose pixel is past the end; `lane` is the number of
+    the thread in it. Shapes: frames [frame, pixel], contiguous; stamps [frame + 1], of the state and of each
+    frame, from the origin [ns]; `lead`, the frames at the start that are known to be quiet, and the states of
+    pixels [pixel]; `row_limit`, the rows whose events are kept [frame]. With `tabulate` events are only
+    counted, in a table [frame, row] of zeros. Counters: where the next key goes, which counts events kept
+    (written or not); invalid samples; and the flat index of the first of these in the stack, as frame_count *
+    pixel_count minus it: zero both before.
     """
     alive = pixel < end_pixel
     base_32 = wp.float32(0.0)

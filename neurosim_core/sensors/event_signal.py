@@ -27,8 +27,7 @@ class Signal:
     slope: wp.float64
     decay: wp.float64
     tau: wp.float64
-    last: wp.float64
-    """Value at the end."""
+    last: wp.float64  # Value at the end
 
 
 @wp.struct
@@ -36,8 +35,7 @@ class Crossing:
     """An event found in a piece, or none."""
 
     time_ns: wp.float64
-    polarity: wp.int32
-    """-1: none."""
+    polarity: wp.int32  # -1: none
     voltage: wp.float64
 
 
@@ -162,10 +160,7 @@ def _inverse_gaussian(
 def _touch(near: wp.float64, far: wp.float64, variance: wp.float64) -> wp.float64:
     """Return the probability that a Brownian bridge touches a threshold; 0 below 4e-18.
 
-    Args:
-        near: Distance of its begin to the threshold, > 0.
-        far: Distance of its end; <= 0: beyond.
-        variance: Of a free motion of this length.
+    Its begin is `near` > 0 from the threshold, its end `far` (<= 0: beyond).
     """
     if far <= _ZERO:
         return _ONE
@@ -190,21 +185,9 @@ def first_passage(
     now: wp.float64,
     end: wp.float64,
 ) -> Crossing:
-    """Move the voltage from now to the end, or to where it first touches +on or -off.
+    """Move the voltage from now to the end [ns], or to where it first touches +on or -off, it is between.
 
-    Args:
-        seed: Address of the random numbers.
-        step_stream: Of the increment.
-        touch_stream: Of what happened within.
-        step: No other piece of the pixel has it.
-        pixel: Index of the pixel.
-        voltage: Between -off and on.
-        on: Threshold upwards.
-        off: Threshold downwards.
-        drift: Per ns.
-        deviation: Per root ns.
-        now: Begin [ns].
-        end: End [ns].
+    Drift is per ns, deviation per root ns; no other piece of the pixel has the same `step`.
     """
     span_ns = end - now
     variance = deviation * deviation * span_ns

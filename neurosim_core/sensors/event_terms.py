@@ -18,12 +18,9 @@ from neurosim_core.settings import Settings
 class SignalTerm:
     """What the device function of a term reads that stays."""
 
-    numbers: wp.vec4d
-    """`NoiseTermConfig.numbers`."""
-    seed: wp.uint64
-    """Seed of what stays in the pixels."""
-    stream: wp.uint32
-    """Of the random numbers of the term in this camera."""
+    numbers: wp.vec4d  # `NoiseTermConfig.numbers`
+    seed: wp.uint64  # Seed of what stays in the pixels
+    stream: wp.uint32  # Of the random numbers of the term in this camera
 
 
 _SIGNAL = (SignalTerm, wp.uint64, wp.int32, wp.int64, wp.float64)

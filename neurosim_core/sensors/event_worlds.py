@@ -4,23 +4,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from neurosim_core.render.launch import core_count
+from neurosim_core.render.launch import core_count, share
 from neurosim_core.sensors import event_worlds_scan as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
-from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise import PixelNoise
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
-from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+from neurosim_core.sensors.event_noise_model import terms_of
+from neurosim_core.sensors.event_scan import BLOCK_SIZE
+from neurosim_core.sensors.event_states import PixelStates
 
 _SORT_BLOCK_SIZE = 1024
 """Threads that sort the events of a world, where there may be many."""
@@ -76,16 +73,8 @@ class WorldEventCamera:
     with more than `capacity` events each of its K renders keeps `capacity / K` at most, the rows from the top
     that fit, and the others are counted in `dropped`.
 
-    Args:
-        configs: The pixels of each world.
-        width: Width of the sensor [px].
-        height: Height of the sensor [px].
-        frames: Log radiance of all worlds, float32, shape [world, K, pixel]; read at each scan.
-        capacity: Room for events of one world in one step.
-        sensor: Name of the sensor: noise depends on it.
-        seeds: Of each world.
-        ordered: Sort the events.
-        takes_apart: Have room for `results`; False: somebody else reads the keys.
+    Frames are log radiance of all worlds, float32, shape [world, K, pixel], read at each scan. Without
+    `takes_apart` there is no room for `results`: somebody else reads the keys.
     """
 
     def __init__(
@@ -103,29 +92,28 @@ class WorldEventCamera:
     ) -> None:
         self.device: Any = wp.get_device(frames.device)
         world_count, frame_count, pixel_count = frames.shape
-        self._configs = list(configs)
-        self._width, self._height, self._sensor = width, height, sensor
+        self._width, self._height = width, height
         self._ordered = ordered
-        self.row_shift = SUB_BITS + (width - 1).bit_length()
-        self.time_shift = self.row_shift + (height - 1).bit_length() + 1
         self._capacity = capacity
         self._event_count_max: Any = wp.array(
             [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
         )
-        self._base = self._empty((world_count, pixel_count), wp.float32)
-        self._last = [self._empty((world_count, pixel_count), wp.float32) for _ in range(2)]
-        self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
-        self.terms: tuple[str, ...] = tuple(sorted({term for config in configs for term in terms_of(config)}))
-        """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
-        self._thresholds: Any = wp.array(
-            [(config.threshold_on, config.threshold_off) for config in configs],
-            dtype=wp.vec2d,
+        terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
+        self._states = PixelStates(
+            configs,
+            width=width,
+            height=height,
+            ring_size=2,
             device=self.device,
+            sensor=sensor,
+            seeds=seeds,
+            terms=terms,
         )
-        self._screened = self.device.is_cpu and not self.terms
-        scratch = (world_count, pixel_count if self._screened else 0)
-        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
-        self._lead = self._zeros((world_count, 0 if self.terms else pixel_count), wp.int32)
+        self.terms: tuple[str, ...] = terms
+        """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
+        self.seed = self._states.seed
+        self.row_shift, self.time_shift = self._states.row_shift, self._states.time_shift
+        self._shape = (world_count, pixel_count)
         self.stack: Any = self._make_stack(frames, frame_count)
         """What a step sees and what comes of it, `event_worlds_scan.Stack`."""
         self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
@@ -143,94 +131,25 @@ class WorldEventCamera:
             width=width,
             height=height,
         )
-        self._noise: list[PixelNoise] = []
-        self._models: Any = None
-        self._phase_stream = 0
-        self._random_phase: Any = None
-        self._memories: list[Any] = []
-        if self.terms:
-            self.seed(seeds)
-        self._pool: ThreadPoolExecutor | None = None
-        self._scan = scan.make_noisy_scan(frozenset(self.terms)) if self.terms else scan.scan
-        self._begin_noise = make_begin(signal_terms(self.terms))
-        for module in (scan, self._scan.module, *([self._begin_noise.module] if self.terms else [])):
-            wp.load_module(module, device=self.device)
 
     @property
     def thresholds(self) -> Any:
         """Thresholds of each world, up and down, device array of vec2d, shape [world]; None: others count."""
-        return None if self.terms else self._thresholds
-
-    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None, *, reset_ns: int = 0) -> None:
-        """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device.
-
-        Args:
-            seeds: Of all worlds.
-            worlds: Indices of those that get other seeds; None: all.
-            reset_ns: Time of the reset that follows, where it is not the origin of the world's time [ns].
-        """
-        if not self.terms:
-            return
-
-        def draw(world: int) -> PixelNoise:
-            noise = PixelNoise(
-                self._configs[world],
-                pixel_count=self._base.shape[1],
-                ring_size=2,
-                seed=seeds[world],
-                sensor=self._sensor,
-                device=self.device,
-                terms=self.terms,
-            )
-            noise.set_reset(reset_ns)
-            return noise
-
-        noise = [
-            draw(world) if worlds is None or world in worlds else self._noise[world]
-            for world in range(len(self._configs))
-        ]
-        models: Any = wp.array([each.model for each in noise], dtype=PixelModel, device=self.device)
-        memories: list[Any] = [
-            wp.array([each.memory(slot) for each in noise], dtype=Memory, device=self.device)
-            for slot in range(2)
-        ]
-        if self._models is None:
-            self._models, self._memories = models, memories
-            self._phase_stream = noise[0].phase()[0]  # it hangs on the name of the sensor
-            self._random_phase = wp.array(
-                [each.phase()[1] for each in noise], dtype=wp.bool, device=self.device
-            )
-        else:  # graphs hold these arrays
-            for array, values in zip((self._models, *self._memories), (models, *memories), strict=True):
-                wp.copy(array, values)
-            wp.synchronize_device(self.device)  # before what the copies were made of is freed
-        self._noise = noise
+        return None if self.terms else self._states.thresholds
 
     def begin(self, mask: wp.array[wp.int32], parity: int) -> None:
-        """Let some worlds take frame 0 as their reference, and forget all events; launches only.
-
-        Args:
-            mask: Not 0: this world, shape [world].
-            parity: Which of the two states is the present one.
-        """
-        shape = self._base.shape
+        """Let worlds whose mask is not 0 take frame 0 as reference; forget all events; launches only."""
         for array in (self.results.offsets, self.results.counts, self.stack.dropped, self.stack.counters):
             array.zero_()
+        states = self._states
         wp.launch(
             scan.begin_pixels,
-            dim=shape,
+            dim=self._shape,
             inputs=[mask, self.stack.log_radiance],
-            outputs=[self._base, self._last[parity], self._crossed[parity], self.stack.counters],
+            outputs=[states.base, states.last[parity], states.crossed[parity], self.stack.counters],
             device=self.device,
         )
-        if self.terms:
-            wp.launch(
-                self._begin_noise,
-                dim=shape,
-                inputs=[self._models, self._phase_stream, self._random_phase, mask, self._base],
-                outputs=[self._memories[parity]],
-                device=self.device,
-            )
+        states.begin_noise(mask, parity)
 
     def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
         """Return offsets of a pattern on the device; whoever makes a graph with them keeps them."""
@@ -243,24 +162,21 @@ class WorldEventCamera:
         return self._offsets_ns[offsets_ns]
 
     def find(self, clock_ns: wp.array[wp.int64], offsets_ns: tuple[int, ...], parity: int) -> None:
-        """Find the events of a step; launches only, on CUDA.
+        """Find the events of a step; launches only, on CUDA; see `WorldFrameSensor.find`.
 
-        Args:
-            clock_ns: Time of each world at the begin of the step [ns].
-            offsets_ns: From there to the last frame seen before, and to each frame [ns]; seen before on the
-                host, so that nothing is allocated.
-            parity: Which of the two states is the present one; the other is after this, if there is a frame.
+        Offsets were seen before on the host, so that nothing is allocated. The other of the two states is the
+        present one after this, if there is a frame.
         """
         frame_count = len(offsets_ns) - 1
         offsets = self.offsets(offsets_ns)
-        self._launch(scan.begin_step, self._base.shape[0], [clock_ns, offsets], [self.stack])
+        self._launch(scan.begin_step, self._shape[0], [clock_ns, offsets], [self.stack])
         if frame_count > 0:
             self.find_keys(frame_count, parity)
         self._hand_out()
 
     def find_keys(self, frame_count: int, parity: int) -> None:
         """Scan the frames of a step that has begun, and drop the events that do not fit."""
-        world_count = self._base.shape[0]
+        world_count = self._shape[0]
         self.take_frames(frame_count, scan.ALL, parity)
         self._launch(scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self.stack])
         if self.device.is_cuda or self.stack.overflow.numpy().any():
@@ -272,10 +188,10 @@ class WorldEventCamera:
     def grow(self, capacity: int) -> None:
         """Have room for more keys; those there are are lost."""
         self._capacity = capacity
-        self.stack.keys = self._empty((self._base.shape[0], capacity), wp.int64)
+        self.stack.keys = self._empty((self._shape[0], capacity), wp.int64)
 
     def _hand_out(self) -> None:
-        events, world_count = self.results, self._base.shape[0]
+        events, world_count = self.results, self._shape[0]
         lanes = BLOCK_SIZE if self.device.is_cuda else 1
         if self._ordered:
             self._sort()
@@ -292,7 +208,7 @@ class WorldEventCamera:
         )
 
     def _sort(self) -> None:
-        world_count = self._base.shape[0]
+        world_count = self._shape[0]
         if self.device.is_cuda:
             block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else BLOCK_SIZE
             wp.launch(
@@ -305,8 +221,8 @@ class WorldEventCamera:
             return
         keys, counts = self.stack.keys.numpy(), self.stack.counters.numpy()[:, 0]
 
-        def sort(first: int, end: int) -> None:
-            for world in range(first, end):
+        def sort(worlds: tuple[int, int]) -> None:
+            for world in range(*worlds):
                 keys[world, : counts[world]].sort()  # several times as fast as the network on a CPU
 
         self._share(sort)
@@ -314,92 +230,36 @@ class WorldEventCamera:
     def take_frames(self, frame_count: int, part: int, parity: int) -> None:
         """Scan all pixels: on a CUDA device at once, on the CPU some worlds on each core."""
 
-        def take(first: int, end: int) -> None:
-            if self._screened:
-                tiles = -(-self._base.shape[1] // int(TILE_SIZE))
-                wp.launch(
-                    scan.screen,
-                    dim=(end - first, tiles),
-                    inputs=[
-                        self._thresholds,
-                        first,
-                        0,
-                        self._base.shape[1],
-                        frame_count,
-                        self.stack,
-                        self._base,
-                        self._crossed[parity],
-                    ],
-                    outputs=[*self._quiet_range, self._lead],
-                    device=self.device,
-                )
-            self._launch_scan(first, end, frame_count, part, parity)
+        def take(worlds: tuple[int, int]) -> None:
+            self._states.launch(
+                self.stack, parity, 1 - parity, frame_count=frame_count, part=part, worlds=worlds
+            )
 
         self._share(take)
 
     def record_scan(self, parity: int) -> Any:
         """Return the launch of the scan of one frame of all worlds, on CUDA; `stack` may change meanwhile."""
-        world_count, pixel_count = self._base.shape
+        states = self._states
         if self.terms:
-            return self._launch_scan(0, world_count, 1, scan.ALL, parity, record_cmd=True)
+            return states.launch(self.stack, parity, 1 - parity, frame_count=1, record_cmd=True)
+        world_count, pixel_count = self._shape
         blocks = -(-pixel_count // (BLOCK_SIZE * PIXELS_PER_THREAD))
-        states = [self._base, self._last[parity], self._crossed[parity]]
+        seen = [states.base, states.last[parity], states.crossed[parity]]
         return wp.launch(
             scan_frame,
             dim=(world_count, blocks * BLOCK_SIZE),
             block_dim=BLOCK_SIZE,
-            inputs=[self._thresholds, self._width, self.row_shift, self.time_shift, *states, self.stack],
-            outputs=[self._last[1 - parity], self._crossed[1 - parity]],
+            inputs=[states.thresholds, self._width, self.row_shift, self.time_shift, *seen, self.stack],
+            outputs=[states.last[1 - parity], states.crossed[1 - parity]],
             device=self.device,
             record_cmd=True,
         )
 
-    def _launch_scan(
-        self, first: int, end: int, frame_count: int, part: int, parity: int, *, record_cmd: bool = False
-    ) -> Any:
-        block = BLOCK_SIZE if self.device.is_cuda else 1
-        own = [self._models] if self.terms else [self._thresholds]
-        lead = [] if self.terms else [self._lead]
-        memory = [[self._memories[slot]] if self.terms else [] for slot in (parity, 1 - parity)]
-        return wp.launch(
-            self._scan,
-            dim=(end - first, -(-self._base.shape[1] // block) * block),  # whole blocks to a world
-            block_dim=BLOCK_SIZE,
-            inputs=[
-                *own,
-                self._width,
-                self.row_shift,
-                self.time_shift,
-                first,
-                0,
-                self._base.shape[1],
-                frame_count,
-                part,
-                *lead,
-                self._base,
-                self._last[parity],
-                self._crossed[parity],
-                *memory[0],
-                self.stack,
-            ],
-            outputs=[self._last[1 - parity], self._crossed[1 - parity], *memory[1]],
-            device=self.device,
-            record_cmd=record_cmd,
-        )
-
-    def _share(self, work: Callable[[int, int], None]) -> None:
+    def _share(self, work: Callable[[tuple[int, int]], None]) -> None:
         """Do some worlds on each core of a CPU; on a CUDA device all at once."""
-        world_count = self._base.shape[0]
+        world_count = self._shape[0]
         parts = min(core_count(), world_count) if self.device.is_cpu else 1
-        edges = [world_count * part // parts for part in range(parts + 1)]
-        if parts > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(parts - 1, thread_name_prefix="world-events")
-        futures = [
-            self._pool.submit(work, first, end) for first, end in itertools.pairwise(edges[1:]) if self._pool
-        ]
-        work(edges[0], edges[1])
-        for future in futures:
-            future.result()
+        share(work, list(itertools.pairwise(world_count * part // parts for part in range(parts + 1))))
 
     def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -49,26 +49,17 @@ _US = wp.constant(wp.int64(1000))
 class Stack:
     """What the pixels of one camera see in a step, and what comes of it. Shapes begin with [world]."""
 
-    log_radiance: wp.array3d[wp.float32]
-    """[world, frame, pixel]"""
-    stamps: wp.array2d[wp.int64]
-    """Of the state and of each frame, from the origin [ns], [world, frame + 1]."""
-    origin_us: wp.array[wp.int64]
-    """Origin of the keys' time since the reset of the world [us]."""
+    log_radiance: wp.array3d[wp.float32]  # [world, frame, pixel]
+    stamps: wp.array2d[wp.int64]  # Of the state and of each frame, from the origin [ns], [world, frame + 1]
+    origin_us: wp.array[wp.int64]  # Origin of the keys' time since the reset of the world [us]
     since_reset_ns: wp.array[wp.int64]
     """The same from the reset of the pixels on, which noise counts from [ns]."""
-    row_limit: wp.array2d[wp.int32]
-    """Rows whose events are kept, [world, frame]."""
-    overflow: wp.array[wp.int32]
-    """1: the world has more events than fit."""
-    table: wp.array3d[wp.int32]
-    """Events of the worlds that have too many, [world, frame, row]; zeros before."""
-    keys: wp.array2d[wp.int64]
-    """[world, capacity]"""
-    counters: wp.array2d[wp.int64]
-    """As in `event_scan.scan_pixel`, [world, 3]."""
-    dropped: wp.array[wp.int32]
-    """Events that were lost in the step."""
+    row_limit: wp.array2d[wp.int32]  # Rows whose events are kept, [world, frame]
+    overflow: wp.array[wp.int32]  # 1: the world has more events than fit
+    table: wp.array3d[wp.int32]  # Events of the worlds that have too many, [world, frame, row]; zeros before
+    keys: wp.array2d[wp.int64]  # [world, capacity]
+    counters: wp.array2d[wp.int64]  # As in `event_scan.scan_pixel`, [world, 3]
+    dropped: wp.array[wp.int32]  # Events that were lost in the step
 
 
 @wp.kernel
@@ -79,13 +70,7 @@ def begin_step(
     # In/out:
     stack: Stack,
 ) -> None:
-    """Set the stamps of a world, and forget the counts of the step before.
-
-    Args:
-        clock_ns: Time of each world at the begin of the step [ns].
-        offsets_ns: From there to the last frame that was seen (<= 0) and to each frame [ns].
-        stack: Its stamps, origins, counts and limits are overwritten.
-    """
+    """Set the stamps of a world (`WorldFrameSensor.find`); forget counts and limits of the step before."""
     world = wp.tid()
     origin_us = (clock_ns[world] + offsets_ns[0]) // _US
     stack.origin_us[world] = origin_us
@@ -193,23 +178,8 @@ def scan(
 ) -> None:
     """Take ideal pixels over the frames of a step; threads are [world, pixel], whole blocks to a world.
 
-    Args:
-        thresholds: ON and OFF of each world.
-        width: Pixels per row.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        first_world: World of the first threads.
-        first_pixel: Pixel of the first threads of each world.
-        end_pixel: Threads at or past it (they fill the last CUDA block) have no pixel.
-        frame_count: Frames to scan.
-        part: ALL, COUNT or AGAIN.
-        lead: Frames at the start that are known to be quiet, [world, pixel].
-        base: Log radiance of the reset, likewise.
-        last: Last sample.
-        crossed: Levels crossed upwards and downwards.
-        stack: Frames in; keys, counters or the table out.
-        last_out: `last` after the step.
-        crossed_out: `crossed` after the step.
+    Threads begin at a world and a pixel; those at or past `end_pixel` (they fill the last CUDA block) have no
+    pixel. `part` is ALL, COUNT or AGAIN; the others are those of `scan_pixel`.
     """
     index, thread = wp.tid()
     world = first_world + index

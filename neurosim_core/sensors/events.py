@@ -29,6 +29,7 @@ from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import LostEvents, Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
+from neurosim_core.sensors.event_states import PixelStates
 from neurosim_core.warp_start import start_warp
 
 _MIXED = "step() and feed() must not be mixed: call reset() between them"
@@ -106,27 +107,22 @@ class EventCamera:
         self.sensor = sensor
         start_warp()
         self.device = wp.get_device(device)
-        self._row_shift = SUB_BITS + (width - 1).bit_length()
-        if CAUSE in (terms or ()):
-            self._row_shift += CAUSE_BITS
-        self._time_shift = self._row_shift + (height - 1).bit_length() + 1
-
         # scans under way begin with a state each, and the last of them needs room for the state after it
         ring_size = scan_count_max + 1
         pixel_terms = terms_of(config) if terms is None else tuple(terms)
         self.terms = pixel_terms if config.readout is None else (*pixel_terms, "readout")
-        self._pixels = Pixels(
-            config,
+        states = PixelStates(
+            [config],
             width=width,
             height=height,
-            row_shift=self._row_shift,
-            time_shift=self._time_shift,
             ring_size=ring_size,
             device=self.device,
             sensor=sensor,
-            seed=seed,
+            seeds=[seed],
             terms=pixel_terms,
         )
+        self._row_shift, self._time_shift = states.row_shift, states.time_shift
+        self._pixels = Pixels(states, width=width, height=height, device=self.device)
         self._scan_count_max = scan_count_max
         self._graphs = GraphCache(device)
         self._reader = make_stream(device, high_priority=True)
@@ -245,7 +241,7 @@ class EventCamera:
             if not self._require_reset() == self._fed_ns == self._reset_ns:
                 raise RuntimeError(_MIXED)
             stepper = self._make_stepper()
-            stepper.reset(self._pixels.base.reshape((self.height, self.width)), self._reset_ns)
+            stepper.reset(self._pixels.states.base.reshape((self.height, self.width)), self._reset_ns)
             self._stepper = stepper
         return self._stepper.step(log_radiance, stamp_ns)
 

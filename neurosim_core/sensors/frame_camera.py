@@ -112,8 +112,7 @@ class _Model:
     read_noise: float
     top: float
     gamma: float
-    filter: wp.vec4i
-    """Colour of the pixels of a square of 2 x 2."""
+    filter: wp.vec4i  # Colour of the pixels of a square of 2 x 2
 
 
 @kernel_variant(__name__, "meter")

@@ -111,11 +111,7 @@ def geodetic(
 ) -> tuple[float, float, float]:
     """Return latitude [rad], longitude [rad] and altitude [m] of a place in W, to 1e-9 m.
 
-    Args:
-        position: East, north, up of the origin [m], shape [3].
-        latitude_rad: Of the origin, likewise the others.
-        longitude_rad: See above.
-        altitude_m: See above.
+    The place is east, north, up of an origin [m], shape [3], of which the others are given.
     """
     sin, cos = math.sin(latitude_rad), math.cos(latitude_rad)
     east, north, up = (float(value) for value in position)

@@ -190,8 +190,7 @@ def _rings_and_times(scan: AnyScan, span_ns: int) -> tuple[NDArray[np.uint16], N
 @wp.struct
 class _Model:
     rays: wp.array[wp.vec3]
-    part: wp.array[int]
-    """Which of the times of a sweep each ray has."""
+    part: wp.array[int]  # Which of the times of a sweep each ray has
     stream: wp.uint32
     range_min: float
     range_max: float

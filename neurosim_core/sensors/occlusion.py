@@ -39,10 +39,8 @@ class Surroundings:
     """What is around cameras, and the lenses through which they see it."""
 
     lenses: wp.array[LensData]
-    mesh: wp.array[wp.uint64]
-    """Of each scene."""
-    scene_instances: int
-    """How many there are before those of bodies."""
+    mesh: wp.array[wp.uint64]  # Of each scene
+    scene_instances: int  # How many there are before those of bodies
     motions: wp.array[Motion]
     body_mesh: wp.array[wp.uint64]
 
@@ -86,11 +84,8 @@ def is_hidden_by_bodies(
 def measure_clearance(mesh: wp.uint64, p_W: wp.vec3, other: wp.vec3, focal_px: float) -> float:
     """Return a distance from the camera within which there is no surface of the scene [m].
 
-    Args:
-        mesh: Of the scene.
-        p_W: Position of the camera.
-        other: Position of the other camera, in C [m].
-        focal_px: Focal length: surfaces are looked for as far as it takes to leave ways of a few pixels.
+    Surfaces are looked for as far as it takes to leave ways of a few pixels; `other` is the position of the
+    other camera, in C [m].
     """
     clearance = wp.min(_CLEARANCE_M, focal_px * wp.length(other) / _NEARBY_PX)
     found = wp.mesh_query_point_no_sign(mesh, p_W, clearance)
@@ -127,15 +122,8 @@ def is_way_free(
 ) -> bool:
     """Return whether the picture of a pinhole camera shows that a way is free, but for its last pixel.
 
-    Args:
-        lens: Of the camera.
-        ranges: The picture [m].
-        nearest: Least range of its tiles [m].
-        row: Of the pixel that sees the end of the way.
-        col: Of the pixel.
-        other: Where the way begins, in C [m].
-        point: Where it ends, in C [m].
-        clearance: Distance from the camera within which there is no surface [m].
+    The way leads from `other` to `point`, in C [m], which the pixel at row and col sees. Ranges are the
+    picture, `nearest` the least of its tiles; within `clearance` of the camera there is no surface [m].
     """
     if wp.length_sq(other) == 0.0:
         return True

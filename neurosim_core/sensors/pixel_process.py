@@ -30,11 +30,9 @@ class Batch:
     """The pictures of a batch as kernels read them (`PictureContext`, `PictureViews`)."""
 
     width: int
-    element_count: int
-    """Of a picture: pixels, or what it has in their place."""
+    element_count: int  # Of a picture: pixels, or what it has in their place
     stride: int
-    part_count: int
-    """J, the times of the rays of a picture."""
+    part_count: int  # J, the times of the rays of a picture
     instant_count: int
     image_slot: wp.array[int]
     active: wp.array[int]
@@ -48,15 +46,11 @@ class Batch:
 class Element:
     """Where in the pictures of a batch a thread works."""
 
-    slot: int
-    """Of the picture; -1: there is none."""
+    slot: int  # Of the picture; -1: there is none
     world: int
-    view: int
-    """Which of the instants of all worlds it is."""
-    last: int
-    """Row of the poses at its stamp."""
-    number: int
-    """Of the element in the picture."""
+    view: int  # Which of the instants of all worlds it is
+    last: int  # Row of the poses at its stamp
+    number: int  # Of the element in the picture
     row: int
     col: int
 

@@ -70,11 +70,9 @@ class Errors:
     """Errors of one group of three axes; see `ErrorConfig`."""
 
     white: wp.vec3d
-    walk: wp.vec3d
-    """Standard deviation of its step from one sample to the next."""
+    walk: wp.vec3d  # Standard deviation of its step from one sample to the next
     markov: wp.vec3d
-    decay: wp.float64
-    """Of the process from one sample to the next."""
+    decay: wp.float64  # Of the process from one sample to the next
     resolution: wp.vec3d
     stream: wp.uint32
 
@@ -140,12 +138,9 @@ class Sampling:
 
     motion: Motion
     seeds: wp.array[wp.uint64]
-    active: wp.array[wp.int32]
-    """0: the world is left alone."""
-    sample: wp.array[wp.int64]
-    """Number of the sample since the reset."""
-    memory: wp.array2d[wp.vec3d]
-    """Of errors, shape [world, groups * 2]."""
+    active: wp.array[wp.int32]  # 0: the world is left alone
+    sample: wp.array[wp.int64]  # Number of the sample since the reset
+    memory: wp.array2d[wp.vec3d]  # Of errors, shape [world, groups * 2]
 
 
 @functools.cache
@@ -275,16 +270,10 @@ class StateSampler(Sampler):
     ) -> None:
         """Allocate what it needs.
 
-        Args:
-            context: What it is made for.
-            kernel: See above.
-            inputs: Its first parameters.
-            packet: Returns a packet of header and rows: its class, if its fields are named as the outputs.
-            outputs: Names and types of what it measures: an array of shape [slot, world] each.
-            are_stacked: The kernel writes one array, of shape [output, slot, world].
-            terms: What is computed.
-            group_count: Groups of errors of three axes.
-            late: Its delay and dropouts. Before the first sample the state was that of it.
+        `packet` makes a packet of header and rows: its class, if its fields are named as the `outputs`, an
+        array of shape [slot, world] each, or of more axes, (type, length, ...); if they `are_stacked`, the
+        kernel writes one array [output, slot, world]. `group_count`: groups of errors of three axes. `late`:
+        before the first sample the state was that of it.
         """
         vehicle = context.vehicle
         self.terms, self._packet = terms, packet
@@ -294,7 +283,8 @@ class StateSampler(Sampler):
             written = [self._zeros(next(iter(outputs.values())), len(outputs), *shape)]
             self.arrays = {name: written[0][index] for index, name in enumerate(outputs)}
         else:
-            self.arrays = {name: self._zeros(dtype, *shape) for name, dtype in outputs.items()}
+            kinds = {name: kind if isinstance(kind, tuple) else (kind,) for name, kind in outputs.items()}
+            self.arrays = {name: self._zeros(kind, *shape, *more) for name, (kind, *more) in kinds.items()}
             written = list(self.arrays.values())
         at = Sampling()
         at.seeds, at.active = context.seeds, context.active
@@ -365,16 +355,9 @@ def make_reader(
 ) -> StateSampler:
     """Return a sensor at work that reads something of each vehicle, to which errors are added.
 
-    Args:
-        context: What it is made for.
-        read: A Warp function of the model, `Motion`, the world and the number of an output, that returns a
-            vec3d.
-        model: What it reads besides, of a type of Warp.
-        errors: Names of its outputs, of vec3d, and their errors.
-        packet: As of `StateSampler`, likewise `late`.
-        rate_hz: Samples a second [Hz].
-        is_scalar: Outputs are the first number of what is read, float64.
-        late: See above.
+    `read` is a Warp function of the model, `Motion`, the world and the number of an output, that returns a
+    vec3d, of which only the first number counts if it `is_scalar` (float64). `errors` names its outputs. The
+    others are those of `StateSampler`.
     """
     made = [
         make_errors(each, rate_hz=rate_hz, name=f"{context.name}/{name}") for name, each in errors.items()

@@ -27,13 +27,7 @@ from neurosim_core.sim.state import Batch, State
 
 
 def launch_cameras(model: Model, state: State, batch: Batch) -> None:
-    """Let the cameras that are wanted see a batch, and launch the copies to the host.
-
-    Args:
-        model: What does not change.
-        state: What does.
-        batch: What was flown.
-    """
+    """Let the cameras that are wanted see a batch, and launch the copies to the host."""
     jobs = batch.jobs
     due = choose(model, state, batch) if jobs is None else ()
     stream = state.render_streams[batch.number % len(state.batch_done)]
@@ -132,10 +126,7 @@ def _is_late(batch: Batch) -> bool:
 def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
     """Wait until the cameras have seen a batch, and return what they yield.
 
-    Args:
-        state: Where it is in flight.
-        batch: What was flown.
-        borrow: Pictures are views of the buffers of the batch.
+    With `borrow` pictures are views of the buffers of the batch.
     """
     packets: list[Packet] = []
     with timed(state.wall_s, "camera read-back"):
@@ -159,13 +150,8 @@ def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
 def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:
     """Let the frame sensors of many worlds see what was rendered; launches only.
 
-    Args:
-        state: The parity of a group that saw a frame turns.
-        batch: What was flown; the clocks of the worlds are at its end.
-        last_seen_ns: For each group, the instant before the batch, <= 0, from its begin [ns].
-
-    Returns:
-        What a graph of these launches has to keep.
+    The clocks of the worlds are at the end of the batch; `last_seen_ns` leads for each group from its begin
+    to the instant before it, <= 0. What is returned has to be kept by a graph of these launches.
     """
     held: list[object] = []
     for group, offsets_ns, parity in _frames_of_worlds(state, batch, last_seen_ns):

@@ -23,6 +23,7 @@ from neurosim_core.frames import quaternion_exp
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, find_place, upload_paths
 from neurosim_core.vehicle import MultirotorConfig, MultirotorState
 from neurosim_core.vehicle.arrays import allocate_arrays
+from neurosim_core.vehicle.integrator import Batch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,8 +35,7 @@ _SMALL_RAD2 = wp.constant(wp.float64(1.0e-2))
 class AttitudeArrays:
     """The attitudes of paths behind each other, on a device."""
 
-    knots: wp.array[wp.quatd]
-    """q_WB, shape [knot]."""
+    knots: wp.array[wp.quatd]  # q_WB, shape [knot]
     rotation_vectors: wp.array2d[wp.vec3d]
     """Coefficients in rising powers of normalised time [rad], shape [piece, 4]."""
 
@@ -45,10 +45,8 @@ class _Turn:
     """Orientation and its derivatives."""
 
     orientation: wp.quatd
-    body_rate: wp.vec3d
-    """w_WB in B [rad/s]."""
-    acceleration: wp.vec3d
-    """dw_WB/dt in B [rad/s^2]."""
+    body_rate: wp.vec3d  # w_WB in B [rad/s]
+    acceleration: wp.vec3d  # dw_WB/dt in B [rad/s^2]
 
 
 @wp.func
@@ -100,21 +98,6 @@ def _evaluate_turn(path: PathArrays, attitude: AttitudeArrays, index: int, stamp
     return _turn(phi, d1, d2, attitude.knots[place.knot])
 
 
-@wp.struct
-class _Carried:
-    """The state of the bodies, of shape [world]."""
-
-    position: wp.array[wp.vec3d]
-    velocity: wp.array[wp.vec3d]
-    orientation: wp.array[wp.quatd]
-    body_rate: wp.array[wp.vec3d]
-    acceleration: wp.array[wp.vec3d]
-    angular_acceleration: wp.array[wp.vec3d]
-    stamp_ns: wp.array[wp.int64]
-    rotor_speed: wp.array2d[wp.float64]
-    rotor_speed_command: wp.array2d[wp.float64]
-
-
 @wp.kernel
 def _carry(
     # Model:
@@ -125,7 +108,7 @@ def _carry(
     mask: wp.array[wp.int32],
     duration_ns: wp.int64,
     # In/out:
-    body: _Carried,
+    body: Batch,
 ) -> None:
     world = wp.tid()
     if mask.shape[0] > 0:
@@ -151,15 +134,8 @@ def _carry(
 class Carrier:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still.
-
-    Attributes:
-        config: The parameters of the vehicle that is not there; of gravity, for IMUs.
-        count: Number of bodies.
-        device: Where they are.
-        max_step_ns: What counts as a step [ns].
-        arrays: Their state.
-        terms: Nothing is compiled in.
+    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
+    `config` of the vehicle that is not there IMUs need gravity.
     """
 
     terms: tuple[str, ...] = ()
@@ -173,21 +149,13 @@ class Carrier:
         device: str,
         max_step_ns: int,
     ) -> None:
-        """Bring paths to the device.
-
-        Args:
-            config: The airframe that the settings name.
-            paths: All with an attitude.
-            path_of_world: Which of them each body follows, shape [N].
-            device: Where to compute.
-            max_step_ns: What counts as a step [ns].
-        """
+        """Bring paths, all with an attitude, to the device; each body follows one, `path_of_world`."""
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
-        self._body = _Carried()
-        for name in _Carried.vars:
-            setattr(self._body, name, getattr(self.arrays, name))
+        self._body = Batch()
+        for name, array in vars(self.arrays).items():
+            setattr(self._body, name, array)
         attitudes = [path.attitude for path in paths if path.attitude is not None]
         knots = np.concatenate([attitude.knots for attitude in attitudes])
         vectors_of_pieces = np.concatenate([attitude.rotation_vectors for attitude in attitudes])

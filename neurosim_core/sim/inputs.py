@@ -46,11 +46,7 @@ class CommandBuffer:
 
 
 def make_seeds(seeds: int | ArrayLike, count: int) -> list[int]:
-    """Return a seed for each world.
-
-    Args:
-        seeds: That of world 0, which the others count on from, or one for each.
-        count: Number of worlds.
+    """Return a seed for each world: those given, or that of world 0, which the others count on from.
 
     Raises:
         ValueError: They are no integers in [0, 2^64), or of the wrong number.

@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.control import CommandMode, Controller
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
@@ -43,7 +43,7 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
         if mode == "motor_speeds":
             array: Any = state.vehicle.arrays.rotor_speed_command
         else:
-            state.controllers[mode] = make_controller(
+            state.controllers[mode] = Controller(
                 mode,
                 model.airframe,
                 model.config.control.gains,
@@ -108,11 +108,8 @@ def plan_batch(
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
-    Args:
-        state: As of the end of what was launched.
-        stretch: What comes next.
-        closed_loop: Let the path controller command; otherwise the last command is held.
-        begin_ns: Where it begins [ns]; None: at the end of what was launched.
+    It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
+    controller commands; otherwise the last command is held.
     """
     number = state.launched_count
     stamps_ns = [

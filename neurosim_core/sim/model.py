@@ -63,7 +63,7 @@ class Model:
 def make_model(
     config: SimulationConfig,
     *,
-    scene: Scene | None = None,
+    scene: Scene | Callable[[], Scene] | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> Model:
@@ -71,7 +71,7 @@ def make_model(
 
     Args:
         config: What to fly; one vehicle.
-        scene: Where to fly, in place of what `config` says; None: as it says.
+        scene: Where to fly, in place of what `config` says, or what returns it; None: as it says.
         on_phase: Told the name of each part of the work when it begins.
         meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`), and
             with what says whether the scene is lit.
@@ -90,10 +90,8 @@ def make_model(
 def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
     """Return a model with other sensors, rates and launches in the same scene and light.
 
-    Args:
-        model: What was made before.
-        config: Its vehicle, device and renderer are those of `model`; its scene is not looked at.
-        replan: Fly the path of `config`; else that of `model`.
+    Vehicle, device and renderer of `config` are those of `model`; its scene is not looked at, and its path is
+    flown if it is to `replan`.
 
     Raises:
         ValueError: No path exists.
@@ -114,7 +112,7 @@ def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Mo
 def make_fleet(
     config: SimulationConfig,
     *,
-    scene: Scene | None = None,
+    scene: Scene | Callable[[], Scene] | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> dict[str, Model]:
@@ -135,7 +133,8 @@ def make_fleet(
         with phase("scene"):
             members = {name: config.of(name) for name in config.vehicles}
             seeing = any(plan_render_groups(member.sensors) for member in members.values())
-            scene = config.scene.load(pictures=seeing) if scene is None else scene
+            if not isinstance(scene, Scene):
+                scene = config.scene.load(pictures=seeing) if scene is None else scene()
             bodies = make_bodies(config.bodies) if seeing else ()
         beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
         light = functools.partial(  # needs no path: both at once
@@ -162,11 +161,7 @@ def make_fleet(
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
-    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
-
-    Args:
-        config: What to fly.
-        vehicles: Names; None: all.
+    """Return the paths of vehicles (None: of all) by name, as `make_fleet` plans them.
 
     Raises:
         KeyError: There is no such vehicle.

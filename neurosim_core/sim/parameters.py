@@ -42,14 +42,10 @@ class WorldSettings:
 
 
 def vary_sensors(sensors: Rig, parameters: Mapping[str, ArrayLike], count: int) -> list[Rig]:
-    """Return the sensors of each world.
+    """Return the sensors of each world, which differ from those of the configuration by some parameters.
 
-    Args:
-        sensors: Those of the configuration, which all worlds have.
-        parameters: Values by name of the camera and key, one for each world: "front.threshold_on",
-            "front.shot_noise.rate_hz" (keys of the pixels of an event camera),
-            "front.lens.horizontal_fov_rad".
-        count: Number of worlds.
+    Parameters are one number for each world by name of the camera and key: "front.threshold_on",
+    "front.shot_noise.rate_hz" (keys of the pixels of an event camera), "front.lens.horizontal_fov_rad".
 
     Raises:
         ValueError: There is no such camera or key, worlds cannot differ in it, or there is not one number for

@@ -167,15 +167,9 @@ def make_render_groups(
 ) -> list[RenderGroupState]:
     """Allocate the buffers of all groups; there are none where the scene is not on the device.
 
-    Args:
-        model: Which cameras there are.
-        worlds: Who is rendered together.
-        seeds: Of each world, for the noise of pictures, device array of uint64.
-        history: The flight, for sensors that look back.
-        in_flight: The most batches in flight.
-        on_host: Bring pictures and events to the host, as packets.
-        make_room: Gives memory to copy a picture to, where the caller has a place for it; `acquire_room` asks
-            for it before pictures are rendered.
+    Seeds are those of each world, device array of uint64; the history is for sensors that look back. With
+    `on_host` pictures and events become packets; `acquire_room` asks `make_room` for memory to copy a picture
+    to.
 
     Raises:
         ValueError: The renderer cannot say what moves how far, and a group is adaptive; or a picture, or an

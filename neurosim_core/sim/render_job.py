@@ -72,17 +72,9 @@ def choose_ticks(
 ) -> Choice:
     """Return which of the ticks that are due an adaptive group has to render, and wait until that is known.
 
-    These are the ticks that its rule asks for, those that its sensors require, the last tick of the run, and
-    the first tick that a camera sees.
-
-    Args:
-        group: Adaptive; its rule moves on to the end of the batch.
-        trace: Where the states of the batch are.
-        slots: Slots of the ticks in the trace.
-        stamps_ns: Their stamps.
-        end_ns: End of the run [ns].
-        wanted: Names of the cameras that look.
-        required: Ticks that each frame sensor needs in any case, by name.
+    These are the ticks that its rule asks for, those that its sensors require, by name, the last tick of the
+    run, and the first tick that a camera sees. The rule moves on to the end of the batch, of whose ticks
+    slots in the trace and stamps are given.
     """
     assert group.rule is not None
     if not slots:
@@ -121,16 +113,10 @@ def plan_render(
     wanted: Collection[str],
     active: Any = None,
 ) -> RenderJob:
-    """Return how a group renders the instants of a batch.
+    """Return how a group renders the instants of a batch, at least one; its buffers are overwritten by that.
 
-    Args:
-        group: The buffers of the batch are overwritten by the rendering.
-        trace: Where the states of the batch are.
-        slots: Slots of the instants in the trace, at least one.
-        stamps_ns: Their stamps, of the clock that all worlds share.
-        buffer_index: Which of the batches in flight it is; the one that had its buffers before has been read.
-        wanted: Names of the cameras that look.
-        active: 0 where a world is not rendered, device array of int32, shape [world]; None: all are.
+    Stamps are of the clock that all worlds share, slots of the trace. `active` is 0 where a world is not
+    rendered, device array of int32, shape [world]; None: all are.
     """
     pictures = []
     image_slots = []
@@ -273,11 +259,8 @@ def _bring(group: RenderGroupState, instants: Instants) -> None:
 def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = False) -> list[Packet]:
     """Return the pictures of a batch that the device has finished with.
 
-    Args:
-        group: Which cameras.
-        instants: What they have seen.
-        borrow: Return views that are valid until the buffers are overwritten, not copies; of those for which
-            the caller has no room.
+    With `borrow` those for which the caller has no room are views that are valid until the buffers are
+    overwritten, not copies.
     """
     copies: dict[tuple[str, int], NDArray[Any]] = {}
 

@@ -21,14 +21,10 @@ wp.set_module_options({"enable_backward": False})
 class Start:
     """Where vehicles begin, one row for each world."""
 
-    position: wp.array2d[wp.float64]
-    """p_WB [m], [N, 3]."""
-    velocity: wp.array2d[wp.float64]
-    """v_WB in W [m/s], [N, 3]."""
-    orientation: wp.array2d[wp.float64]
-    """q_WB, xyzw, [N, 4], of unit length."""
-    body_rate: wp.array2d[wp.float64]
-    """w_WB in B [rad/s], [N, 3]."""
+    position: wp.array2d[wp.float64]  # p_WB [m], [N, 3]
+    velocity: wp.array2d[wp.float64]  # v_WB in W [m/s], [N, 3]
+    orientation: wp.array2d[wp.float64]  # q_WB, xyzw, [N, 4], of unit length
+    body_rate: wp.array2d[wp.float64]  # w_WB in B [rad/s], [N, 3]
 
 
 def begin_of_paths(scenes: SceneTable) -> dict[str, NDArray[np.float64]]:

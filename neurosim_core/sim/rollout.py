@@ -209,12 +209,9 @@ def render_backlog_left(state: State) -> int:
 
 
 def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
-    """Render what the cameras see in a batch; return their packets in the order of time.
+    """Render the oldest batch that was flown and not looked at; return its packets in the order of time.
 
-    Args:
-        model: What does not change.
-        state: Only what belongs to the cameras changes, so that another thread may fly on.
-        batch: The oldest that was flown and not looked at.
+    Only what belongs to the cameras changes in the state, so that another thread may fly on.
     """
     launch_cameras(model, state, batch)
     packets = read_cameras(state, batch, borrow=state.borrow_pictures)
@@ -278,33 +275,22 @@ def start(model: Model, state: State) -> list[Packet]:
     return read(model, state)
 
 
-def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> list[Packet]:
+def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
     """Fly one batch, at most to what `batch_end_ns` gives, and return what the sensors yield in it.
 
-    Args:
-        model: What does not change.
-        state: Moved on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
-            (`failure`).
-        end_ns: End of the batch [ns], after the state's stamp.
-        closed_loop: Let the path controller command; otherwise the last command is held.
+    The state moves on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
+    (`failure`). The path controller commands.
 
     Raises:
         RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
     """
     _check_all_read(state)
-    launch_until(model, state, end_ns, closed_loop=closed_loop)
+    launch_until(model, state, end_ns)
     return read(model, state)
 
 
 def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> None:
-    """Launch one batch, at most to what `batch_end_ns` gives, without waiting for a CUDA device.
-
-    Args:
-        model: What does not change.
-        state: It has room for one more batch in flight.
-        end_ns: End of the batch [ns], after what was launched before.
-        closed_loop: Let the path controller command; otherwise the last command is held.
-    """
+    """Launch one batch, as `advance` flies it, without waiting for a CUDA device."""
     stretch = boundaries(model.schedule, state.launched_ns, end_ns)
     launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
 

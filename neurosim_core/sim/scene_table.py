@@ -84,21 +84,16 @@ def make_scene_table(
     lenses_differ: bool = False,
     own_light: bool = False,
 ) -> SceneTable:
-    """Load the scenes and bring them to the device.
+    """Load the scenes of `count` worlds and bring them to the device; without any, that of the configuration.
 
-    Args:
-        config: What to fly; its scene counts where no others are given.
-        count: Number of worlds.
-        scenes: The scenes.
-        models: Scenes that were loaded before, in place of `scenes`, each with its path and light.
-        scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
-        lenses_differ: Worlds look through different lenses.
-        own_light: Let the light of each world be changed (`SceneTable.light`).
+    `models` are scenes that were loaded before, each with its path and light. `scene_of_world` is the index
+    of each world's, shape [N]; by default they take turns. With `own_light` that of each world may be
+    changed.
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
-            move and there are several scenes; or models are on another device, have other bodies or were
-            lit or packed by other settings of the renderer than `config` says.
+            move and there are several scenes; or models are on another device, have other bodies or were lit
+            or packed by other settings of the renderer than `config` says.
     """
     if config.renderer.kind != "warp":
         raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer.kind!r}")

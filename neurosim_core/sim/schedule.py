@@ -132,15 +132,11 @@ class Period:
 class Timetable:
     """Finds the period that begins at a tick of the control clock.
 
-    Args:
-        schedule: Every clock of the rig.
-        images: For each group, the clocks of its image sensors by name.
-
-    Attributes:
-        common_ns: After this time all clocks tick together [ns]; 0: that takes hours.
+    All clocks tick together after `common_ns`; 0: that takes hours.
     """
 
     def __init__(self, schedule: Schedule, images: tuple[dict[str, Rate], ...]) -> None:
+        """Make it for a rig, and for each group the clocks of its image sensors by name."""
         self._schedule = schedule
         self._images = images
         self._periods: dict[int, Period] = {}

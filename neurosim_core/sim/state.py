@@ -383,12 +383,9 @@ def _make_fleet(vehicle: Vehicle) -> Any:
 
 
 def reset_vehicles(model: Model, state: State, mask: Any) -> None:
-    """Put the vehicles of some worlds where they begin, with rotors at hover, at time 0; launches only.
+    """Put vehicles whose mask [N] is not 0 where they begin (`State.start`); launches only.
 
-    Args:
-        model: What does not change.
-        state: `start` says where they begin.
-        mask: Not 0 where a world begins anew, device array of int32, shape [N].
+    Rotors are at hover, time is 0.
     """
     wp.launch(
         restart,

@@ -38,11 +38,8 @@ from neurosim_core.warp_start import refuse_forked_process
 def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[int] = ()) -> None:
     """Launch one batch, from the command to the events, without waiting for a device.
 
-    Args:
-        model: What does not change.
-        state: Everything else, of all worlds.
-        batch: Where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
-        last_seen_ns: Of many worlds, for each group: the instant before the batch, from its begin [ns], <= 0.
+    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`). Of many
+    worlds `last_seen_ns` is for each group the instant before it, from its begin [ns], <= 0.
     """
     refuse_forked_process()
     # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
@@ -82,11 +79,9 @@ def launch_first(model: Model, state: State, batch: Batch) -> None:
 def read(model: Model, state: State, *, last: bool = False) -> list[Packet]:
     """Wait for the oldest batch in flight and return what the sensors yield in it, in the order of time.
 
-    Args:
-        model: What does not change.
-        state: `stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or
-            the integration failed (`failure`).
-        last: Nothing is launched before the pictures have been used: they may be borrowed, if that is wanted.
+    `state.stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or the
+    integration failed (`failure`). If it is the `last`, nothing is launched before the pictures have been
+    used: they may be borrowed, if that is wanted.
     """
     batch = state.in_flight.popleft()
     with timed(state.wall_s, "read-back"):

@@ -29,16 +29,11 @@ _LAUNCHES_MAX = 256
 class Surfaces:
     """What vehicles can touch: the scene that each world is in, and the ground."""
 
-    fields: wp.array[DistanceField]
-    """Distance to each scene, shape [scene]."""
-    scene: wp.array[int]
-    """Which of them a world is in, shape [world]."""
-    radius_m: float
-    """Radius of the vehicle [m]."""
-    ground_height_m: wp.float64
-    """z of the plane that it may land on [m]; -inf: there is none."""
-    holds: int
-    """1: a vehicle that touches something is held until its world is reset."""
+    fields: wp.array[DistanceField]  # Distance to each scene, shape [scene]
+    scene: wp.array[int]  # Which of them a world is in, shape [world]
+    radius_m: float  # Radius of the vehicle [m]
+    ground_height_m: wp.float64  # z of the plane that it may land on [m]; -inf: there is none
+    holds: int  # 1: a vehicle that touches something is held until its world is reset
 
 
 @wp.struct
@@ -55,27 +50,23 @@ class Fleet:
     status: wp.array[wp.int32]
     redone_count: wp.array[wp.int64]
     evaluation_count: wp.array[wp.int64]
-    clock_ns: wp.array[wp.int64]
-    """Time of the world at the beginning of the batch [ns]."""
+    clock_ns: wp.array[wp.int64]  # Time of the world at the beginning of the batch [ns]
     collided: wp.array[wp.int32]
     """1: the vehicle has touched something in this batch, or is held because it did."""
-    active: wp.array[wp.int32]
-    """0: the world is left alone by samplers and collisions."""
+    active: wp.array[wp.int32]  # 0: the world is left alone by samplers and collisions
 
 
 @wp.struct
 class Rows:
     """The slots of a trace."""
 
-    states: wp.array3d[wp.float64]
-    status: wp.array2d[wp.int32]
-    clearance: wp.array2d[wp.float32]
-    redone: wp.array2d[wp.int64]
-    stamps: wp.array2d[wp.int64]
-    history: History
-    """Of all boundaries, as far back as rays with times of their own need it."""
-    entries: wp.array2d[wp.int64]
-    """Number of the entry of each slot in `history`; empty without one."""
+    states: wp.array3d[wp.float64]  # Shape [slot, world, 13 + R]; the others: [slot, world]
+    status: wp.array2d[wp.int32]  # Why a vehicle is held (`MultirotorArrays.status`)
+    clearance: wp.array2d[wp.float32]  # From the vehicle to the nearest surface [m], <= 0 where it touches
+    redone: wp.array2d[wp.int64]  # Intervals redone so far (`MultirotorArrays.redone_count`)
+    stamps: wp.array2d[wp.int64]  # Time since the reset of the world [ns]
+    history: History  # Of all boundaries, as far back as rays with times of their own need it
+    entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
 
 @wp.kernel
@@ -253,13 +244,7 @@ class TraceRows(NamedTuple):
 class Trace:
     """Device buffers with one slot for each boundary of the batches in flight, and their copies on the host.
 
-    Attributes:
-        states: States, float64, shape [slot, world, 13 + R].
-        status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, world].
-        stamps: Time of each slot since the reset of the world [ns], int64, shape [slot, world].
-        redone: Intervals redone so far (`MultirotorArrays.redone_count`), shape [slot, world].
-        clearance: Distance from the vehicle to the nearest surface [m], <= 0 where it touches, float32, shape
-            [slot, world].
+    Its arrays are those of `Rows`.
     """
 
     def __init__(
@@ -289,13 +274,9 @@ class Trace:
     ) -> None:
         """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
 
-        Args:
-            surfaces: `Surfaces`.
-            fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
-            slot: Where to write, in [0, capacity).
-            elapsed_ns: Time since the beginning of the batch [ns].
-            first: It is the first slot of a batch: vehicles touch nothing yet.
-            last: It is the last one: clocks of worlds move on to it.
+        Vehicles that touch something are marked in `fleet`, and held if so configured; `elapsed_ns` counts
+        from the beginning of the batch. At the `first` slot of a batch vehicles touch nothing yet; at the
+        `last` clocks of worlds move on to it.
         """
         self._record.launch(
             self.states.shape[1], [surfaces, fleet, self._rows, slot, elapsed_ns, int(first), int(last)]
@@ -314,14 +295,8 @@ class Trace:
     ) -> None:
         """Write the poses T_WC = T_WB T_BC of a camera at the first `count` of the given slots, in float32.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
-            p_WC: Positions, shape [world K]; overwritten.
-            q_WC: Orientations, shape [world K]; overwritten.
-            stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
+        Where the camera is on the body in each world is given as vec3d [m] and quatd, shape [world].
+        Positions, orientations, [world K], and times [ns], [world K, 1] or empty, are overwritten.
         """
         key = (slots.ptr, count, p_WC.ptr)
         # another list of slots may have the memory of one that is gone
@@ -373,12 +348,7 @@ class Trace:
     def camera_twists(self, slots: wp.array[int], twist: Any, *, count: int, p_BC: Any, q_BC: Any) -> None:
         """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
 
-        Args:
-            slots: Slots of the instants, shape [K].
-            twist: spatial_vectord, shape [world K]; overwritten.
-            count: How many of them to use.
-            p_BC: Position of the camera on the body in each world [m], vec3d, shape [world].
-            q_BC: Orientation of the camera against the body, xyzw, likewise.
+        As `camera_poses`; `twist` is of spatial_vectord, shape [world K].
         """
         world_count = self.states.shape[1]
         wp.launch(
@@ -422,14 +392,10 @@ class Trace:
 def make_surfaces(
     fields: Any, scene: Any, *, radius_m: float, ground_height_m: float | None, holds: bool
 ) -> Surfaces:
-    """Return what vehicles can touch.
+    """Return what vehicles of a radius can touch: `DistanceField` of each scene, index of that of each world.
 
-    Args:
-        fields: Distance to each scene, device array of `DistanceField`.
-        scene: Index of the scene of each world, device array of int32.
-        radius_m: Radius of the vehicle [m].
-        ground_height_m: z of the plane that it may land on [m]; None: there is none.
-        holds: A vehicle that touches something is held.
+    `ground_height_m` is z of the plane that they may land on; None: there is none. With `holds` a vehicle
+    that touches something is held.
     """
     surfaces = Surfaces()
     surfaces.fields, surfaces.scene = fields, scene

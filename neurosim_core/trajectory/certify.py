@@ -42,13 +42,8 @@ class ClearanceProof:
 def prove_clearance(path: Path, space: FreeSpace, clearance_m: float) -> ClearanceProof:
     """Prove that every piece of a path keeps a clearance, or say which do not.
 
-    A piece fails if some point of it is too near something, or if it comes so close to the limit (about 1e-5
-    m) that 12 halvings prove nothing.
-
-    Args:
-        path: What is to be proven.
-        space: The scene; its bounds count as obstacles.
-        clearance_m: What every point of the path must have around it [m].
+    A piece fails if some point of it is too near something (the bounds of the scene count), or if it comes so
+    close to the limit (about 1e-5 m) that 12 halvings prove nothing.
     """
     return prove_pieces(path.coefficients[:, :3], space, clearance_m)
 
@@ -56,10 +51,7 @@ def prove_clearance(path: Path, space: FreeSpace, clearance_m: float) -> Clearan
 def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> ClearanceProof:
     """Prove the clearance of polynomial pieces; see `prove_clearance`.
 
-    Args:
-        coefficients: Positions [m] in rising powers of normalised time, shape [S, 3, degree + 1].
-        space: The scene.
-        clearance_m: See `prove_clearance`.
+    Positions [m] are coefficients in rising powers of normalised time, shape [S, 3, degree + 1].
     """
     degree = coefficients.shape[2] - 1
     convert = bernstein_matrix(degree)
@@ -99,13 +91,7 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
 
 
 def segment_clearance(room_a: Array, room_b: Array, length: Array) -> Array:
-    """Return a lower bound of the distance to obstacles on segments, from the distances at their ends [m].
-
-    Args:
-        room_a: Distance to the nearest obstacle at one end [m], shape [n]; negative counts as 0.
-        room_b: At the other end.
-        length: Of each segment [m].
-    """
+    """Return a lower bound of the distance to obstacles on segments, from those at their ends [m]."""
     a2, b2, l2 = np.maximum(room_a, 0.0) ** 2, np.maximum(room_b, 0.0) ** 2, length**2
     s = np.clip(np.divide(l2 + a2 - b2, 2.0 * l2, out=np.zeros_like(l2), where=l2 > 0.0), 0.0, 1.0)
     squared = (1.0 - s) * a2 + s * b2 - s * (1.0 - s) * l2

@@ -67,9 +67,7 @@ class FlightBounds:
 def control_points(coefficients: Array, parts: int) -> Array:
     """Return Bernstein control points of each of `parts` equal parts of each piece.
 
-    Args:
-        coefficients: Rising powers of normalised time, shape [S, axis, degree + 1].
-        parts: How many parts a piece is cut into.
+    The pieces are in rising powers of normalised time, shape [S, axis, degree + 1].
 
     Returns:
         Shape [S * parts, degree + 1, axis]; the first and the last of a part lie on the curve.
@@ -93,16 +91,11 @@ def flight_bounds(path: Path) -> FlightBounds:
 
 
 def time_factor(coefficients: Array, durations_s: Array, limits: FlightLimits) -> float:
-    """Return the factor on all durations that makes a path as fast as the limits allow.
+    """Return the factor on all durations [S] that makes a path as fast as the limits allow.
 
-    By bisection, to 1e-4; the limits are proven to hold at the factor returned, with 1e-6 to spare for
-    rounding
-    durations to nanoseconds.
-
-    Args:
-        coefficients: Positions in rising powers of normalised time, shape [S, 3, degree + 1].
-        durations_s: Shape [S].
-        limits: What must hold; the yaw rate plays no part here.
+    By bisection, to 1e-4; the limits, but that of the yaw rate, are proven to hold at the factor returned,
+    with 1e-6 to spare for rounding durations to nanoseconds. Positions are in rising powers of normalised
+    time, shape [S, 3, degree + 1].
     """
     hulls = _derivative_hulls(coefficients, durations_s)
     spare = 1.0 - 1e-6

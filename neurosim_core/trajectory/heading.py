@@ -30,16 +30,11 @@ _HORIZONTAL_MIN_M = 0.02
 
 
 def follow_travel(path: Path, *, lookahead_s: float, rate_max_rad_s: float) -> Path:
-    """Return a path with the same positions that looks where it flies.
+    """Return a path with the same positions that looks where it will be after a time, > 0 and at most 1e6 s.
 
-    The heading is four times continuously differentiable inside, and at rest at both ends. Pieces are cut so
-    that
-    none is longer than 0.15 s.
-
-    Args:
-        path: Positions; its yaw is replaced. A path without horizontal motion keeps yaw 0.
-        lookahead_s: The heading points to where the path will be after this time [s], > 0 and at most 1e6.
-        rate_max_rad_s: Largest yaw rate [rad/s], > 0; holds everywhere.
+    The heading is four times continuously differentiable inside, and at rest at both ends; its rate holds
+    everywhere. Pieces are cut so that none is longer than 0.15 s. A path without horizontal motion keeps yaw
+    0.
     """
     fine = path.subdivided(np.maximum(np.ceil(path.durations_s / _KNOT_SPACING_S), 1.0).astype(np.int64))
     knots_s = (fine.knots_ns - fine.start_ns) / NS_PER_S

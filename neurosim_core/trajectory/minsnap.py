@@ -32,14 +32,8 @@ _BAND = 5
 def hermite_matrix(order: int) -> Array:
     """Matrix from end values to coefficients, for polynomials of degree 2 order - 1 on [0, 1].
 
-    Exact: its elements are multiples of 1 / (order - 1)!.
-
-    Args:
-        order: How many values are given at each end: position, velocity, ...
-
-    Returns:
-        Shape [2 order, 2 order]: column k < order belongs to derivative k at 0, column order + k to
-        derivative k at 1, row j to power j.
+    Exact: its elements are multiples of 1 / (order - 1)!. Shape [2 order, 2 order]: column k < order belongs
+    to derivative k at 0, column order + k to derivative k at 1, row j to power j.
     """
     powers = np.arange(2 * order)
     values = np.zeros((2 * order, 2 * order))
@@ -77,17 +71,10 @@ class Spline:
 
 
 def solve_minimum_snap(points: Array, durations_s: Array, rest: NDArray[np.bool_]) -> Spline:
-    """Minimise the integral of squared snap through waypoints at given times.
+    """Minimise the integral of squared snap through waypoints [n + 1, axis] that are durations [n] apart [s].
 
     The gradient follows from the envelope theorem: at the optimum, only the explicit dependence of the cost
-    on a
-    duration counts.
-
-    Args:
-        points: Waypoints, shape [n + 1, axis].
-        durations_s: Duration of each piece [s], > 0, shape [n].
-        rest: Where velocity, acceleration and jerk must be zero, shape [n + 1]; they are at both ends in any
-            case.
+    on a duration counts. Velocity, acceleration and jerk are zero where it rests, [n + 1], and at both ends.
     """
     count, axes = len(durations_s), points.shape[1]
     scale_s = float(
@@ -151,22 +138,13 @@ def solve_minimum_snap(points: Array, durations_s: Array, rest: NDArray[np.bool_
 def allocate_durations(
     points: Array, *, rest: NDArray[np.bool_] | None = None, iterations: int = 60
 ) -> Array:
-    """Divide time between the pieces so that snap is least for the total duration.
+    """Return durations of mean 1, shape [n], that divide time between the pieces so that snap is least.
 
     Minimises log(cost) + 7 log(sum of durations) over the logarithms of the durations, by L-BFGS with the
-    exact
-    gradient. Cost is homogeneous of degree -7 in the durations, so this has the same minimiser, up to a
-    common
-    factor, as cost + k * total duration for every k > 0: k only chooses that factor, and that is chosen
-    afterwards, by what the vehicle can do.
-
-    Args:
-        points: Waypoints, no two neighbours equal, shape [n + 1, axis].
-        rest: See `solve_minimum_snap`.
-        iterations: Most iterations of L-BFGS.
-
-    Returns:
-        Durations with mean 1, shape [n].
+    exact gradient. Cost is homogeneous of degree -7 in the durations, so this has the same minimiser, up to a
+    common factor, as cost + k * total duration for every k > 0: k only chooses that factor, and that is
+    chosen afterwards, by what the vehicle can do. Parameters as of `solve_minimum_snap`; no two neighbours
+    are equal.
     """
     rest = np.zeros(len(points), dtype=bool) if rest is None else rest
     distance = np.linalg.norm(np.diff(points, axis=0), axis=1)

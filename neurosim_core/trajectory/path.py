@@ -337,10 +337,7 @@ def join_axes(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArra
 def restriction(start: NDArray[np.float64], length: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Return matrices that take a polynomial's coefficients to those on parts of its interval.
 
-    Args:
-        start: Where each part begins, in normalised time, shape [part].
-        length: How long it is, shape [part].
-        degree: Of the polynomial.
+    Parts begin in normalised time at `start` and have a length, shape [part].
 
     Returns:
         Shape [part, degree + 1, degree + 1]; each part has its own normalised time in [0, 1].
@@ -355,12 +352,7 @@ def restriction(start: NDArray[np.float64], length: NDArray[np.float64], degree:
 
 
 def upload_paths(paths: Sequence[Path], device: Any) -> PathArrays:
-    """Put paths on a device, for `evaluate_path(arrays, index, stamp_ns)` inside a kernel.
-
-    Args:
-        paths: At least one; shorter degrees are padded with zeros.
-        device: Warp device.
-    """
+    """Put paths, padded to one degree, on a device, for `evaluate_path` in a kernel."""
     width = max(path.degree for path in paths) + 1
     rows = np.concatenate(
         [np.pad(path.coefficients, ((0, 0), (0, 0), (0, width - path.degree - 1))) for path in paths]

@@ -136,12 +136,7 @@ def read_poses(file: FilePath, kind: PoseFormat, *, topic: str | None = None) ->
     """Read a file of poses; stamps count from the first.
 
     Poses with the time of the one before, or nearly so, are left out, and the log says it: published ground
-    truth has some.
-
-    Args:
-        file: Where they are.
-        kind: Format.
-        topic: Of a bag; None: the only one that has poses.
+    truth has some. Of a bag the topic may be left open if only one has poses.
 
     Raises:
         ValueError: The file cannot be read, or a row is wrong; the message names file, row and value.
@@ -231,12 +226,9 @@ def _check_poses(
 ) -> Poses:
     """Return poses, with stamps from the first one on.
 
-    Args:
-        table: Time, p_WB [m] and q_WB, xyzw, of length 1 to 1 %, shape [n, 8].
-        where: What a message calls all of them.
-        name: What a message calls a row.
-        unit_s: Unit of time [s].
-        repeats: Poses less than 1 % of the usual time after the one before are left out, not refused.
+    The table has time in `unit_s`, p_WB [m] and q_WB, xyzw, of length 1 to 1 %, shape [n, 8]. Messages call
+    it `where` and a row `name`. With `repeats` poses less than 1 % of the usual time after the one before are
+    left out, not refused.
     """
     times, p, q = table[:, 0], table[:, 1:4].astype(np.float64), table[:, 4:].astype(np.float64)
     if len(times) < 2:
@@ -264,13 +256,7 @@ def _check_poses(
 def spline_path(
     stamps_ns: NDArray[np.int64], position: NDArray[np.float64], orientation: scipy.spatial.transform.Rotation
 ) -> Path:
-    """Return the path through poses, whose orientation is prescribed as well.
-
-    Args:
-        stamps_ns: Strictly increasing [ns], shape [n].
-        position: p_WB [m], shape [n, 3].
-        orientation: R_WB, n rotations.
-    """
+    """Return the path through poses p_WB [m], [n, 3], and R_WB at rising stamps [ns]; it prescribes both."""
     times_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
     spans_s = np.diff(times_s)
     rising = spans_s[:, None, None] ** np.arange(4)

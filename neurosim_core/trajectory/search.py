@@ -156,14 +156,10 @@ def search(
     *,
     cost_max_m: float = math.inf,
 ) -> Search:
-    """Find the cheapest ways from a voxel over the 26 neighbours of each.
+    """Find the cheapest ways from a voxel over 26 neighbours, to a goal (A*) or to all (Dijkstra).
 
-    Args:
-        slowness: Cost of a metre in each voxel, >= 1, or 0 where it must not go, shape [nx, ny, nz].
-        voxel_m: Spacing [m].
-        start: Voxel.
-        goal: Voxel at which to stop (A*); None: find the ways to all voxels (Dijkstra).
-        cost_max_m: Ways that cost more need not be found [m].
+    `slowness` is the cost of a metre in each voxel, >= 1, or 0 where it must not go, shape [nx, ny, nz]; ways
+    that cost more than `cost_max_m` need not be found.
     """
     # Nothing is cheaper than what goes through a voxel of infinite slowness: such a border, and no bounds.
     walls = np.pad(np.where(slowness > 0.0, slowness, np.inf), 1, constant_values=np.inf)

@@ -61,11 +61,8 @@ def quadratic_weights(
 ) -> NDArray[np.float64]:
     """Return what one (rad/s)^2 of each rotor adds to thrust and to torque about x, y, z, shape [R, 4].
 
-    Args:
-        position: Hubs in B [m], shape [R, 3].
-        direction: Signs of the reaction torques, shape [R].
-        thrust: Coefficient of all rotors, or of each, shape [R] [N/(rad/s)^2].
-        torque: Likewise [N m/(rad/s)^2].
+    Hubs are in B [m], shape [R, 3]; directions are the signs of the reaction torques, [R]. The coefficients,
+    of all rotors or of each, are in N/(rad/s)^2 and N m/(rad/s)^2.
     """
     x, y = position[:, 0], position[:, 1]
     return np.stack([np.full(len(x), thrust), thrust * y, -thrust * x, torque * direction], axis=1)

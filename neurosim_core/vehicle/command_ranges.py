@@ -86,12 +86,7 @@ class CommandRanges:
     """Size of each coordinate of a position [m]."""
 
     def excess(self, mode: str, row: list[float]) -> str:
-        """Say what of a setpoint is beyond its range; empty if nothing is.
-
-        Args:
-            mode: Name of the command mode.
-            row: Finite setpoint, as in `control.modes.MODES`.
-        """
+        """Say what of a finite setpoint (`control.modes.MODES`) is beyond its range; empty: nothing is."""
         for part in _PARTS[mode]:
             limit = getattr(self, part.limit)
             numbers = row[part.begin : part.end]

@@ -78,13 +78,7 @@ def make_ground(config: GroundConfig | None, rotor_position_m: tuple[Vector3, ..
 
 @wp.func
 def touches(ground: Ground, height: wp.float64, up: wp.vec3d) -> wp.bool:
-    """Return whether a foot is in the ground.
-
-    Args:
-        ground: Parameters.
-        height: Of the centre of mass above the plane [m].
-        up: Direction of world z, in the frame of the feet.
-    """
+    """Return whether a foot is in the ground; height is that of the centre of mass, up is world z in B."""
     for foot in range(ground.feet.shape[0]):
         if height + wp.dot(up, ground.feet[foot]) < wp.float64(0.0):
             return wp.bool(True)
@@ -95,12 +89,8 @@ def touches(ground: Ground, height: wp.float64, up: wp.vec3d) -> wp.bool:
 def contact_wrench(ground: Ground, height: wp.float64, up: wp.vec3d, velocity: wp.vec3d, w: wp.vec3d):
     """Return force [N] and torque [N m] of the ground on the vehicle, in B.
 
-    Args:
-        ground: Parameters.
-        height: Of the centre of mass above the plane [m].
-        up: Direction of world z, in B.
-        velocity: Of the centre of mass over ground, in B [m/s].
-        w: Body rate [rad/s].
+    Height is that of the centre of mass above the plane [m]; world z, its velocity over ground [m/s] and the
+    body rate [rad/s] are in B.
     """
     force = wp.vec3d()
     torque = wp.vec3d()

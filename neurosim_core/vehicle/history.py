@@ -21,10 +21,8 @@ wp.set_module_options({"enable_backward": False})
 class History:
     """The states of vehicles at boundaries, in a ring of L entries; all of shape [world, L] but `count`."""
 
-    count: wp.array[wp.int64]
-    """Entries since the reset of a world, shape [world]."""
-    stamp_ns: wp.array2d[wp.int64]
-    """Time since the reset of the world [ns]."""
+    count: wp.array[wp.int64]  # Entries since the reset of a world, shape [world]
+    stamp_ns: wp.array2d[wp.int64]  # Time since the reset of the world [ns]
     position: wp.array2d[wp.vec3d]
     velocity: wp.array2d[wp.vec3d]
     orientation: wp.array2d[wp.quatd]

@@ -290,15 +290,12 @@ def _calibrate(
 def _missing(body_rate: Array, turning: Array, load: Array, flying: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Tell what the model misses, by a Kalman filter of rate, steady and fading part for each axis.
 
-    Args:
-        body_rate: Measured at every sample [rad/s], shape [n, 3].
-        turning: Angular acceleration of the model there [rad/s^2], shape [n, 3].
-        load: By which the steady part is multiplied there, shape [n, 3].
-        flying: Which samples count, shape [n].
+    Of n samples: measured rate [rad/s], angular acceleration of the model [rad/s^2] and load by which the
+    steady part is multiplied, [n, 3] each, and which of them count, [n].
 
     Returns:
-        The steady part under a load of 1 and the fading part at samples 0, 10, 20, ... [rad/s^2], shape
-        [n / 10, 3] each.
+        The steady part under a load of 1 and the fading part at samples 0, 10, 20, ... [rad/s^2], shape [n /
+        10, 3] each.
     """
     step = round(_FILTER_STEP_S / _STEP_S)
     count = len(turning) // step

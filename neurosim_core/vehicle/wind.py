@@ -125,15 +125,8 @@ def make_wind(
 ) -> Wind:
     """Allocate what gusts and turbulence need, for a number of vehicles; nothing for what there is not.
 
-    Args:
-        gusts: Those that blow.
-        turbulence: Parameters; None: still air, in the place of turbulence.
-        turbulent: There is turbulence, be it still.
-        wind_m_s: Mean wind, which turbulence is aligned with.
-        ground_height_m: z of the ground in W.
-        seeds: Of the turbulence of each vehicle, device array of uint64, shape [N].
-        count: Number of vehicles.
-        device: Warp device.
+    If it is `turbulent` without parameters, the air is still in the place of turbulence, which is aligned
+    with the mean wind `wind_m_s`. Seeds are those of each vehicle, device array of uint64, shape [N].
     """
     wind = Wind()
     if gusts:

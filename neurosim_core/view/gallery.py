@@ -72,14 +72,7 @@ font-size:12px;white-space:pre-wrap;overflow-wrap:anywhere}
 def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -> None:
     """Write the page; pictures are inside of it.
 
-    Args:
-        path: File to write.
-        device: Where to compute.
-        only: Name of a section; None: all.
-
-    Raises:
-        OSError: The file cannot be written.
-        ValueError: There is no such section.
+    `only`: name of a section; None: all.
     """
     made: dict[str, Callable[[], list[str]]] = {
         "sensors": lambda: _show_rig(sensors(), device),

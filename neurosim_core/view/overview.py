@@ -83,9 +83,8 @@ class FlightSummary:
     ) -> None:
         """Start empty.
 
-        Args:
-            sensors: Sensors of the flight; the orientation of the first camera is used.
-            event_window_ns: Length of the window of events that is shown [ns].
+        `sensors`: sensors of the flight; the orientation of the first camera is used. `event_window_ns`:
+        length of the window of events that is shown [ns].
         """
         self._window_ns = event_window_ns
         cameras = [s for s in sensors if s.intrinsics is not None]
@@ -187,8 +186,8 @@ class FlightSummary:
                 elif kind == "depth":
                     depth_m = min(depth_m, float(np.median(data)))
         for view in snapshot.events.values():
-            seen = np.zeros((view.height, view.width), dtype=np.bool_)
-            seen[view.events.y, view.events.x] = True
+            seen = np.zeros(view.height * view.width, dtype=np.bool_)
+            seen[np.multiply(view.events.y, view.width, dtype=np.intp) + view.events.x] = True
             covered = max(covered, float(seen.mean()))
         # most at a third: more is a thicket
         interest = (1.0 + contrast) * (0.01 + covered * (1.0 - covered) ** 2) * (0.1 + depth_m)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from controller_commands import command_of
 
-from neurosim_core.control import MODES, make_controller
+from neurosim_core.control import MODES, Controller
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.command_ranges import SPEED_CEILING_M_S, command_ranges, top_speed_m_s
 
@@ -35,7 +35,7 @@ def fly_random_commands(mode: str, airframe: str, *, vehicles: int, periods: int
     """Fly each vehicle by its own random commands; raises if a run ends."""
     config = preset(airframe)
     batch = Multirotor(config, count=vehicles, device=device)
-    controller = make_controller(mode, config, count=vehicles, device=device)
+    controller = Controller(mode, config, count=vehicles, device=device)
     random = np.random.default_rng(7)
     for _ in range(periods):
         controller.set(random_commands(random, mode, vehicles, len(controller.layout)))
@@ -84,14 +84,14 @@ def test_a_command_out_of_range_is_flown_as_the_nearest_within(
         "body_rate": [0.1, 0.0, 0.0],
         "rotor_speed": 400.0 * np.ones(4),
     }
-    controller = make_controller(mode, preset("hummingbird", command_ranges=limits), device=device)
+    controller = Controller(mode, preset("hummingbird", command_ranges=limits), device=device)
     with caplog.at_level(logging.WARNING):
         got = [command_of(controller, asked, **state) for _ in range(2)]
     assert controller.clamped_count == 2
     assert caplog.text.count("is out of range") == 1  # said once
     np.testing.assert_allclose(got[1], command_of(controller, flown, **state), rtol=1e-12)
     assert controller.clamped_count == 2
-    strict = make_controller(
+    strict = Controller(
         mode, preset("hummingbird", command_ranges={**limits, "beyond": "refuse"}), device=device
     )
     with pytest.raises(ValueError, match="is out of range"):

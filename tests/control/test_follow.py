@@ -7,7 +7,7 @@ import pytest
 from controller_commands import command_of
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.control import PathFollower, Se3Config, make_controller
+from neurosim_core.control import Controller, PathFollower, Se3Config
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import Multirotor, preset
 
@@ -31,7 +31,7 @@ def test_motor_speeds_are_those_of_the_controller():
     """To the last bit, state after state: nothing of the state before is left."""
     gains = Se3Config(position_gain_per_s2=7.0)
     follower = PathFollower(PATH, VEHICLE, gains)
-    controller = make_controller("path", VEHICLE, gains, device="cpu", paths=PATH)
+    controller = Controller("path", VEHICLE, gains, device="cpu", paths=PATH)
     for seed in range(20):
         state, stamp_ns = a_state(seed), STAMP_NS * seed
         command = follower.command(stamp_ns=stamp_ns, **state)
@@ -78,7 +78,7 @@ def test_a_velocity_leads_back_to_the_path():
 def test_every_mode_flies_the_path(mode):
     """Setpoints are flown by the controller of their mode, as the simulator does it."""
     follower = PathFollower(PATH, VEHICLE, mode=mode)
-    inner = None if mode == "motor_speeds" else make_controller(mode, VEHICLE, device="cpu")
+    inner = None if mode == "motor_speeds" else Controller(mode, VEHICLE, device="cpu")
     vehicle = Multirotor(VEHICLE, count=1, device="cpu", max_step_ns=1_000_000)
     start = PATH.evaluate([0])
     vehicle.reset(position=start.position, velocity=start.velocity)

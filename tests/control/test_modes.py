@@ -8,7 +8,7 @@ from controller_commands import command_of
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.control import MODES, Se3Config, make_controller
+from neurosim_core.control import MODES, Controller, Se3Config
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, preset
 
@@ -56,7 +56,7 @@ def a_path(yaw="travel"):
 )
 def test_no_error_is_hover(device, mode, setpoint):
     """Every mode, asked for the state it is in, carries the weight and no more."""
-    controller = make_controller(mode, HUMMINGBIRD, device=device)
+    controller = Controller(mode, HUMMINGBIRD, device=device)
     speeds = command_of(controller, setpoint, **REST)
     np.testing.assert_allclose(speeds, [REST["rotor_speed"]], rtol=1e-14)
 
@@ -65,8 +65,8 @@ def test_attitude_at_its_attitude_is_rates():
     """Attitude without attitude error is the rate mode asked for no rate."""
     state = random_states(20)
     thrust = np.full((20, 1), 6.0)
-    attitude = make_controller("attitude", HUMMINGBIRD, count=20)
-    rates = make_controller("rates", HUMMINGBIRD, count=20)
+    attitude = Controller("attitude", HUMMINGBIRD, count=20)
+    rates = Controller("rates", HUMMINGBIRD, count=20)
     np.testing.assert_allclose(
         command_of(attitude, np.hstack([thrust, state["orientation"]]), **state),
         command_of(rates, np.hstack([thrust, np.zeros((20, 3))]), **state),
@@ -79,8 +79,8 @@ def test_position_is_velocity_asked_for_the_correction():
     state = random_states(20) | {"orientation": [0.0, 0.0, 0.0, 1.0], "body_rate": [0.0, 0.0, 0.0]}
     target = state["position"] + 0.1
     gains = Se3Config(position_gain_per_s2=12.0, velocity_gain_per_s=6.0)
-    position = make_controller("position", HUMMINGBIRD, gains, count=20)
-    velocity = make_controller("velocity", HUMMINGBIRD, gains, count=20)
+    position = Controller("position", HUMMINGBIRD, gains, count=20)
+    velocity = Controller("velocity", HUMMINGBIRD, gains, count=20)
     np.testing.assert_allclose(
         command_of(position, np.hstack([target, np.zeros((20, 1))]), **state),
         command_of(velocity, np.hstack([2.0 * (target - state["position"]), np.zeros((20, 1))]), **state),
@@ -95,9 +95,9 @@ def test_path_at_rest_is_position():
     setpoint = [*end.position[0], end.yaw[0]]
     np.testing.assert_allclose(
         command_of(
-            make_controller("path", HUMMINGBIRD, count=8, paths=path), **state, stamp_ns=path.end_ns + 10**9
+            Controller("path", HUMMINGBIRD, count=8, paths=path), **state, stamp_ns=path.end_ns + 10**9
         ),
-        command_of(make_controller("position", HUMMINGBIRD, count=8), setpoint, **state),
+        command_of(Controller("position", HUMMINGBIRD, count=8), setpoint, **state),
         rtol=1e-9,
     )
 
@@ -106,7 +106,7 @@ def test_quaternion_sign_does_not_matter():
     """Minus q is q: of the body and of the setpoint, within rounding."""
     state = random_states(30)
     setpoint = np.hstack([np.full((30, 1), 5.0), Rotation.random(30, rng=1).as_quat()])
-    controller = make_controller("attitude", HUMMINGBIRD, count=30)
+    controller = Controller("attitude", HUMMINGBIRD, count=30)
     one = command_of(controller, setpoint, **state)
     np.testing.assert_allclose(
         command_of(controller, setpoint, **state | {"orientation": -state["orientation"]}), one
@@ -124,7 +124,7 @@ def test_commands_stay_within_limits(name, mode, device):
     state = random_states(200, config, seed=5)
     state["velocity"] = 50.0 * state["velocity"]
     state["body_rate"] = 50.0 * state["body_rate"]
-    controller = make_controller(mode, config, count=200, device=device)
+    controller = Controller(mode, config, count=200, device=device)
     setpoint = 100.0 * np.random.default_rng(6).normal(size=(200, len(controller.layout)))
     speeds = command_of(controller, setpoint, **state)
     assert speeds.min() >= config.rotor_speed_min_rad_s
@@ -140,10 +140,10 @@ def test_batch_is_its_singles(mode, device):
     setpoint = None
     if paths is None:
         setpoint = np.array(SETPOINTS[mode]) + 0.1 * np.arange(count)[:, None]
-    batch = make_controller(mode, HUMMINGBIRD, count=count, device=device, paths=paths)
+    batch = Controller(mode, HUMMINGBIRD, count=count, device=device, paths=paths)
     together = command_of(batch, setpoint, **state, stamp_ns=stamp_ns)
     for vehicle in range(count):
-        single = make_controller(mode, HUMMINGBIRD, device=device, paths=paths and paths[vehicle])
+        single = Controller(mode, HUMMINGBIRD, device=device, paths=paths and paths[vehicle])
         alone = command_of(
             single,
             None if setpoint is None else setpoint[vehicle],
@@ -160,7 +160,7 @@ def test_it_commands_a_vehicle_as_it_does_other_arrays(mode, device):
     vehicle.reset(**random_states(3))
     vehicle.advance(50_000_000)
     path = a_path() if mode == "path" else None
-    controller = make_controller(mode, HUMMINGBIRD, count=3, device=device, paths=path)
+    controller = Controller(mode, HUMMINGBIRD, count=3, device=device, paths=path)
     if mode != "path":
         controller.set(SETPOINTS[mode])
     controller.update(vehicle.arrays)
@@ -174,7 +174,7 @@ def test_it_commands_a_vehicle_as_it_does_other_arrays(mode, device):
 def test_not_a_number_reaches_the_vehicle(mode, element, device):
     """On the device nothing checks a setpoint, so nothing may hide it: the vehicle reports the command."""
     vehicle = Multirotor(HUMMINGBIRD, device=device)
-    controller = make_controller(mode, HUMMINGBIRD, device=device)
+    controller = Controller(mode, HUMMINGBIRD, device=device)
     row = np.array([SETPOINTS[mode]])
     row[0, element] = np.nan
     controller.setpoint.assign(row)
@@ -186,32 +186,32 @@ def test_not_a_number_reaches_the_vehicle(mode, element, device):
 
 @pytest.mark.parametrize("bad", [[np.nan, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [[0.0] * 4] * 2])
 def test_bad_setpoint_names_mode_and_layout(bad):
-    controller = make_controller("velocity", HUMMINGBIRD)
+    controller = Controller("velocity", HUMMINGBIRD)
     with pytest.raises(ValueError, match=r"mode 'velocity' takes rows of \(v_W_x_m_s, .*yaw_rate_rad_s\)"):
         controller.set(bad)
 
 
 def test_other_errors_are_clear():
     with pytest.raises(ValueError, match=r"unknown command mode 'fly', known: .*'attitude'"):
-        make_controller("fly", HUMMINGBIRD)
+        Controller("fly", HUMMINGBIRD)
     with pytest.raises(ValueError, match="takes one path, or one for each of 3 vehicles, got 2"):
-        make_controller("path", HUMMINGBIRD, count=3, paths=[a_path(), a_path()])
+        Controller("path", HUMMINGBIRD, count=3, paths=[a_path(), a_path()])
     with pytest.raises(ValueError, match="not paths"):
-        make_controller("position", HUMMINGBIRD, paths=a_path())
+        Controller("position", HUMMINGBIRD, paths=a_path())
     with pytest.raises(ValueError, match="unit quaternions"):
-        make_controller("attitude", HUMMINGBIRD).set([5.0, 0.0, 0.0, 0.0, 0.0])
+        Controller("attitude", HUMMINGBIRD).set([5.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(ValidationError, match="velocity_gain_per_s"):
         Se3Config(velocity_gain_per_s=0.0)
 
 
 def test_arrays_of_another_batch_are_refused(device):
-    controller = make_controller("rates", HUMMINGBIRD, count=2, device=device)
+    controller = Controller("rates", HUMMINGBIRD, count=2, device=device)
     with pytest.raises(ValueError, match="for 2 vehicles of 4 rotors"):
         controller.update(Multirotor(HUMMINGBIRD, count=3, device=device).arrays)
 
 
 def test_layouts_have_units():
-    assert {mode: len(make_controller(mode, HUMMINGBIRD).layout) for mode in SETPOINTS} == {
+    assert {mode: len(Controller(mode, HUMMINGBIRD).layout) for mode in SETPOINTS} == {
         mode: len(row) for mode, row in SETPOINTS.items()
     }
 

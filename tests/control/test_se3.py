@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.clock import Rate
-from neurosim_core.control import Se3Config, make_controller
+from neurosim_core.control import Controller, Se3Config
 from neurosim_core.trajectory.path import Path
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import Multirotor, preset
@@ -46,7 +46,7 @@ def fly(vehicle, controller, *, rate_hz, duration_ns):
 def path_error(config, path, *, rate_hz, gains=None, device="cpu", duration_ns=None):
     """Fly a path from its start; return the distance to it behind each period [m]."""
     vehicle = Multirotor(config, device=device)
-    controller = make_controller("path", config, gains, paths=path, device=device)
+    controller = Controller("path", config, gains, paths=path, device=device)
     start = path.evaluate(path.start_ns)
     vehicle.reset(position=start.position, velocity=start.velocity)
     stamps, states = fly(vehicle, controller, rate_hz=rate_hz, duration_ns=duration_ns or path.end_ns)
@@ -71,7 +71,7 @@ def test_attitude_step_response(device, axis):
     k, d = (90.0, 10.0) if axis == 2 else (300.0, 20.0)
     config = preset("racer", **IDEAL)
     vehicle = Multirotor(config, device=device)
-    controller = make_controller("attitude", config, gains, device=device)
+    controller = Controller("attitude", config, gains, device=device)
     angle = 1e-3
     turn = np.eye(3)[axis] * angle
     controller.set([config.mass_kg * 9.81, 0.0, 0.0, 0.0, 1.0])
@@ -89,7 +89,7 @@ def test_rate_response(device):
     """A rate error obeys e' + rate_gain e = 0, about all axes at once, spinning body or not."""
     config = preset("hummingbird", **IDEAL)
     vehicle = Multirotor(config, device=device)
-    controller = make_controller("rates", config, device=device)
+    controller = Controller("rates", config, device=device)
     target = np.array([1.0, -2.0, 0.5])
     controller.set([config.mass_kg * 9.81, *target])
     start = np.array([2.0, 1.0, 1.5])
@@ -113,7 +113,7 @@ def test_equivariance(device):
     def flight(way, position, orientation):
         vehicle = Multirotor(config, device=device)
         vehicle.reset(position=position, orientation=orientation)
-        controller = make_controller("path", config, paths=way, device=device)
+        controller = Controller("path", config, paths=way, device=device)
         return fly(vehicle, controller, rate_hz=200.0, duration_ns=2_000_000_000)[1]
 
     start = np.array([0.3, 0.2, -0.1])
@@ -133,7 +133,7 @@ def test_recovery_from_upside_down(name, axis, rate_hz):
     vehicle = Multirotor(config)
     turn = np.radians(170.0) * np.array(axis) / np.linalg.norm(axis)
     vehicle.reset(orientation=Rotation.from_rotvec(turn).as_quat(), body_rate=[1.0, -1.0, 1.0])
-    controller = make_controller("position", config)
+    controller = Controller("position", config)
     controller.set([0.0, 0.0, 0.0, 0.5])
     _, states = fly(vehicle, controller, rate_hz=rate_hz, duration_ns=8_000_000_000)
     upright = Rotation.from_quat(states[2][:, 0]).as_matrix()[:, 2, 2]
@@ -152,7 +152,7 @@ def test_far_setpoint(name):
     """A setpoint 30 m away is reached without overshoot, at the speed allowed, never past 60 degrees."""
     config = preset(name)
     vehicle = Multirotor(config)
-    controller = make_controller("position", config)
+    controller = Controller("position", config)
     controller.set([30.0, 0.0, 2.0, 0.0])
     vehicle.reset()
     _, states = fly(vehicle, controller, rate_hz=100.0, duration_ns=15_000_000_000)
@@ -167,7 +167,7 @@ def test_height_is_kept_before_distance():
     config = preset("crazyflie", mass_kg=0.05)  # thrust over weight 1.17
     vehicle = Multirotor(config)
     vehicle.reset()
-    controller = make_controller("position", config)
+    controller = Controller("position", config)
     controller.set([20.0, 0.0, 0.0, 0.0])
     _, states = fly(vehicle, controller, rate_hz=100.0, duration_ns=4_000_000_000)
     assert states[0][:, 0, 2].min() > -0.15  # 0.118 m while it tilts: a fifth of a second of falling free
@@ -179,7 +179,7 @@ def test_yaw_rate_of_velocity_mode(device):
     config = preset("racer")
     vehicle = Multirotor(config, device=device)
     vehicle.reset()
-    controller = make_controller("velocity", config, device=device)
+    controller = Controller("velocity", config, device=device)
     controller.set([1.0, -0.5, 0.2, 0.8])
     _, states = fly(vehicle, controller, rate_hz=200.0, duration_ns=3_000_000_000)
     yaw = np.unwrap(Rotation.from_quat(states[2][:, 0]).as_euler("ZXY")[:, 0])
@@ -214,7 +214,7 @@ def test_flip_is_followed(device):
     vehicle = Multirotor(config, device=device)
     start = path.evaluate(0)
     vehicle.reset(position=start.position, velocity=start.velocity, body_rate=[0.0, -rate, 0.0])
-    controller = make_controller("path", config, paths=path, device=device)
+    controller = Controller("path", config, paths=path, device=device)
     stamps, states = fly(vehicle, controller, rate_hz=500.0, duration_ns=int(t[-1] * 1e9))
     error = np.linalg.norm(states[0][:, 0] - path.evaluate(stamps).position, axis=1)
     upright = Rotation.from_quat(states[2][:, 0]).as_matrix()[:, 2, 2]

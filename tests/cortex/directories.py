@@ -61,11 +61,7 @@ class Node:
         self.changes: list[frozenset[int]] = []
         self.ever_lost: set[int] = set()
         self.directory = Directory(
-            context,
-            domain=0,
-            record=lambda: self.record,
-            on_change=self._on_change,
-            **options,
+            context, domain=0, record=lambda: self.record, on_change=self._on_change, **options
         )
         registered = options.get("registry") != "off"
         # The sign of life of a node whose process lives: it is given time when this process stands still.
@@ -101,9 +97,7 @@ def drive(nodes, condition, timeout_s=SOON_S):
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, [(n.record.name, n.names, n.directory.connected) for n in nodes]
-        next_ns = min((node.directory.deadline_ns for node in nodes), default=0)
-        wait_ms = (next_ns - time.monotonic_ns()) // 1_000_000
-        for socket, _ in poller.poll(min(max(wait_ms, 0), 20)):
+        for socket, _ in poller.poll(2):
             owner[socket].directory.handle()
         for node in nodes:
             node.directory.tick()

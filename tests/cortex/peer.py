@@ -5,6 +5,7 @@ The message types here are those of the tests, too.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import resource
@@ -86,11 +87,30 @@ def number_of(received: Any) -> int:
 def connect(
     node: Node, topic: str, kind: Any, policy: Policy | None = None, callback: Any = None, **options: Any
 ) -> tuple[Any, Any]:
-    """A publisher of a node, and a subscriber of the same node that is attached to it."""
+    """A publisher of a node, and a subscriber of the same node, or of `reader`, that is attached to it."""
+    reader = options.pop("reader", node)
     publisher = node.publisher(topic, kind, **options)
-    subscriber = node.subscriber(topic, kind, callback, policy=policy)
+    subscriber = reader.subscriber(topic, kind, callback, policy=policy)
     assert publisher.wait_for_subscribers(timeout_s=60.0)
     return publisher, subscriber
+
+
+def take(subscriber: Any, timeout_s: float = 0.0) -> Any:
+    """The next message; None if none comes in time."""
+    try:
+        return subscriber.recv(timeout_s)
+    except TimeoutError:
+        return None
+
+
+def take_all(subscriber: Any) -> list[Any]:
+    """The messages that are there now."""
+    return list(iter(lambda: take(subscriber), None))
+
+
+def accounted(counters: Any) -> int:
+    """How many messages a subscriber knows of."""
+    return counters.received + counters.lost + counters.overtaken
 
 
 def policy_of(words: list[Any]) -> Policy:
@@ -171,9 +191,7 @@ class Peer:
         first = None
         deadline_s = time.monotonic() + timeout_s
         while last < until:
-            try:
-                got = subscriber.recv(deadline_s - time.monotonic())
-            except TimeoutError:
+            if (got := take(subscriber, deadline_s - time.monotonic())) is None:
                 break
             number = number_of(got)
             first = number if first is None else first
@@ -228,10 +246,15 @@ def node_at(name: str, host: str = "", **options: Any) -> Node:
     return Node(name, **options)
 
 
+def limit_files(most_bytes: int | None) -> None:
+    """Let no file grow larger."""
+    if most_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+
 def as_peer(name: str = "peer", limit_file_bytes: int | None = None, **options: Any) -> None:
     """Does what it is told until its input ends."""
-    if limit_file_bytes is not None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit_file_bytes, limit_file_bytes))
+    limit_files(limit_file_bytes)
     if "keys" in options:
         from pathlib import Path
 
@@ -286,28 +309,40 @@ def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0, **place:
                 if not sys.stdin.readline():
                     return
                 torn += sum(not is_whole(block) for block in kept)
-                found = sub.counters
-                say(
-                    count=count,
-                    torn=torn,
-                    lost=found.lost,
-                    overtaken=found.overtaken,
-                    rejected=found.rejected,
-                )
-            try:
-                block = sub.recv(0.02)
-            except TimeoutError:
-                continue
-            count += 1
-            torn += not is_whole(block)
-            kept.append(block)
-            del kept[: len(kept) - keep]
+                lost, overtaken = sub.counters.lost, sub.counters.overtaken
+                say(count=count, torn=torn, lost=lost, overtaken=overtaken, rejected=sub.counters.rejected)
+            if (block := take(sub, 0.02)) is not None:
+                count += 1
+                torn += not is_whole(block)
+                kept.append(block)
+                del kept[: len(kept) - keep]
+
+
+def as_recorder(path: str, limit_file_bytes: int | None = None) -> None:
+    """Publishes numbers and records them, until that fails; says now and then how many there were."""
+    from cortex.log import Recorder
+
+    limit_files(limit_file_bytes)
+    with Node("recorder", registry="off") as node, node.publisher("/number", Number) as publisher:
+        recorder = Recorder(node, path)
+        publisher.wait_for_subscribers(timeout_s=60.0)
+        for number in itertools.takewhile(lambda _: recorder.running, itertools.count()):
+            publisher.publish(Number(time.monotonic_ns(), number))
+            if number % 10 == 9:
+                say(count=number + 1)
+                time.sleep(1e-3)
+        try:
+            recorder.close()
+        except OSError as error:
+            stats = recorder.stats
+            say(written=stats.written, unwritten=stats.unwritten, errno=error.errno, error=str(error))
 
 
 ROLES: dict[str, Callable[..., None]] = {
     "peer": as_peer,
     "endless_publisher": as_endless_publisher,
     "endless_subscriber": as_endless_subscriber,
+    "recorder": as_recorder,
 }
 
 

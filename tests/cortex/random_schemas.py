@@ -27,11 +27,7 @@ labels = st.text(st.characters(exclude_categories=("C",), exclude_characters='"\
 dimensions = st.one_of(st.sampled_from(["n", "m"]), st.integers(1, 3))
 scalars = st.sampled_from([*SCALAR_SIZES, "str", "bytes"])
 arrays = st.one_of(
-    st.builds(
-        ArrayType,
-        st.sampled_from([*DTYPE_NAMES, "any"]),
-        st.lists(dimensions, max_size=3).map(tuple),
-    ),
+    st.builds(ArrayType, st.sampled_from([*DTYPE_NAMES, "any"]), st.lists(dimensions, max_size=3).map(tuple)),
     st.just(ArrayType("uint8", (33, 32))),  # large enough to be aligned to 64
 )
 enums = st.builds(

@@ -3,29 +3,121 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import logging
 import os
 import random
 import resource
 import select
-import threading
+import socket
+import struct
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import zmq
-from peer import Block, Number, is_whole, make_block
-from processes import SOON_S, wait_for
-from rings import RING_BYTES, WIDE_BYTES, fill, frame, number_of, read_all, ring, takes
+from peer import Block, Number, accounted, connect, is_whole, make_block, take_all
+from processes import SOON_S, Beside, wait_for
 
 import cortex.broadcast
 import cortex.link
 import cortex.subscriber
 from cortex import keep_last, reliable
+from cortex.broadcast import Listener
 from cortex.compiled import native
+from cortex.wire import MESSAGE, AttachKey, Header, attach_key, message_head, pack_header
 
 pytestmark = pytest.mark.skipif(native is None, reason="no C module")
 
-__all__ = ["ring"]
+
+SOURCE = 7
+RING_BYTES, WIDE_BYTES = 1 << 19, 1 << 21
+
+
+def frame(number: int, size: int) -> bytes:
+    """A frame that says which it is, and whose every byte depends on that."""
+    return pack_header(Header(MESSAGE, 1, SOURCE, number, None, 3, size, 0)) + bytes([number % 251]) * size
+
+
+def number_of(found: bytes) -> int:
+    """The number of a frame, which must be whole."""
+    number = int.from_bytes(found[24:32], "little")
+    assert found == frame(number, len(found) - 64)
+    return number
+
+
+class Ring:
+    """A publisher's ring, and its readers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path / "1.ring")
+        self.listener = native.listen(self.path)
+        self.writer = native.Broadcast(SOURCE, zmq.Again)
+        self.readers: list = []
+        self._idle = socket.socketpair()
+
+    def join(self, *, strict: bool, timeout_ms: int = 700):
+        """A reader, and its number."""
+        reader = native.RingReader(
+            self.path, SOURCE, len(self.readers) + 1, self._idle[0].fileno(), nothing, zmq.Again, 20
+        )
+        connection = native.accept(self.listener)
+        source, number, page, bell = native.hear(connection)
+        assert (source, number) == (SOURCE, len(self.readers) + 1)
+        assert reader.welcomed() is None
+        member = self.writer.add(connection, page, bell, strict, timeout_ms, 5)
+        assert reader.welcomed() == 5
+        self.readers.append(reader)
+        return reader, member
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self.writer.close()
+        for reader in self.readers:
+            reader.close()
+        os.close(self.listener)
+        for end in self._idle:
+            end.close()
+
+
+def nothing(flags: int) -> bytes:
+    """A socket to which nothing comes."""
+    raise zmq.Again
+
+
+@pytest.fixture
+def ring(tmp_path):
+    made = Ring(tmp_path)
+    yield made
+    made.close()
+
+
+def takes(writer, each: bytes) -> bool:
+    """Whether there is room for a frame, which then is sent."""
+    try:
+        assert writer.send(each) is True
+    except zmq.Again:
+        return False
+    return True
+
+
+def read_all(reader) -> list[int]:
+    """The numbers of all frames that are there."""
+    numbers = []
+    try:
+        while True:
+            numbers.append(number_of(reader.receive(zmq.DONTWAIT)))
+    except zmq.Again:
+        return numbers
+
+
+def fill(ring: Ring, size: int) -> int:
+    """Send frames until a reliable reader has no room; how many there was room for."""
+    count = 0
+    while takes(ring.writer, frame(count, size)):
+        count += 1
+    return count
 
 
 @pytest.mark.parametrize("largest", [200, 20_000, 3 * RING_BYTES], ids=str)
@@ -50,25 +142,19 @@ def test_every_reliable_reader_gets_every_frame_in_order(ring, largest):
 
 def test_threads_read_while_the_publisher_writes(ring):
     """Each sleeps until the bell rings; it waits for the slowest, and nobody loses anything."""
-    readers = [ring.join(strict=True)[0] for _ in range(3)]
     count = 20_000
-    got: list[list[int]] = [[] for _ in readers]
 
-    def read(reader, numbers: list[int]) -> None:
+    def read(reader) -> list[int]:
+        numbers: list[int] = []
         while len(numbers) < count:
-            try:
+            with contextlib.suppress(zmq.Again):
                 numbers.append(number_of(reader.receive(0)))
-            except zmq.Again:
-                continue
+        return numbers
 
-    threads = [threading.Thread(target=read, args=pair) for pair in zip(readers, got, strict=True)]
-    for thread in threads:
-        thread.start()
+    threads = [Beside(read, ring.join(strict=True)[0]) for _ in range(3)]
     for number in range(count):
         wait_for(lambda number=number: takes(ring.writer, frame(number, 40)), every_s=1e-5)
-    for thread in threads:
-        thread.join(SOON_S)
-    assert got == [list(range(count))] * 3
+    assert [thread.join() for thread in threads] == [[list(range(count))]] * 3
 
 
 def test_a_reliable_reader_holds_up_the_publisher(ring):
@@ -80,11 +166,6 @@ def test_a_reliable_reader_holds_up_the_publisher(ring):
     assert ring.writer.patience(1064) == -1
     assert takes(ring.writer, frame(count, 1000))
     assert read_all(reader) == list(range(1, count + 1))
-
-
-def test_slots_for_nothing(ring):
-    """Bodies of 0 bytes have slots, too."""
-    ring.writer.provide(0, True, False)
 
 
 def test_a_ring_that_finds_no_memory_tries_once(ring):
@@ -161,19 +242,10 @@ def test_a_lossy_reader_keeps_the_newest_and_disturbs_nobody(ring):
 def test_a_lossy_reader_in_a_race_sees_no_torn_frame(ring):
     """Each frame is checked byte by byte; numbers only grow."""
     reader, _ = ring.join(strict=False)
-    ended = threading.Event()
-
-    def write() -> None:
-        for number in range(20_000):
-            takes(ring.writer, frame(number, 3000))
-        ended.set()
-
-    thread = threading.Thread(target=write)
-    thread.start()
     got: list[int] = []
-    while not ended.is_set():
-        got += read_all(reader)
-    thread.join()
+    with Beside(lambda: [takes(ring.writer, frame(number, 3000)) for number in range(20_000)]) as writing:
+        while writing.thread.is_alive():
+            got += read_all(reader)
     got += read_all(reader)
     assert got == sorted(set(got))
     assert got[-1] == 19_999
@@ -225,19 +297,12 @@ def test_a_ring_that_brings_nonsense_is_left_for_the_socket(make_node, start_chi
     publisher = make_node().publisher("/blocks", Block)
     child = start_child("endless_subscriber", topic="/blocks", policy=["reliable", {"timeout_s": SOON_S}])
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    sent = 0
-
-    def publish() -> None:
-        nonlocal sent
+    for sent in (1, 2):
         assert publisher.publish(make_block(sent, 100))
-        sent += 1
-
-    publish()
-    wait_for(lambda: child.ask()["count"] == 1)
-    publisher._fanout.ring._ring.send(b"nonsense" * 20)
-    wait_for(lambda: child.ask()["rejected"] == 1)
-    publish()
-    wait_for(lambda: child.ask()["count"] == sent)
+        wait_for(lambda sent=sent: child.ask()["count"] == sent)
+        if sent == 1:
+            publisher._fanout.ring._ring.send(b"nonsense" * 20)
+            wait_for(lambda: child.ask()["rejected"] == 1)
     assert child.ask()["lost"] == 0
 
 
@@ -269,17 +334,13 @@ def test_what_came_before_the_answer_was_read_counts(make_node, start_child, mon
     child.ask(do="publish", topic="/blocks", count=100, size=RING_BYTES // 20)
     child.finish()
     wait_for(lambda: not subscriber.sources())
-    count = 0
 
-    def accounted() -> int:
-        nonlocal count
-        with contextlib.suppress(TimeoutError):
-            assert is_whole(subscriber.recv(0.0))
-            count += 1
-        return count + subscriber.counters.lost + subscriber.counters.overtaken
+    def all_known() -> bool:
+        assert all(map(is_whole, take_all(subscriber)))
+        return accounted(subscriber.counters) >= 100
 
-    wait_for(lambda: accounted() >= 100)
-    assert accounted() == 100
+    wait_for(all_known)
+    assert accounted(subscriber.counters) == 100
     assert subscriber.counters.lost > 0
 
 
@@ -332,8 +393,7 @@ def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_chil
     values = []
 
     def has_read(count: int) -> bool:
-        with contextlib.suppress(TimeoutError):
-            values.append(subscriber.recv(0.05).value)
+        values.extend(message.value for message in take_all(subscriber))
         return subscriber.publisher_count == 1 and len(values) >= count
 
     wait_for(lambda: has_read(int(latch)))
@@ -343,3 +403,163 @@ def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_chil
     assert asked
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (5 - latch, 0)
     child.finish()
+
+
+@contextlib.contextmanager
+def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3", bell: int | None = None):
+    """The connection of a reader, number 1, that has said hello."""
+    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0) if bell is None else bell
+    os.ftruncate(page, 4096)
+    fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(path)
+        socket.send_fds(other, [magic + struct.pack("<QQ", source, 1)], [page, bell])
+        os.close(page)
+        os.close(bell)
+        yield other
+
+
+@pytest.mark.parametrize(
+    "make", [os.pipe, lambda: [end.detach() for end in socket.socketpair()]], ids=["pipe", "socket"]
+)
+def test_a_bell_whose_ringing_would_end_the_process_is_refused(ring, make):
+    """Nobody is at its other end: to write there sends SIGPIPE."""
+    other, bell = make()
+    os.close(other)
+    with asks_by_hand(ring.path, SOURCE, bell=bell):
+        connection = native.accept(ring.listener)
+        with pytest.raises(OSError, match=r"[Pp]rotocol"):
+            native.hear(connection)
+        os.close(connection)
+
+
+def test_a_reader_that_spoke_and_died_is_forgotten(ring):
+    """What it has said waits in its connection, which has ended all the same."""
+    with asks_by_hand(ring.path, SOURCE) as other:
+        connection = native.accept(ring.listener)
+        ring.writer.add(connection, *native.hear(connection)[2:], True, 700, 5)
+        other.send(b"still here")
+        fill(ring, 1000)
+        for _ in range(2):  # of the first ring, and of the larger one
+            assert other.recv(64)[:8] == b"CTXCAST3"
+        assert ring.writer.patience(1064) == 700
+    assert takes(ring.writer, frame(0, 1000))
+
+
+def test_a_reader_of_another_version_gets_messages_and_it_is_said(make_node, caplog):
+    """It asks for a ring of an older kind. That is said once, not by each publisher of the node."""
+    node = make_node()
+    publisher = node.publisher("/numbers", Number)
+    address = publisher._pub_sockets._pub_sockets[0].socket.last_endpoint.decode()
+    key = attach_key(AttachKey(publisher.source, 1, True, False, 10, 0), stamped=True)
+    path = address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
+    context = zmq.Context()
+    with asks_by_hand(path, publisher.source, b"CTXCAST2"), context.socket(zmq.SUB) as other:
+        other.connect(address)
+        for each in (message_head(MESSAGE, publisher.source, publisher.codec.fingerprint, stamped=True), key):
+            other.subscribe(each)
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        wait_for(lambda: "a subscriber with another version of cortex" in caplog.text)
+        publisher.publish(Number(1, 2))
+        assert other.recv()[:32] == key
+        assert other.recv()[3:4] == MESSAGE
+    context.term()
+    second = node.publisher("/others", Number)
+    with make_node().subscriber("/others", Number):
+        assert second.wait_for_subscribers(timeout_s=SOON_S)
+    second._pub_sockets.emit_notes()
+    assert caplog.text.count("a subscriber with another version of cortex") == 1
+
+
+def test_a_publisher_of_another_version_is_heard_and_it_is_said(make_node, monkeypatch, caplog):
+    """It closes the connection of who asks for a ring that it does not know. That is said once for a node."""
+    take, asked = Listener.take, []
+
+    def close(self, source, reader):
+        asked.append(reader)
+        take(self, source, reader).close()
+
+    monkeypatch.setattr(Listener, "take", close)
+    node = make_node()
+    publisher, subscriber = connect(node, "/numbers", Number, reliable())
+    publisher.publish(Number(1, 2))
+    assert subscriber.recv(SOON_S) == Number(1, 2)
+    assert subscriber.wait_for_publisher(SOON_S)
+    assert subscriber.carriers == ["ipc"]
+    node.publisher("/others", Number)
+    others = node.subscriber("/others", Number, policy=reliable())
+    assert others.wait_for_publisher(SOON_S)
+    said = [record for record in caplog.records if "another version of cortex" in record.message]
+    assert [record.levelname for record in said if record.levelno >= logging.WARNING] == ["WARNING"]
+    assert len(asked) == 2
+
+
+def test_a_reader_cannot_write_to_the_ring(ring):
+    """Its memory is sealed: a second mapping for writing is refused."""
+    ring.join(strict=True)
+    fds = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]
+    rings = [fd for fd in fds if os.path.exists(fd) and os.stat(fd).st_size == RING_BYTES + (1 << 16)]
+    assert rings
+    with pytest.raises(PermissionError), open(rings[0], "r+b", buffering=0) as file:
+        file.write(b"x")
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"x" * 24, (b"CTXCAST3" * 3)], ids=["nothing", "nonsense", "no descriptors"]
+)
+def test_who_says_something_else_is_refused(ring, said):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(ring.path)
+        connection = native.accept(ring.listener)
+        if said:
+            other.send(said)
+            with pytest.raises(OSError, match=r"[Pp]rotocol"):
+                native.hear(connection)
+        else:
+            with pytest.raises(BlockingIOError):
+                native.hear(connection)
+        os.close(connection)
+
+
+def test_who_connects_and_says_nothing_is_forgotten(tmp_path, monkeypatch):
+    """More of them than are waited for: the older ones are let go of."""
+    monkeypatch.setattr(cortex.broadcast, "WAITING_MAX", 16)
+    listener = Listener(tmp_path / "1.ring")
+    before = len(os.listdir("/proc/self/fd"))
+    with contextlib.ExitStack() as others:
+        for _ in range(3):
+            for _ in range(10):
+                other = others.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+                other.connect(str(tmp_path / "1.ring"))
+            listener.take(SOURCE, 1)
+        listener.take(SOURCE, 1)
+        assert len(os.listdir("/proc/self/fd")) == before + 30 + 16
+    listener.take(SOURCE, 1)
+    assert len(os.listdir("/proc/self/fd")) == before
+    listener.close()
+
+
+def test_a_reader_that_leaves_before_it_attaches_is_forgotten(tmp_path):
+    """What it has handed over is closed; a reader that is still about to attach stays."""
+    listener = Listener(tmp_path / "1.ring")
+    idle, other = socket.socketpair()
+    leaving, staying = (
+        native.RingReader(str(tmp_path / "1.ring"), SOURCE, n, idle.fileno(), nothing, zmq.Again, 20)
+        for n in (1, 2)
+    )
+    assert listener.take(SOURCE, 3) is None  # both have been heard
+    before = len(os.listdir("/proc/self/fd"))
+    listener.forget()
+    assert len(os.listdir("/proc/self/fd")) == before
+    leaving.close()
+    after_close = len(os.listdir("/proc/self/fd"))
+    listener.forget()
+    assert len(os.listdir("/proc/self/fd")) == after_close - 3  # socket, page and bell
+    assert listener.take(SOURCE, 1) is None
+    hello = listener.take(SOURCE, 2)
+    assert hello is not None
+    hello.close()
+    staying.close()
+    listener.close()
+    idle.close()
+    other.close()

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import threading
 import time
 
 import pytest
 from peer import Block, connect, make_block
-from processes import SOON_S, wait_for
+from processes import SOON_S, Beside, wait_for
 
 import cortex.link
 import cortex.publisher
@@ -27,13 +26,12 @@ def subscribe(publisher, start_child, policy: list, count: int = 1) -> list:
     return children
 
 
-def begin_close(publisher, **options) -> threading.Thread:
+def begin_close(publisher, **options) -> Beside:
     """Close in a thread, which has time for it; returns once nothing can be published any more."""
-    thread = threading.Thread(target=publisher.close, kwargs=options)
-    thread.start()
+    closing = Beside(publisher.close, **options)
     wait_for(lambda: publisher._closed)
-    thread.join(0.2)  # one that does not wait for the reader is done by then
-    return thread
+    closing.thread.join(0.2)  # one that does not wait for the reader is done by then
+    return closing
 
 
 def arrives(child, sent: int, lost: int = 0) -> bool:
@@ -80,8 +78,7 @@ def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, 
     """Not who publishes already, nor later; what the reader loses is counted. Through the ring and slots."""
     node = make_node()
     publisher = node.publisher("/blocks", Block)
-    policy = ["reliable", {"depth": 1, "timeout_s": 10.0 * SOON_S}]
-    (child,) = subscribe(publisher, start_child, policy)
+    (child,) = subscribe(publisher, start_child, ["reliable", {"depth": 1, "timeout_s": 10.0 * SOON_S}])
     sent = Sent(publisher, size)
 
     def publish() -> None:
@@ -89,19 +86,13 @@ def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, 
             sent()
 
     with child.stopped():
-        thread = threading.Thread(target=publish)
-        thread.start()
-        wait_for(lambda: publisher._back_pressure.is_waiting)
-        node.stop_waiting()
-        thread.join(SOON_S)
-        assert not thread.is_alive()
+        with Beside(publish):
+            wait_for(lambda: publisher._back_pressure.is_waiting)
+            node.stop_waiting()
         sent()
         assert (sent.refused, publisher.counters.timeouts) == (2, 2)
-        lost = sent.refused
-    thread = begin_close(publisher)
-    wait_for(lambda: arrives(child, sent.count, lost))
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    with begin_close(publisher):
+        wait_for(lambda: arrives(child, sent.count, lost=2))
 
 
 def test_nobody_holds_up_a_node_for_long(make_node, start_child):
@@ -118,13 +109,9 @@ def test_nobody_holds_up_a_node_for_long(make_node, start_child):
                 sent()
 
     with child.stopped():
-        threads = [threading.Thread(target=publish), threading.Thread(target=node.close)]
-        threads[0].start()
-        wait_for(lambda: publisher._back_pressure.is_waiting)
-        threads[1].start()
-        for thread in reversed(threads):
-            thread.join(SOON_S)
-            assert not thread.is_alive()
+        with Beside(publish):
+            wait_for(lambda: publisher._back_pressure.is_waiting)
+            Beside(node.close).join()
         assert len(os.listdir("/proc/self/fd")) < before
 
 
@@ -136,10 +123,9 @@ def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
     with child.stopped():
         while sent.refused < 5:
             sent()
-        thread = begin_close(publisher, linger_s=SOON_S)
+        closing = begin_close(publisher, linger_s=SOON_S)
     wait_for(lambda: arrives(child, sent.count, lost=sent.refused))
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    closing.join()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import sys
-import threading
 import tracemalloc
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from enum import Enum, IntEnum
 from typing import Any
 
@@ -71,32 +72,16 @@ class Everything:
 
 
 def everything(**changes: Any) -> Everything:
-    fields: dict[str, Any] = {
-        "stamp_ns": 1,
-        "small": -2,
-        "unsigned": 2**64 - 1,
-        "flag": True,
-        "mode": Mode.FIRST,
-        "level": Level.HIGH,
-        "text": "hé",
-        "data": b"ab",
-        "fixed": np.arange(3, dtype=np.float32),
-        "large": np.arange(1600, dtype=np.uint8).reshape(40, 40),
-        "a": np.arange(5, dtype=np.float32),
-        "b": np.zeros((5, 3)),
-        "open_": np.eye(3, dtype=np.complex128)[:2],
-        "mask": np.eye(3, dtype=bool)[:2],
-        "point": Point(1.5),
-        "maybe": 0.5,
-        "points": [Point(1.0, True), Point(2.0)],
-        "modes": [Mode.OFF, Mode.LAST],
-        "flags": [True, False, True],
-        "sizes": [-128, 127],
-        "names": ["", "hé", "z" * 100],
-        "ragged": [np.ones((2, 2), np.float16), np.zeros((0, 0)), np.ones((16, 16), np.int64)],
-        "deep": [[], [1, 2], [3]],
-    }
-    return Everything(**(fields | changes))
+    plain = Everything(
+        stamp_ns=1, small=-2, unsigned=2**64 - 1, flag=True, mode=Mode.FIRST, level=Level.HIGH, text="hé",
+        fixed=np.arange(3, dtype=np.float32), large=np.arange(1600, dtype=np.uint8).reshape(40, 40),
+        a=np.arange(5, dtype=np.float32), b=np.zeros((5, 3)), open_=np.eye(3, dtype=np.complex128)[:2],
+        mask=np.eye(3, dtype=bool)[:2], point=Point(1.5), maybe=0.5, points=[Point(1.0, True), Point(2.0)],
+        modes=[Mode.OFF, Mode.LAST], flags=[True, False, True], sizes=[-128, 127], deep=[[], [1, 2], [3]],
+        ragged=[np.ones((2, 2), np.float16), np.zeros((0, 0)), np.ones((16, 16), np.int64)],
+        names=["", "hé", "z" * 100], data=b"ab",
+    )  # fmt: skip
+    return dataclasses.replace(plain, **changes)
 
 
 def body_of(value: Any) -> bytes:
@@ -114,7 +99,8 @@ def check_both_ways(value: Any) -> None:
     assert codec.prepare(value, len(body)) == body
     assert codec.fixed_size in (None, len(body))
     if body:
-        assert codec.encode(value, len(body) - 1) is None
+        with pytest.raises(ValueError, match="exceeds the limit"):
+            codec.encode(value, len(body) - 1)
         assert isinstance(codec.prepare(value, len(body) - 1), Plan)
     memory = np.full(len(body) + 8, 0xAA, np.uint8)
     assert codec.prepare(value, -1).write(memory) == len(body)
@@ -145,12 +131,6 @@ def test_messages_of_any_type(value):
 def test_a_type_with_everything():
     check_both_ways(everything())
     check_both_ways(everything(open_=np.eye(4, 3)[::2], mask=None, point=None, large=None))
-
-
-def test_a_codec_is_made_once():
-    assert codec_of(Point) is codec_of(Point)
-    with pytest.raises(TypeError, match="@cortex"):
-        codec_of(int)
 
 
 def test_stamp_of_finds_integer_stamps_only():
@@ -248,36 +228,26 @@ def test_a_message_of_another_type_is_refused():
     for cls, value in ((Point, Other(1.0)), (Imu, Point(1.0)), (MotorCommand, Point(1.0))):
         with pytest.raises(TypeError, match=f"got {type(value).__name__}, expected {cls.__name__}"):
             codec_of(cls).encode(value, 1000)
+    assert codec_of(Point) is codec_of(Point)
+    with pytest.raises(TypeError, match="@cortex"):
+        codec_of(int)
+    with pytest.raises(TypeError, match="not a message type"):
+        codec_of(type("Derived", (Point,), {}))
 
 
 def test_arrays_of_any_memory_layout_are_accepted():
     grid = np.arange(4096, dtype=np.float64).reshape(64, 64)
-    for array in (
-        grid[::2, 1:],
-        grid.T,
-        np.asfortranarray(grid),
-        grid[::-1],
-        np.broadcast_to(grid[0], (3, 64)),
-    ):
-        image = Image(0, array[:, :, None], "64FC1")
-        decoded = codec_of(Image).decode(body_of(image))
-        assert decoded == image
-        memory = np.zeros(2**16, np.uint8)
-        size = codec_of(Image).prepare(image, 0).write(memory)
-        assert memory[:size].tobytes() == body_of(image)
-    strided = MotorCommand(0, grid[0, ::2])
-    assert codec_of(MotorCommand).decode(body_of(strided)) == strided
+    check_both_ways(MotorCommand(0, grid[0, ::2]))
+    row = np.broadcast_to(grid[0], (3, 64))
+    for array in (grid[::2, 1:], grid.T, np.asfortranarray(grid), grid[::-1], row):
+        check_both_ways(Image(0, array[:, :, None], "64FC1"))
 
 
 def test_decoded_arrays_are_read_only_views():
-    value = everything()
-    body = body_of(value)
-    for decoded in (
-        codec_of(Everything).decode(body),
-        codec_of(Everything).decode(np.frombuffer(body, np.uint8)),
-    ):
+    body = body_of(everything())
+    for data in (body, np.frombuffer(body, np.uint8)):
+        decoded = codec_of(Everything).decode(data)
         for array in (decoded.fixed, decoded.large, decoded.a, decoded.open_, decoded.ragged[0]):
-            assert not array.flags.writeable
             assert not array.flags.owndata
             with pytest.raises(ValueError, match="read-only"):
                 array[...] = 0
@@ -320,20 +290,16 @@ def test_bodies_beyond_4_gib_are_refused():
             attempt(MotorCommand(0, huge))
 
 
-@pytest.mark.parametrize("extra", [-1, 1, 8])
-@pytest.mark.parametrize("value", [Imu(0, np.zeros(3), np.zeros(3)), Clock(1, 2)], ids=["arrays", "numbers"])
-def test_bodies_of_fixed_size_have_that_size(value, extra):
-    codec, body = codec_of(type(value)), body_of(value)
-    wrong = body[:extra] if extra < 0 else body + bytes(extra)
-    for arguments in ((wrong,), (wrong, 0, len(wrong)), (wrong + bytes(64), 0, len(wrong))):
-        with pytest.raises(MalformedMessage, match=f"allowed are {len(body)} to {len(body)}"):
-            codec.decode(*arguments)
-
-
-def test_a_size_beyond_the_buffer_is_malformed():
+def test_bodies_have_their_size():
+    for value in (Imu(0, np.zeros(3), np.zeros(3)), Clock(1, 2)):
+        codec, body = codec_of(type(value)), body_of(value)
+        for wrong in (body[:-1], body + bytes(1), body + bytes(8)):
+            for arguments in ((wrong,), (wrong, 0, len(wrong)), (wrong + bytes(64), 0, len(wrong))):
+                with pytest.raises(MalformedMessage, match=f"allowed are {len(body)} to {len(body)}"):
+                    codec.decode(*arguments)
     for value in (everything(), Imu(0, np.zeros(3), np.zeros(3)), Point(1.0), MotorCommand(0, np.zeros(3))):
         body = body_of(value)
-        for size in (len(body) + 1, 2**40, -1):
+        for size in (len(body) + 1, 2**40, -1):  # beyond the buffer
             with pytest.raises(MalformedMessage):
                 codec_of(type(value)).decode(body, 0, size)
 
@@ -362,25 +328,20 @@ def test_threads_may_share_a_codec():
     codec = codec_of(Everything)
     values = [everything(stamp_ns=k, text="x" * k, a=np.full(5, k, np.float32)) for k in range(20)]
     bodies = [body_of(value) for value in values]
-    failures: list[object] = []
 
-    def work() -> None:
-        for value, body in zip(values * 5, bodies * 5, strict=True):
-            if codec.encode(value, 2**20) != body or codec.decode(body) != value:
-                failures.append(value)
+    def is_right(k: int) -> bool:
+        return (
+            codec.encode(values[k % 20], 2**20) == bodies[k % 20]
+            and codec.decode(bodies[k % 20]) == values[k % 20]
+        )
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(timeout=20.0)
+        with ThreadPoolExecutor(4) as pool:
+            assert all(pool.map(is_right, range(400), timeout=60.0))
     finally:
         sys.setswitchinterval(interval)
-    assert not failures
-    assert not any(thread.is_alive() for thread in threads)
 
 
 def test_codecs_die_with_their_classes():
@@ -399,13 +360,3 @@ def test_codecs_die_with_their_classes():
         codec_of_schema(Schema(f"test/Passing{number}", (Field("value", "int64"),)))
     gc.collect()
     assert [reference() for reference in alive] == [None, None]
-
-
-def test_a_subclass_has_no_codec_of_its_base():
-    codec_of(Point)
-
-    class Derived(Point):
-        pass
-
-    with pytest.raises(TypeError, match="not a message type"):
-        codec_of(Derived)

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -80,16 +81,12 @@ def everything(size: int = 1000, label: str = "a\x1b[31mb") -> Everything:
     )
 
 
-def start(
-    *arguments: object, columns: int = 120, environment: dict[str, str] | None = None, **options: object
-) -> subprocess.Popen[str]:
+def start(*arguments, columns=120, environment=None, **options) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(columns), **(environment or {})}
     command = [sys.executable, "-m", "cortex", *map(str, arguments)]
-    child: subprocess.Popen[str] = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **options
-    )  # type: ignore[call-overload]
-    _children.append(child)
-    return child
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    _children.append(subprocess.Popen(command, env=environment, **pipes, **options))
+    return _children[-1]
 
 
 _children: list[subprocess.Popen[str]] = []
@@ -100,28 +97,20 @@ def no_child_left():
     """End what a test that failed has left running."""
     yield
     while _children:
-        child = _children.pop()
-        child.kill()
-        child.wait(SOON_S)
-        for stream in (child.stdout, child.stderr):
-            if stream is not None:
-                stream.close()
+        with _children.pop() as child:
+            child.kill()
 
 
 def finish(child: subprocess.Popen[str], timeout_s: float = SOON_S) -> tuple[int, str, str]:
     """Wait for a command: status, output, complaints."""
-    try:
-        output, errors = child.communicate(timeout=timeout_s)
-    finally:
-        child.kill()
-        child.wait(SOON_S)
+    output, errors = child.communicate(timeout=timeout_s)
     return child.returncode, output, errors
 
 
-def cortex(*arguments: object, columns: int = 120, **options: object) -> tuple[int, str, str]:
+def cortex(*arguments, columns=120, **options) -> tuple[int, str, str]:
     """Run a command that ends by itself: in this process, if it needs no directory, environment or log."""
     if options or arguments[0] == "discovery":
-        return finish(start(*arguments, columns=columns, **options))  # type: ignore[arg-type]
+        return finish(start(*arguments, columns=columns, **options))
     output, errors = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, signals_kept():
         patch.setenv("COLUMNS", str(columns))
@@ -171,14 +160,9 @@ def publishing(publisher: Publisher[Number], period_s: float) -> Iterator[None]:
 
 def column(output: str, name: str, line: int = -1) -> str:
     """What stands under a title, the columns being separated by two blanks or more."""
-    import re
-
     lines = output.splitlines()
     titles, cells = (re.split(r" {2,}", text.strip()) for text in (lines[0], lines[line]))
     return cells[titles.index(name)]
-
-
-# Looking
 
 
 def test_where_nothing_runs_it_says_what_to_do(runtime):
@@ -325,9 +309,6 @@ def test_types_are_compared(make_node, tmp_path):
     assert "there are /number" in errors
 
 
-# Watching
-
-
 def test_echo_fits_the_terminal(make_node):
     publisher = make_node("robot").publisher("/all", Everything, latch=True)
     publisher.publish(everything())
@@ -396,9 +377,6 @@ def rates_and_delays_are_right() -> bool:
         and float(column(bw, "bandwidth").split()[0]) == pytest.approx(1.6, rel=0.3)
         and max(delays_s) < 0.5
     )
-
-
-# Files
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -492,31 +470,28 @@ def test_errors_are_one_line(runtime, tmp_path, arguments, complaint, capsys):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["fly"], "invalid choice: 'fly'"),
-        (["echo", "scan"], "got 'scan'"),
-        (["hz", "/scan", "--window", "0"], "must be a number > 0, got '0'"),
-        (["echo", "/scan", "-n", "-3"], "must be an integer > 0, got '-3'"),
-        (["play", "x.mcap", "--rate", "fast"], "must be a number > 0, or \"max\", got 'fast'"),
-        (["record", "/scan"], "-o"),
-        (["record", "-o", "x.mcap"], "say which topics to record, or --all"),
-        (["record", "-o", "x.mcap", "--all", "/scan"], "leave out /scan"),
-        (["cpp", "Scan"], "a type is named like robot.messages:Scan, got 'Scan'"),
-        (["cpp"], "name message types"),
-        (["cpp", "--include-dir", "a:B"], "--include-dir takes no type"),
-        (["keys", "old"], "invalid choice: 'old'"),
+        ("fly", "invalid choice: 'fly'"),
+        ("echo scan", "got 'scan'"),
+        ("hz /scan --window 0", "must be a number > 0, got '0'"),
+        ("echo /scan -n -3", "must be an integer > 0, got '-3'"),
+        ("play x.mcap --rate fast", "must be a number > 0, or \"max\", got 'fast'"),
+        ("record /scan", "-o"),
+        ("record -o x.mcap", "say which topics to record, or --all"),
+        ("record -o x.mcap --all /scan", "leave out /scan"),
+        ("cpp Scan", "a type is named like robot.messages:Scan, got 'Scan'"),
+        ("cpp", "name message types"),
+        ("cpp --include-dir a:B", "--include-dir takes no type"),
+        ("keys old", "invalid choice: 'old'"),
     ],
 )
 def test_wrong_use_is_told_from_failure(arguments, complaint, capsys):
     with signals_kept():
         try:
-            status = main(arguments)
+            status = main(arguments.split())
         except SystemExit as exit_of_the_parser:
-            status = exit_of_the_parser.code  # type: ignore[assignment]
+            status = exit_of_the_parser.code
     assert status == 2
     assert complaint in capsys.readouterr().err
-
-
-# Tools
 
 
 COMMANDS = "topics nodes top info echo hz bw delay record play keys doctor schema cpp bench discovery"
@@ -534,10 +509,8 @@ def test_every_command_has_help(command, capsys, monkeypatch):
 
 
 def test_help_loads_no_sockets():
-    code = "import sys, cortex.cli; assert 'zmq' not in sys.modules; assert 'cortex.node' not in sys.modules"
-    subprocess.run(
-        [sys.executable, "-c", code], check=True, timeout=SOON_S, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
+    code = "import sys, cortex.cli; assert not {'zmq', 'cortex.node'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=SOON_S, cwd=ROOT)
 
 
 def test_keys_are_made_once(tmp_path):
@@ -569,29 +542,18 @@ def test_discovery_serves_until_interrupted(runtime, make_node):
     assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
 
 
-# Text
-
-
 @pytest.mark.parametrize(
-    ("shown", "expected"),
+    ("show", "values", "expected"),
     [
-        (seconds(0.0), "0 ns"),
-        (seconds(123e-9), "123.0 ns"),
-        (seconds(9.99996e-3), "10.00 ms"),
-        (seconds(0.999999), "1.000 s"),
-        (seconds(12345.0), "12,345 s"),
-        (seconds(math.nan), "-"),
-        (bytes_of(16), "16 B"),
-        (number_of(1, "topic"), "1 topic"),
-        (number_of(2345, "message"), "2,345 messages"),
-        (bytes_of(999.99), "1.000 kB"),
-        (bytes_of(23.7e6), "23.70 MB"),
-        (rate(99.98), "99.98 Hz"),
-        (rate(123456.0), "123.5 kHz"),
+        (seconds, (0.0, 123e-9, 9.99996e-3, 0.999999, math.nan), "0 ns|123.0 ns|10.00 ms|1.000 s|-"),
+        (seconds, (12345.0,), "12,345 s"),
+        (bytes_of, (16, 999.99, 23.7e6), "16 B|1.000 kB|23.70 MB"),
+        (rate, (99.98, 123456.0), "99.98 Hz|123.5 kHz"),
+        (lambda count: number_of(count, "topic"), (1, 2345), "1 topic|2,345 topics"),
     ],
 )
-def test_numbers_have_units(shown, expected):
-    assert shown == expected
+def test_numbers_have_units(show, values, expected):
+    assert [show(value) for value in values] == expected.split("|")
 
 
 def test_names_of_others_command_no_terminal():
@@ -618,3 +580,33 @@ def test_json_has_no_numbers_that_json_does_not_know():
     odd = Scan(1, np.array([math.nan, math.inf, 1.0], np.float32))
     assert to_plain(schema_of(Scan), odd) == {"stamp_ns": 1, "ranges": ["nan", "inf", 1.0]}
     json.dumps(to_plain(schema_of(Everything), shown), allow_nan=False)
+
+
+README = (ROOT / "cortex" / "README.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"<!-- example: (\w+) -->\s*```python\n(.*?)```", README, flags=re.DOTALL))
+SHOWN = {"minute": "mean 2.25 m", "loan": "(480, 640, 3)", "service": "Done(stamp_ns=0)"}
+"""What each example prints, among other things."""
+
+
+def test_every_example_is_run():
+    assert set(EXAMPLES) == set(SHOWN)
+    assert README.count("```python") == len(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", sorted(SHOWN))
+def test_an_example(name, runtime, tmp_path):
+    path = tmp_path / "example.py"
+    path.write_text(EXAMPLES[name], encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", path], capture_output=True, text=True, timeout=300.0, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert SHOWN[name] in done.stdout
+    assert not done.stderr
+
+
+def test_commands_exist():
+    """Every `cortex …` of the README names a command of the program."""
+    listed = set(re.findall(r"^cortex (\w+)", README, flags=re.MULTILINE))
+    assert listed
+    assert listed <= set(COMMANDS.split())

@@ -17,7 +17,13 @@ def found(monkeypatch):
     """What is found as `cortex._native`."""
     module = types.ModuleType("cortex._native")
     module.__file__ = "there/_native.so"
-    monkeypatch.setattr(compiled.importlib, "import_module", lambda name: module)
+
+    def load(name):
+        if module.__file__ is None:
+            raise ImportError("undefined symbol: nothing")
+        return module
+
+    monkeypatch.setattr(compiled.importlib, "import_module", load)
     monkeypatch.delenv("CORTEX_PURE_PYTHON", raising=False)
     return module
 
@@ -26,12 +32,16 @@ def test_the_compiled_module_is_of_this_version():
     assert compiled.native is None or compiled.native.INTERFACE == compiled.INTERFACE
 
 
-def test_a_module_of_another_version_is_left_out(found, caplog):
+def test_a_module_of_another_version_or_that_cannot_be_loaded_is_left_out_and_no_secret(found, caplog):
     with caplog.at_level(logging.WARNING):
         assert compiled._load() is None
-    assert "there/_native.so is older or newer" in caplog.text
-    found.INTERFACE = compiled.INTERFACE
-    assert compiled._load() is found
+        assert "there/_native.so is older or newer" in caplog.text
+        found.INTERFACE = compiled.INTERFACE
+        assert compiled._load() is found
+        found.__file__ = None
+        assert compiled._load() is None
+    assert "cannot be loaded" in caplog.text
+    assert "undefined symbol: nothing" in caplog.text
 
 
 @pytest.mark.parametrize("enabled", [True, False])

@@ -66,23 +66,9 @@ def test_ordinary_classes_are_hastened_and_others_are_not():
     ("args", "kwargs"),
     [
         ((1,), {}),
-        ((1, 2.0), {}),
         ((1, 2.0, "q"), {}),
-        ((), {"x": 1}),
         ((1,), {"name": "q"}),
         ((), {"name": "q", "y": 1.0, "x": 4}),
-    ],
-)
-def test_equals_what_init_makes(args, kwargs):
-    made = Point(*args, **kwargs)
-    assert made == plain_init(Point, *args, **kwargs)
-    assert type(made) is Point
-    assert repr(made) == repr(plain_init(Point, *args, **kwargs))
-
-
-@pytest.mark.parametrize(
-    ("args", "kwargs"),
-    [
         ((), {}),
         ((1, 2.0, "q", 4), {}),
         ((1,), {"x": 1}),
@@ -90,12 +76,17 @@ def test_equals_what_init_makes(args, kwargs):
         ((), {"y": 1.0}),
     ],
 )
-def test_refuses_as_init_does(args, kwargs):
-    with pytest.raises(TypeError) as ours:
-        Point(*args, **kwargs)
-    with pytest.raises(TypeError) as theirs:
-        plain_init(Point, *args, **kwargs)
-    assert str(ours.value) == str(theirs.value)
+def test_makes_what_init_makes_and_refuses_what_it_refuses(args, kwargs):
+    made = []
+    for make in (Point, lambda *args, **kwargs: plain_init(Point, *args, **kwargs)):
+        try:
+            made.append(repr(make(*args, **kwargs)))
+        except TypeError as error:
+            made.append(str(error))
+    assert made[0] == made[1]
+    if made[0].startswith("Point("):
+        assert Point(*args, **kwargs) == plain_init(Point, *args, **kwargs)
+        assert type(Point(*args, **kwargs)) is Point
 
 
 def test_factories_run_for_each_message():
@@ -122,13 +113,12 @@ def test_a_subclass_runs_its_own_init():
     assert Longer(1).z == 9
 
 
+class Probe(np.ndarray):
+    """An array that can be watched."""
+
+
 def test_values_are_held_once_and_let_go():
-    array = np.zeros(3)
-
-    class Holder(np.ndarray):
-        pass
-
-    held = array.view(Holder)
+    held = np.zeros(3).view(Probe)
     gone = weakref.ref(held)
     point: Any = Point(held)
     del held
@@ -140,10 +130,8 @@ def test_values_are_held_once_and_let_go():
 
 def test_cycles_are_collected():
     items: list[Any] = []
-    items.append(Listed(1, items))
-    probe = Listed(2, [np.zeros(1).view(type("Probe", (np.ndarray,), {}))])
-    gone = weakref.ref(probe.items[0])
-    items.append(probe)
-    del items, probe
+    items += [Listed(1, items), Listed(2, [np.zeros(1).view(Probe)])]
+    gone = weakref.ref(items[1].items[0])
+    del items
     gc.collect()
     assert gone() is None

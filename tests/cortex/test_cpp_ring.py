@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import shutil
 import signal
-import socket
 import time
 from pathlib import Path
 
@@ -58,46 +56,38 @@ def sizes() -> list[int]:
     return [int(size) for size in SIZES.split(",")]
 
 
-def test_all_sizes_to_cpp_in_one_order(start, make_node):
-    scans = make_node().publisher("/scan", Scan)
-    peer = start("count", "/scan", "reliable", 0, 3, 3000)
-    assert scans.wait_for_subscribers(1, SOON_S)
-    for number in range(3000):
-        assert scans.publish(scan(number, sizes()[number % 5]))
-    result = result_of(peer)
-    assert result["received"] == 3000
-    assert result["wrong"] == result["lost"] == result["rejected"] == result["overtaken"] == 0
+@pytest.mark.parametrize("direction", ["Python to C++", "C++ to Python", "C++ to C++"])
+def test_all_sizes_in_one_order(start, make_node, direction):
+    writer, _, reader = direction.partition(" to ")
+    node = make_node()
+    counting = start("count", "/scan", "reliable", 0, 3, 3000) if reader == "C++" else None
+    scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) if reader == "Python" else None
+    publishing = start("publish", "/scan", 3000, SIZES) if writer == "C++" else None
+    if writer == "Python":
+        publisher = node.publisher("/scan", Scan)
+        assert publisher.wait_for_subscribers(1, SOON_S)
+        assert all(publisher.publish(scan(number, sizes()[number % 5])) for number in range(3000))
+    if scans is not None:
+        for number in range(3000):
+            assert scans.recv(SOON_S) == scan(number, sizes()[number % 5])
+        assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
+        assert scans.carriers == ["ipc, shared memory"]
+    if counting is not None:
+        result = result_of(counting)
+        assert result["received"] == 3000
+        assert result["wrong"] == result["lost"] == result["rejected"] == result["overtaken"] == 0
+    if publishing is not None:
+        assert result_of(publishing) == {"published": 3000, "refused": 0, "timeouts": 0}
 
 
-def test_all_sizes_from_cpp_in_one_order(start, make_node):
+@pytest.mark.parametrize("reason", ["no descriptor left for slots", "a reader without the C module"])
+def test_a_cpp_publisher_serves_its_reader_through_the_socket(start, make_node, monkeypatch, reason):
+    if "reader" in reason:
+        monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    start("publish", "/scan", 3000, SIZES)
-    for number in range(3000):
-        received = scans.recv(SOON_S)
-        assert (received.stamp_ns, received.ranges.size) == (number, sizes()[number % 5])
-        assert (received.ranges == number).all()
-    assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
-    assert scans.carriers == ["ipc, shared memory"]
-
-
-def test_cpp_to_cpp_in_one_order(start):
-    reader = start("count", "/scan", "reliable", 0, 3, 3000)
-    writer = start("publish", "/scan", 3000, SIZES)
-    result = result_of(reader)
-    assert result["received"] == 3000
-    assert result["wrong"] == result["lost"] == result["rejected"] == 0
-    assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
-
-
-def test_no_memory_for_slots(start, make_node):
-    """A C++ publisher that has no descriptor left for slots sends its readers to their sockets."""
-    scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    start("publish", "/scan", 100, "100000,10", "full")
+    start("publish", "/scan", 100, "100000,10", "" if "reader" in reason else "full")
     for number in range(100):
-        received = scans.recv(SOON_S)
-        assert received.stamp_ns == number
-        assert received.ranges.size == (10 if number % 2 else 100_000)
-        assert (received.ranges == number).all()
+        assert scans.recv(SOON_S) == scan(number, 10 if number % 2 else 100_000)
     assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
 
 
@@ -123,39 +113,24 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(start, make_node, p
     wait_for(lambda: counted(node) == [9000])
 
 
-def test_reader_without_ring(start, make_node, monkeypatch):
-    """One without the C module asks for none: the C++ publisher serves it through ZeroMQ."""
+@pytest.mark.parametrize("timeout_s", [0.05, 1.0])
+def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
+    start, make_node, monkeypatch, timeout_s
+):
+    """After 8 MB, as one in Python: for a second, not for one with each large message."""
     monkeypatch.setattr(cortex.link, "native", None)
-    scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    start("publish", "/scan", 500, SIZES)
-    for number in range(500):
-        assert scans.recv(SOON_S).stamp_ns == number
-    assert scans.counters.lost == 0
-
-
-def test_what_waits_for_a_reliable_reader_of_a_socket_is_bounded(start, make_node, monkeypatch):
-    """It stands still, and holds up a C++ publisher after 8 MB, as one in Python."""
-    monkeypatch.setattr(cortex.link, "native", None)
-    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.05))
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, timeout_s))
     monkeypatch.setattr(scans, "top_up", lambda now_ns: None)  # the node does not read either
-    writer = start("fill", "/scan", 200, 250_000)  # 1 MB each
+    role = ("fill", "/scan", 200) if timeout_s < 1.0 else ("publish", "/scan", 40)
+    begin_s = time.monotonic()
+    writer = start(*role, 250_000)  # 1 MB each
     assert scans.wait_for_publisher(SOON_S)
     result = result_of(writer)
-    # What is on its way besides: in the kernel, and one in the queue of the reader.
-    assert 8 <= result["taken"] <= 12
-
-
-def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(start, make_node, monkeypatch):
-    """For a second, not for one with each large message."""
-    monkeypatch.setattr(cortex.link, "native", None)
-    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 1.0))
-    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)
-    begin = time.monotonic()
-    writer = start("publish", "/scan", 40, "250000")
-    assert scans.wait_for_publisher(SOON_S)
-    result = result_of(writer)
-    assert result["refused"] >= 28
-    assert time.monotonic() - begin < 20.0
+    if timeout_s < 1.0:  # what is on its way besides: in the kernel, and one in the queue of the reader
+        assert 8 <= result["taken"] <= 12
+    else:
+        assert result["refused"] >= 28
+        assert time.monotonic() - begin_s < 20.0
 
 
 @pytest.mark.parametrize(("others", "size", "held"), [(0, 10, 500), (2, 10, 500), (0, 20_000, 45)])
@@ -184,88 +159,12 @@ def test_killed_cpp_reader_that_holds_up_its_publisher(start, make_node, others,
     assert writer.process.poll() is None  # no signal has killed it
 
 
-def nothing(flags: int) -> bytes:
-    """A socket to which nothing comes."""
-    raise zmq.Again
-
-
 def place_of(node: Node, topic: str) -> tuple[int, str]:
     """Source and strict address of the only publisher of a topic."""
-
-    def found() -> list[tuple[int, str]]:
-        return [
-            (publisher.source, record.endpoints[0].strict)
-            for record in node.nodes()
-            for publisher in record.publishers
-            if publisher.topic == topic
-        ]
-
-    wait_for(lambda: bool(found()))
-    (place,) = found()
-    return place
-
-
-class SlowReader:
-    """A reliable reader of a C++ publisher that attaches by hand, and reads when it is told to.
-
-    Args:
-        node: Who knows the publisher.
-        publisher: Its program.
-        topic: Its topic.
-    """
-
-    def __init__(self, node: Node, publisher: Peer, topic: str) -> None:
-        self.publisher = publisher
-
-        self.source, address = place_of(node, topic)
-        self.key = wire.attach_key(wire.AttachKey(self.source, 1, True, True, 10, 1), stamped=True)
-        path = address.removeprefix("ipc://").rpartition(".")[0] + ".ring"
-        self._idle = socket.socketpair()
-        self._ring = native.RingReader(path, self.source, 1, self._idle[0].fileno(), nothing, zmq.Again, 20)
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.connect(address)
-        self._socket.subscribe(self.key)
-        self.answer()
-        assert self._ring.welcomed() is not None
-
-    def answer(self) -> wire.AttachAnswer:
-        """The publisher's next answer."""
-        assert self._socket.poll(1e3 * SOON_S), "the publisher does not answer"
-        return wire.parse_answer(self._socket.recv())
-
-    def frame(self) -> bytes:
-        """The next frame."""
-        found: bytes = self._ring.receive(zmq.DONTWAIT)
-        return found
-
-    def body(self) -> np.ndarray:
-        """What the frame that was read last says is in a slot."""
-        found: np.ndarray | None = self._ring.take_body()
-        assert found is not None
-        return found
-
-    def leave(self) -> None:
-        self._ring.close()
-        for end in self._idle:
-            end.close()
-        self._context.destroy(linger=0)
-
-
-@pytest.fixture
-def attach(make_node, start):
-    """Makes a C++ program publish until a reader has no room, and leave; both, and what the program says."""
-    readers = []
-
-    def run(most: int, size: int) -> tuple[SlowReader, dict[str, int]]:
-        node = make_node()
-        peer = start("fill", "/scan", most, size)
-        readers.append(SlowReader(node, peer, "/scan"))
-        return readers[-1], result_of(peer)
-
-    yield run
-    for reader in readers:
-        reader.leave()
+    ((record, publisher),) = wait_for(
+        lambda: [(each, p) for each in node.nodes() for p in each.publishers if p.topic == topic]
+    )
+    return publisher.source, record.endpoints[0].strict
 
 
 def sequence_of(frame: bytes) -> int:
@@ -276,18 +175,19 @@ def aux_of(frame: bytes) -> int:
     return int.from_bytes(frame[56:64], "little")
 
 
-def test_what_a_closed_publisher_has_taken_stays(attach):
-    """Also when its process has ended; behind it the number that tells of the loss."""
-    reader, result = attach(10**9, 2700)
-    reader.publisher.end()
+def test_what_a_closed_cpp_publisher_has_taken_stays(start, make_node, monkeypatch):
+    """Also when its process has ended, and nobody has read; behind it the number that tells of the loss."""
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.01))
+    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)  # the node does not read either
+    writer = start("fill", "/scan", 10**9, 2700)
+    result = result_of(writer)
+    writer.end()
     for number in range(result["taken"]):
-        assert reader.frame()[wire.HEADER_SIZE :] == body_of(number, 2700)
-    last = reader.frame()
-    assert (last[3:4], len(last), sequence_of(last)) == (b"N", wire.HEADER_SIZE, result["published"])
-    assert aux_of(last) == wire.LAST
-    assert result["published"] == result["taken"] + 1
-    with pytest.raises(zmq.Again):
-        reader.frame()
+        assert scans.recv(SOON_S) == scan(number, 2700)
+    with pytest.raises(TimeoutError):
+        scans.recv(0.1)
+    assert scans.counters.lost == result["published"] - result["taken"] == 1
+    assert scans.counters.rejected == scans.counters.cut_off == 0
 
 
 @pytest.mark.parametrize("confirms_end", [True, False], ids=["", "to an older version"])
@@ -349,35 +249,27 @@ def test_cpp_reader_counts_what_it_had_no_time_for(start, make_node):
     wait_for(lambda: counted(watcher) == [sent])
 
 
-def test_cpp_reader_counts_a_stream_that_was_cut_off(start, start_child, make_node):
+@pytest.mark.parametrize("busy", [False, True], ids=["", "while another is busy"])
+def test_cpp_reader_counts_a_stream_that_was_cut_off(start, start_child, make_node, busy):
     """Nobody knows how much of it was lost; one that was closed in order is complete."""
     reader = start("count", "/scan", "reliable", 0, 0)
     for orderly in (True, False):
         child = start_child("peer")
         child.ask(do="publisher", topic="/scan", type="Scan")
         assert child.ask(do="await_subscribers", topic="/scan")["ok"]
+        if busy and not orderly:
+            start("publish", "/scan", -1, 10)  # without a pause, for ever
         child.say(do="leave", topic="/scan", count=10, orderly=orderly)
-    assert select.select([reader.process.stderr], [], [], SOON_S)[0]
-    node = make_node()
-    wait_for(lambda: [found.cut_off for found in subscribers_in_cpp(node)] == [1])
-    last = node.publisher("/scan", Scan)
-    assert last.wait_for_subscribers(1, SOON_S)
-    last.publish(scan(-1, 0))
-    result = result_of(reader)
-    assert (result["received"], result["lost"], result["cut_off"]) == (20, 0, 1)
-    assert "ended without saying how much it had sent" in reader.end()
-
-
-def test_cpp_reader_takes_leave_of_a_publisher_while_another_is_busy(start, start_child, make_node):
-    reader = start("count", "/scan", "reliable", 0, 0)
-    child = start_child("peer")
-    child.ask(do="publisher", topic="/scan", type="Scan")
-    assert child.ask(do="await_subscribers", topic="/scan")["ok"]
-    start("publish", "/scan", -1, 10)  # without a pause, for ever
-    child.say(do="leave", topic="/scan", count=10, orderly=False)
     node = make_node()
     wait_for(lambda: [found.cut_off for found in subscribers_in_cpp(node)] == [1])
     assert reader.process.poll() is None
+    if not busy:
+        last = node.publisher("/scan", Scan)
+        assert last.wait_for_subscribers(1, SOON_S)
+        last.publish(scan(-1, 0))
+        result = result_of(reader)
+        assert (result["received"], result["lost"], result["cut_off"]) == (20, 0, 1)
+        assert "ended without saying how much it had sent" in reader.end()
 
 
 class RingImpostor(Impostor):
@@ -421,14 +313,10 @@ def body_of(number: int, size: int = 4) -> bytes:
 def bad_frames() -> list[bytes]:
     """Frames that the subscriber must reject."""
     body = body_of(1)
-    return [
-        make_frame(b"M", 1, body, fingerprint=1),
-        make_frame(b"M", 1, body, source=78),
-        make_frame(b"M", 2**63, body),
-        make_frame(b"N", 1, body),
-        make_frame(b"N", 2**63, b""),
-        make_frame(b"S", 0, b"", size=40, aux=9),  # there is no such slot
-    ]
+    changes = [{"fingerprint": 1}, {"source": 78}, {"sequence": 2**63}]
+    wrong = [make_frame(b"M", **{"sequence": 1} | change, body=body) for change in changes]
+    no_slot = make_frame(b"S", 0, b"", size=40, aux=9)
+    return [*wrong, make_frame(b"N", 1, body), make_frame(b"N", 2**63, b""), no_slot]
 
 
 def test_lies_in_a_ring_are_rejected(programs, impostor):

@@ -16,6 +16,7 @@ from cpp_messages import Rich, Scan
 from cpp_programs import needs_compiler, programs
 from directories import serving
 from processes import SOON_S, wait_for
+from test_transports import keys_of
 
 from cortex.policy import reliable
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
@@ -30,12 +31,10 @@ Start = Callable[..., Any]
 @pytest.fixture
 def places(tmp_path):
     """Key directories: `python` and `cpp` trust each other, `stranger` trusts both and is trusted by none."""
-    names = ("python", "cpp", "stranger")
-    public = {name: new_keys(tmp_path / name).public for name in names}
-    for name in names:
-        trusted = [public[other] for other in ("python", "cpp")]
-        (tmp_path / name / AUTHORIZED_FILE).write_text("# friends\n" + "\n".join(trusted) + "\n")
-    return {name: tmp_path / name for name in names}
+    made = keys_of(tmp_path, ("python", "cpp"))
+    new_keys(tmp_path / "stranger")
+    (tmp_path / "stranger" / AUTHORIZED_FILE).write_text((made["cpp"] / AUTHORIZED_FILE).read_text())
+    return made | {"stranger": tmp_path / "stranger"}
 
 
 def authorize(place: Path, key: str) -> None:
@@ -68,13 +67,16 @@ def start_cpp(programs, registry, places, elsewhere, monkeypatch):
 
     def start(name: str, *arguments: object) -> Any:
         authorize(places[name], load_keys(places["python"]).public)
+        command = [programs / "peer", *map(str, arguments)]
         with monkeypatch.context() as environment:
-            environment.setenv("CORTEX_TEST_REGISTRY", str(registry.address))
-            environment.setenv("HOME", str(places[name].parent))
-            environment.setenv("CORTEX_TEST_KEYS", f"~/{places[name].name}")
-            environment.setenv("CORTEX_TEST_LISTEN", "127.0.0.1")
-            environment.setenv("CORTEX_RUNTIME_DIR", str(elsewhere))
-            command = [programs / "peer", *map(str, arguments)]
+            for variable, value in {
+                "CORTEX_TEST_REGISTRY": registry.address,
+                "HOME": places[name].parent,
+                "CORTEX_TEST_KEYS": f"~/{places[name].name}",
+                "CORTEX_TEST_LISTEN": "127.0.0.1",
+                "CORTEX_RUNTIME_DIR": elsewhere,
+            }.items():
+                environment.setenv(variable, str(value))
             if name == "stranger":
                 return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
             return Peer(command)
@@ -93,13 +95,17 @@ def test_cpp_reads_what_python_writes(start_cpp, python_node):
     peer.end()
 
 
+def tcp_key_of(node: Node) -> str:
+    """The server key of the program in C++ that a node knows."""
+    (found,) = wait_for(lambda: [each for each in node.nodes() if each.name == "cpp"])
+    return next(each.server_key for each in found.endpoints if each.transport == "tcp")
+
+
 def test_python_reads_what_cpp_writes(start_cpp, python_node):
     scans = python_node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     peer = start_cpp("cpp", "publish", "/scan", 100, 8)
     assert [scans.recv(SOON_S).stamp_ns for _ in range(100)] == list(range(100))
-    [found] = [node for node in python_node.nodes() if node.name == "cpp"]
-    [tcp] = [e for e in found.endpoints if e.transport == "tcp"]
-    assert tcp.server_key != ""
+    assert tcp_key_of(python_node) != ""
     peer.end()
 
 
@@ -117,15 +123,7 @@ def test_a_stranger_is_told_nothing(start_cpp, python_node, caplog, places):
 def test_a_stranger_cannot_read_cpp(start_cpp, python_node, places, make_node):
     """A key that the list no longer has: the publisher's process says whom it has refused."""
     peer = start_cpp("cpp", "echo")
-    assert wait_for(lambda: len(python_node.nodes()) == 2)
-    [tcp] = [
-        e
-        for node in python_node.nodes()
-        if node.name == "cpp"
-        for e in node.endpoints
-        if e.transport == "tcp"
-    ]
-    authorize(places["stranger"], tcp.server_key)
+    authorize(places["stranger"], tcp_key_of(python_node))
     stranger = make_node(listen="127.0.0.1", keys=load_keys(places["stranger"]))
     scans = stranger.subscriber("/from_cpp", Rich)
     with pytest.raises(TimeoutError):

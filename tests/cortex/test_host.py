@@ -14,15 +14,7 @@ from pathlib import Path
 import pytest
 from processes import SOON_S
 
-from cortex.host import (
-    FileLock,
-    NodeFiles,
-    domain_id,
-    host_id,
-    node_lives,
-    runtime_dir,
-    sweep,
-)
+from cortex.host import FileLock, NodeFiles, domain_id, host_id, node_lives, runtime_dir, sweep
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,10 +36,8 @@ def base(short_path, monkeypatch):
 @pytest.mark.parametrize(("text", "expected"), [(None, 0), ("0", 0), ("232", 232), ("007", 7)])
 def test_domain_comes_from_the_environment(monkeypatch, text, expected):
     monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
-    if text is not None:
-        monkeypatch.setenv("CORTEX_DOMAIN", text)
-    assert domain_id() == expected
-    assert domain_id(5) == 5
+    monkeypatch.setenv("CORTEX_DOMAIN", text) if text is not None else None
+    assert (domain_id(), domain_id(5)) == (expected, 5)
 
 
 @pytest.mark.parametrize("text", ["", "-1", "233", "1.0", "x", "²"])
@@ -67,27 +57,25 @@ def test_runtime_directory_is_private(base):
     assert (base.stat().st_mode & 0o777, directory.stat().st_mode & 0o777) == (0o700, 0o700)
 
 
-def test_a_directory_that_others_may_enter_is_refused(base):
-    base.mkdir(mode=0o700)
-    (base / "0").mkdir()
-    (base / "0").chmod(0o750)
-    with pytest.raises(PermissionError, match="0750"):
-        runtime_dir(0)
-
-
-def test_a_link_is_refused(base, short_path):
-    base.mkdir(mode=0o700)
-    (short_path / "elsewhere").mkdir(mode=0o700)
-    (base / "0").symlink_to(short_path / "elsewhere")
-    with pytest.raises(PermissionError, match="not a link"):
-        runtime_dir(0)
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory away")
-def test_the_directory_of_another_user_is_refused(base):
-    base.mkdir(mode=0o700)
-    os.chown(base, 12345, -1)
-    with pytest.raises(PermissionError, match="belongs to user 12345"):
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda base: (base / "0").chmod(0o750), "0750"),
+        (
+            lambda base: ((base / "0").rename(base / "other"), (base / "0").symlink_to(base / "other")),
+            "a link",
+        ),
+        pytest.param(
+            lambda base: os.chown(base, 12345, -1),
+            "belongs to user 12345",
+            marks=pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory away"),
+        ),
+    ],
+)
+def test_a_directory_that_is_not_ours_alone_is_refused(base, spoil, said):
+    runtime_dir(0)
+    spoil(base)
+    with pytest.raises(PermissionError, match=said):
         runtime_dir(0)
 
 
@@ -117,125 +105,79 @@ def test_a_lock_has_one_holder_at_a_time(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def _sit_until_killed(ready):
-    ready.set()
-    signal.pause()
+@pytest.fixture
+def fork():
+    """Starts children that call a function and sit until they are killed."""
+    context, children = multiprocessing.get_context("fork"), []
 
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
-def test_a_forked_child_does_not_keep_the_lock(tmp_path):
-    """A child that outlives us must not make us look alive."""
-    lock = FileLock.acquire(tmp_path / "lock")
-    context = multiprocessing.get_context("fork")
-    ready = context.Event()
-    child = context.Process(target=_sit_until_killed, args=(ready,))
-    child.start()
-    try:
+    def start(action, *arguments):
+        ready = context.Event()
+        children.append(context.Process(target=lambda: (action(*arguments), ready.set(), signal.pause())))
+        children[-1].start()
         assert ready.wait(SOON_S)
-        lock.close()
-        again = FileLock.acquire(tmp_path / "lock")
-        assert again is not None
-        again.close()
-    finally:
+        return children[-1]
+
+    yield start
+    for child in children:
         child.kill()
         child.join()
 
 
-def test_a_node_leaves_nothing_behind():
-    files = NodeFiles(0, 0xABC)
-    files.path("lossy").touch()
-    assert files.endpoint("lossy") == f"ipc://{files.directory}/0000000000000abc.lossy"
-    files.close()
-    files.close()
-    assert list(files.directory.iterdir()) == []
-
-
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
-def test_a_forked_child_removes_nothing_of_its_parent():
+def test_a_forked_child_neither_keeps_nor_removes_what_is_its_parents(fork):
+    """It may outlive us, and must not make us look alive."""
     files = NodeFiles(0, 8)
     files.path("lossy").touch()
-    child = multiprocessing.get_context("fork").Process(target=files.close)
-    child.start()
-    child.join(SOON_S)
-    assert child.exitcode == 0
+    fork(files.close)
+    fork(lambda: None)
     assert files.path("lossy").exists()
     assert sweep(files.directory) == []  # and it lives still
     files.close()
+    NodeFiles(0, 8).close()
 
 
-def test_a_number_is_not_given_twice():
-    files = NodeFiles(0, 7)
-    with pytest.raises(FileExistsError, match="0000000000000007"):
-        NodeFiles(0, 7)
-    files.close()
-
-
-@pytest.mark.parametrize("role", ["", "Lossy", "a.b", "../x", "lock", "x" * 13])
-def test_a_role_that_would_leave_the_scheme_is_refused(role):
-    files = NodeFiles(0, 7)
-    try:
+def test_a_node_has_its_number_alone_lives_and_leaves_nothing_behind():
+    (runtime_dir(0) / f"{9:016x}.lossy").touch()
+    files = NodeFiles(0, 0xABC)  # sweeps what it finds
+    files.path("lossy").touch()
+    assert files.endpoint("lossy") == f"ipc://{files.directory}/0000000000000abc.lossy"
+    for role in ("", "Lossy", "a.b", "../x", "lock", "x" * 13):
         with pytest.raises(ValueError, match="role must be"):
             files.path(role)
-    finally:
-        files.close()
-
-
-_HOLD = """
-import signal, sys
-from cortex.host import NodeFiles
-files = NodeFiles(0, int(sys.argv[1]))
-for role in ("lossy", "strict", "control"):
-    files.path(role).touch()
-print("ready", flush=True)
-signal.pause()
-"""
-
-
-def test_a_node_lives_while_its_lock_is_held():
-    files = NodeFiles(0, 6)
-    assert node_lives(files.directory, 6)
+    with pytest.raises(FileExistsError, match="0000000000000abc"):
+        NodeFiles(0, 0xABC)
+    assert node_lives(files.directory, 0xABC)
     assert not node_lives(files.directory, 7)
     files.close()
-    assert not node_lives(files.directory, 6)
+    files.close()
+    assert not node_lives(files.directory, 0xABC)
     (files.directory / f"{6:016x}.lock").touch()  # what a killed one leaves
     assert not node_lives(files.directory, 6)
     assert list(files.directory.iterdir()) == []
 
 
-def test_sweep_removes_the_files_of_killed_nodes_only():
+def hold(number: int) -> None:
+    """Be a node."""
+    files = NodeFiles(0, number)
+    for role in ("lossy", "strict", "control"):
+        files.path(role).touch()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
+def test_sweep_removes_the_files_of_killed_nodes_only(fork):
     living = NodeFiles(0, 1)
     living.path("lossy").touch()
-    command = [sys.executable, "-c", _HOLD]
-    killed = subprocess.Popen([*command, "2"], cwd=ROOT, stdout=subprocess.PIPE)
-    stopped = subprocess.Popen([*command, "3"], cwd=ROOT, stdout=subprocess.PIPE)
-    foreign = living.directory / "notes.txt"
-    foreign.touch()
-    try:
-        assert killed.stdout.readline() == stopped.stdout.readline() == b"ready\n"
-        (living.directory / f"{4:016x}.lossy").touch()  # the lock of its node was lost
-        stopped.send_signal(signal.SIGSTOP)
-        killed.kill()
-        killed.wait()
-        assert sorted(sweep(living.directory)) == [2, 4]
-        left = {path.name for path in living.directory.iterdir()}
-        assert left == {
-            "notes.txt",
-            f"{1:016x}.lock",
-            f"{1:016x}.lossy",
-            *(f"{3:016x}.{role}" for role in ("lock", "lossy", "strict", "control")),
-        }
-    finally:
-        for process in (killed, stopped):
-            process.kill()
-            process.communicate()
-        living.close()
-
-
-def test_a_new_node_sweeps_what_it_finds(base):
-    directory = runtime_dir(0)
-    (directory / f"{9:016x}.lossy").touch()
-    NodeFiles(0, 1).close()
-    assert list(directory.iterdir()) == []
+    killed, stopped = fork(hold, 2), fork(hold, 3)
+    (living.directory / "notes.txt").touch()
+    (living.directory / f"{4:016x}.lossy").touch()  # the lock of its node was lost
+    os.kill(stopped.pid, signal.SIGSTOP)
+    killed.kill()
+    killed.join()
+    assert sorted(sweep(living.directory)) == [2, 4]
+    roles = {1: ("lock", "lossy"), 3: ("lock", "lossy", "strict", "control")}
+    left = {f"{number:016x}.{role}" for number in roles for role in roles[number]}
+    assert {path.name for path in living.directory.iterdir()} == {"notes.txt", *left}
+    living.close()
 
 
 OTHER_SYSTEM = """

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import mmap
 import threading
 import time
 import tracemalloc
+from collections import deque
 from pathlib import Path
 
 import numpy as np
 import pytest
-from peer import Block, Scan, connect, is_whole, make_block
-from processes import SOON_S, shared_mappings, wait_for
+from peer import Block, Scan, accounted, connect, is_whole, make_block, take, take_all
+from processes import SOON_S, Beside, shared_mappings, wait_for
 
 import cortex.back_pressure
 import cortex.broadcast
 import cortex.large
 import cortex.link
-from cortex import keep_last, latest, reliable
+from cortex import Closed, keep_last, latest, reliable
 from cortex.pub_socket import Backoff
 
 LARGE = 100_000
@@ -48,9 +50,6 @@ def is_shared(message):
     return False
 
 
-# Leases
-
-
 def test_an_array_that_is_copied_past_the_caches(node):
     """In 64-byte steps, and what is left of them."""
     publisher, subscriber = connected(node, Block, reliable())
@@ -72,46 +71,32 @@ def test_a_large_message_is_a_view(node):
     assert slots_held(publisher) == 0
 
 
-def test_views_outlive_everything(make_node):
-    """The subscriber, its node and the publisher are closed; what was received stays as it was."""
-    kept = []
+@pytest.mark.parametrize("end", ["subscriber", "publisher", "node of the reader", "node of the writer"])
+def test_views_outlive_everything(make_node, end):
+    """What is closed leaves what was received as it was, also where its slots are written again."""
     one, two = make_node("one"), make_node("two")
     publisher = one.publisher("/large", Block)
-    for end in ("subscriber", "publisher", "node of the reader", "node of the writer"):
-        if end == "node of the writer":
-            two = make_node("two again")
-        subscriber = two.subscriber("/large", Block, policy=reliable(4))
-        assert subscriber.wait_for_publisher(timeout_s=SOON_S)  # the publisher may count an earlier one
-        for number in range(2):
+    subscriber = two.subscriber("/large", Block, policy=reliable(4))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    kept = []
+    for number in range(2):
+        publisher.publish(make_block(number, 300_000))
+        kept.append(subscriber.recv(SOON_S))
+    {"subscriber": subscriber, "publisher": publisher, "node of the reader": two}.get(end, one).close()
+    gc.collect()
+    if end == "subscriber":
+        other = two.subscriber("/large", Block, policy=latest())
+        assert other.wait_for_publisher(timeout_s=SOON_S)
+        for number in range(10, 30):
             publisher.publish(make_block(number, 300_000))
-            kept.append(subscriber.recv(SOON_S))
-        if end == "subscriber":
-            subscriber.close()
-        elif end == "publisher":
-            publisher.close()
-            publisher = one.publisher("/large", Block)
-        elif end == "node of the reader":
-            two.close()
-        else:
-            one.close()
-        gc.collect()
-        if end == "subscriber":  # its slots are written again
-            other = two.subscriber("/large", Block, policy=latest())
-            assert other.wait_for_publisher(timeout_s=SOON_S)
-            for number in range(10, 30):
-                publisher.publish(make_block(number, 300_000))
-                other.recv(SOON_S)
-            other.close()
-        assert all(is_whole(block) for block in kept)
+            other.recv(SOON_S)
+    assert all(map(is_whole, kept))
+    one.close()
     two.close()
-    assert [block.number for block in kept] == [0, 1] * 4
-    assert all(is_whole(block) for block in kept)
+    assert [(block.number, is_whole(block)) for block in kept] == [(0, True), (1, True)]
     kept.clear()
     gc.collect()
     wait_for(lambda: not shared_mappings())
-
-
-# Quotas
 
 
 def test_a_reader_that_hoards_hurts_only_itself(node):
@@ -119,56 +104,42 @@ def test_a_reader_that_hoards_hurts_only_itself(node):
     publisher, hoarder = connected(node, Scan, keep_last(64))
     other = node.subscriber("/large", Scan, policy=keep_last(64))
     assert publisher.wait_for_subscribers(2, SOON_S)
-    kept = []
-    took_s = []
-
-    def take():
-        if (message := _try(hoarder)) is not None:
-            kept.append(message)
-
+    kept, took_s = [], []
     for number in range(100):
         begin = time.monotonic()
         assert publisher.publish(scan(number))
         took_s.append(time.monotonic() - begin)
         assert other.recv(SOON_S).stamp_ns == number
-        take()
+        kept += filter(None, [take(hoarder, 0.005)])
     assert sorted(took_s)[80] < 0.05  # the last 60 of them are those that it could wait for
-    counters = hoarder.counters
-    wait_for(lambda: take() or counters.received + counters.lost + counters.overtaken == 100)
-    assert [message.stamp_ns for message in kept] == sorted({message.stamp_ns for message in kept})
+    wait_for(lambda: kept.extend(take_all(hoarder)) or accounted(hoarder.counters) == 100)
+    assert [message.stamp_ns for message in kept] == list(range(100))
     assert all((message.ranges == message.stamp_ns).all() for message in kept)
-    assert (other.counters.received, other.counters.lost) == (100, 0)
-    assert counters.received == 100
+    assert (other.counters.received, other.counters.lost, hoarder.counters.received) == (100, 0, 100)
     assert 1 <= sum(map(is_shared, kept)) <= 32
     kept.clear()
     publisher.publish(scan(100))
-    message = hoarder.recv(SOON_S)
-    assert is_shared(message)
+    assert is_shared(hoarder.recv(SOON_S))
 
 
-def test_a_reader_that_keeps_all_there_is_holds_up_its_publisher(node, monkeypatch):
+def test_a_reader_that_keeps_all_there_is_holds_up_its_publisher(node):
     """A reliable one, that may copy nothing more: what is lost is counted at both ends, and it goes on."""
     publisher, subscriber = connected(node, Scan, reliable(2, 0.01))
     kept = []
     for number in range(60):
         delivered = publisher.publish(scan(number, 4_000_000))
-        if (message := _try(subscriber)) is not None:
-            kept.append(message)
+        kept += filter(None, [take(subscriber, 0.005)])
     assert not delivered
     assert sum(not is_shared(message) for message in kept) * 16_000_000 <= 64 << 20
     assert all((message.ranges == message.stamp_ns).all() for message in kept)
     kept.clear()
-    message = None
 
     def arrives():
         publisher.publish(scan(99, 10))
-        return (message := _try(subscriber)) is not None and message.stamp_ns == 99
+        return 99 in [message.stamp_ns for message in take_all(subscriber)]
 
     wait_for(arrives)
-    while _try(subscriber) is not None:
-        pass
-    counters = subscriber.counters
-    wait_for(lambda: counters.received + counters.lost == publisher.counters.published)
+    wait_for(lambda: take_all(subscriber) or accounted(subscriber.counters) == publisher.counters.published)
 
 
 @pytest.mark.parametrize("count", [3, 70])
@@ -188,36 +159,24 @@ def test_many_readers(node, count):
     wait_for(lambda: slots_held(publisher) == 0)
 
 
-# Rings
-
-
-@pytest.mark.parametrize("policy", [reliable(4, 60.0), keep_last(4)], ids=str)
-def test_messages_that_grow_and_shrink(node, policy):
+@pytest.mark.parametrize(
+    ("policy", "waiting"), [(reliable(64, 60.0), 1), (reliable(64, 60.0), 3), (keep_last(64), 1)], ids=str
+)
+def test_messages_that_grow_and_shrink(node, policy, waiting):
+    """Also while some wait: what lies in an older ring is still delivered."""
     publisher, subscriber = connected(node, Scan, policy)
-    sizes = [5_000, 10, 20_000, 80_000, 320_000, 1_280_000, 5_000, 2_000_000, 10, 4_200, 2_000_001]
+    sizes = [5_000, 10, 20_000, 80_000, 320_000, 640_000, 5_000, 1_000_000, 10, 4_200, 1_000_001]
     kept = []
-    for number, size in enumerate(sizes * 2):
-        assert publisher.publish(scan(number, size))
-        message = subscriber.recv(SOON_S)
-        assert len(message.ranges) == size
-        assert (message.ranges == number).all()
-        kept.append(message)
+    for begin in range(0, 24, waiting):
+        sent = [scan(number, sizes[number % 11]) for number in range(begin, begin + waiting)]
+        assert all(map(publisher.publish, sent))
+        for expected in sent:
+            kept.append(subscriber.recv(SOON_S))
+            assert kept[-1] == expected
         del kept[:-2]
     assert subscriber.counters.lost == 0
-    del kept, message
+    kept.clear()
     wait_for(lambda: len(shared_mappings()) < 12)  # the small ones are given up
-
-
-def test_growing_while_messages_wait(node):
-    """What lies in an older ring is still delivered."""
-    publisher, subscriber = connected(node, Scan, keep_last(64))
-    sizes = [5_000, 50_000, 500_000]
-    for number, size in enumerate(sizes):
-        assert publisher.publish(scan(number, size))
-    for number, size in enumerate(sizes):
-        message = subscriber.recv(SOON_S)
-        assert (message.stamp_ns, len(message.ranges)) == (number, size)
-    assert subscriber.counters.lost == 0
 
 
 def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
@@ -225,21 +184,19 @@ def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
     size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
     publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
     monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
-    ring, count, results = publisher._fanout.ring._ring, 0, []
+    ring, count = publisher._fanout.ring._ring, 0
     while ring.patience(64) < 0:  # less than a frame that names a slot would find
         publisher.publish(scan(1, 3_000 if ring.patience(13_000) < 0 else 1))
         count += 1
     slots = ring.slots
-    thread = threading.Thread(target=lambda: results.append(publisher.publish(scan(2, size))))
-    thread.start()
-    wait_for(lambda: publisher._back_pressure.is_waiting)
-    other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
-    assert other.wait_for_publisher(timeout_s=SOON_S)
-    for _ in range(count):
-        assert subscriber.recv(SOON_S).stamp_ns == 1
-    assert subscriber.recv(SOON_S) == scan(2, size)
-    thread.join(SOON_S)
-    assert results == [True]
+    with Beside(publisher.publish, scan(2, size)) as waiting:
+        wait_for(lambda: publisher._back_pressure.is_waiting)
+        other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
+        assert other.wait_for_publisher(timeout_s=SOON_S)
+        for _ in range(count):
+            assert subscriber.recv(SOON_S).stamp_ns == 1
+        assert subscriber.recv(SOON_S) == scan(2, size)
+    assert waiting.results == [True]
     assert publisher.publish(scan(3, size))
     assert other.recv(SOON_S) in (scan(2, size), scan(3, size))
     assert ring.slots > slots
@@ -266,25 +223,14 @@ def test_memory_stays_flat(node):
     assert resident() - before < 8 << 20  # 1 kB each would be 12 MB; one large one leaked in eight, 300 MB
 
 
-# Without shared memory
-
-
 def test_a_reader_without_shared_memory(node, monkeypatch):
     """It gets the same bytes; one that can share goes on sharing."""
     publisher, sharing = connected(node, Scan, reliable(8, 60.0))
-    publisher.publish(scan(0))
-    assert is_shared(sharing.recv(SOON_S))
-
     with monkeypatch.context() as patch:
         patch.setattr(cortex.link, "native", None)
         plain = node.subscriber("/large", Scan, policy=reliable(8, 60.0))
         assert publisher.wait_for_subscribers(2, SOON_S)
         assert plain.wait_for_publisher(SOON_S)
-        wait_for(lambda: publisher.publish(scan(1)) and _try(plain))
-    publisher.publish(scan(-1))
-    for subscriber in (sharing, plain):
-        while subscriber.recv(SOON_S).stamp_ns != -1:
-            pass
     for number, size in enumerate((10, LARGE, 5_000, 10, 300_000)):
         publisher.publish(scan(number, size))
         first, second = sharing.recv(SOON_S), plain.recv(SOON_S)
@@ -292,13 +238,6 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
         assert is_shared(first) == (size > 4096)
         assert not second.ranges.flags.writeable
     assert plain.counters.rejected == 0
-
-
-def _try(subscriber):
-    try:
-        return subscriber.recv(0.005)
-    except TimeoutError:
-        return None
 
 
 def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
@@ -359,13 +298,13 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     for _ in range(60):
         publisher.publish(message)
     assert sum(publisher._fanout.large.waiting_bytes.values()) <= 80 << 20
-    counters = subscriber.counters
 
     def has_caught_up():
         publisher.publish(scan(1, 10))
-        return any(scan.stamp_ns == 1 for scan in iter(lambda: _try(subscriber), None))
+        return 1 in [message.stamp_ns for message in take_all(subscriber)]
 
     wait_for(has_caught_up)
+    counters = subscriber.counters
     assert counters.received > 1
     assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
@@ -374,11 +313,13 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
     """Not each large message, nor with each new reader; it goes on when it reads, and counts what it lost."""
     monkeypatch.setattr(cortex.link, "native", None)
     publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
-    waits = []
-    wait = publisher._back_pressure.wait_for
-    monkeypatch.setattr(
-        publisher._back_pressure, "wait_for", lambda *arguments: waits.append(wait(*arguments)) or waits[-1]
-    )
+    waits, wait_for_room = [], publisher._back_pressure.wait_for
+
+    def wait(*arguments):
+        waits.append(wait_for_room(*arguments))
+        return waits[-1]
+
+    monkeypatch.setattr(publisher._back_pressure, "wait_for", wait)
     with monkeypatch.context() as still:
         still.setattr(subscriber, "top_up", lambda now_ns: None)
         delivered = [publisher.publish(scan(number, 250_000)) for number in range(25)]
@@ -390,17 +331,16 @@ def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch)
     received = []
 
     def goes_on():
-        if publisher.publish(scan(len(delivered), 250_000)):
-            return True
-        delivered.append(False)
-        received.extend(scan.stamp_ns for scan in iter(lambda: _try(subscriber), None))
+        delivered.append(publisher.publish(scan(len(delivered), 250_000)))
+        received.extend(message.stamp_ns for message in take_all(subscriber))
+        return delivered[-1]
 
     wait_for(goes_on)
-    last = len(delivered)
-    while not received or received[-1] < last:
-        received.append(subscriber.recv(SOON_S).stamp_ns)
+    wait_for(
+        lambda: received.extend(m.stamp_ns for m in take_all(subscriber)) or len(delivered) - 1 in received
+    )
     assert received == sorted(set(received))
-    assert len(received) + subscriber.counters.lost == last + 1
+    assert accounted(subscriber.counters) == len(delivered)
 
 
 def fill_slots(publisher):
@@ -475,20 +415,14 @@ def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, m
         poor.setattr(publisher._fanout.ring, "acquire", refuse)
         with pytest.raises(MemoryError):
             publisher.publish(scan(0))
-    sent = []
-    thread = threading.Thread(target=lambda: sent.append(publisher.publish(scan(1))), daemon=True)
-    thread.start()
-    thread.join(SOON_S)
-    assert sent == [True]
+    assert Beside(publisher.publish, scan(1)).join() == [True]
     assert subscriber.recv(SOON_S).stamp_ns == 1
     assert subscriber.counters.lost == 0
 
 
-# Loans
-
-
 @pytest.mark.parametrize("size", [3, LARGE])
 def test_a_loan_is_published_when_it_ends(node, size):
+    """Or by another thread; once."""
     publisher, subscriber = connected(node, Scan, keep_last())
     with publisher.loan(n=size) as draft:
         draft.stamp_ns = 5
@@ -498,7 +432,17 @@ def test_a_loan_is_published_when_it_ends(node, size):
     message, info = subscriber.recv_with_info(SOON_S)
     assert (message.stamp_ns, info.stamp_ns, info.sequence) == (5, 5, 0)
     np.testing.assert_array_equal(message.ranges, np.arange(size, dtype=np.float32))
-    assert publisher.counters.published == 1
+    loan, sent = publisher.try_loan(n=size), []
+    loan.draft.stamp_ns, loan.draft.ranges[:] = 4, 4.0
+    thread = threading.Thread(target=lambda: sent.append(loan.publish()))
+    thread.start()
+    thread.join()
+    assert sent == [True]
+    assert subscriber.recv(SOON_S) == scan(4, size)
+    with pytest.raises(RuntimeError, match="published or dropped before"):
+        loan.publish()
+    loan.drop()  # nothing is left to be given back
+    assert publisher.counters.published == 2
 
 
 @pytest.mark.parametrize("size", [3, LARGE])
@@ -528,11 +472,9 @@ def test_several_loans_at_once(node):
     """Numbers are given when they are published; another message may go in between."""
     publisher, subscriber = connected(node, Scan, keep_last())
     with publisher.loan(n=LARGE) as first:
-        first.stamp_ns = 1
-        first.ranges[:] = 1.0
+        first.stamp_ns, first.ranges[:] = 1, 1.0
         with publisher.loan(n=LARGE) as second:
-            second.stamp_ns = 2
-            second.ranges[:] = 2.0
+            second.stamp_ns, second.ranges[:] = 2, 2.0
             publisher.publish(scan(3))
             publisher.publish(scan(4, 10))
     received = [subscriber.recv_with_info(SOON_S) for _ in range(4)]
@@ -541,44 +483,118 @@ def test_several_loans_at_once(node):
     assert all((message.ranges == message.stamp_ns).all() for message, _ in received)
 
 
-@pytest.mark.parametrize("size", [3, LARGE])
-def test_a_loan_may_be_published_by_another_thread(node, size):
-    publisher, subscriber = connected(node, Scan, keep_last())
-    loan = publisher.try_loan(n=size)
-    loan.draft.ranges[:] = 3.0
-    loan.draft.stamp_ns = 4
-    sent = []
-    thread = threading.Thread(target=lambda: sent.append(loan.publish()))
-    thread.start()
-    thread.join()
-    message = subscriber.recv(SOON_S)
-    assert sent == [True]
-    assert message.stamp_ns == 4
-    assert (message.ranges == 3.0).all()
-    with pytest.raises(RuntimeError, match="published or dropped before"):
-        loan.publish()
-    loan.drop()  # nothing is left to be given back
-    assert publisher.counters.published == 1
-
-
 def test_too_many_loans(node):
     publisher, subscriber = connected(node, Scan, keep_last(64))
-    loans = []
-
-    def hoard():
-        while len(loans) < 200:
-            loan = publisher.loan(n=1_000_000)
-            loan.__enter__()
-            loans.append(loan)
-
-    with pytest.raises(RuntimeError, match="every slot is out on loan"):
-        hoard()
-    assert len(loans) >= 3
-    for loan in loans:
-        assert not loan.__exit__(KeyError, KeyError("no"), None)
+    with contextlib.ExitStack() as loans:
+        with pytest.raises(RuntimeError, match="every slot is out on loan"):
+            deque(loans.enter_context(publisher.loan(n=1_000_000)) for _ in range(200))
+        loans.pop_all().__exit__(KeyError, KeyError("no"), None)
     with publisher.loan(n=1_000_000) as draft:
-        draft.stamp_ns = 9
-        draft.ranges[:] = 9.0
+        draft.stamp_ns, draft.ranges[:] = 9, 9.0
     message, info = subscriber.recv_with_info(SOON_S)
     assert message.stamp_ns == 9
     assert info.sequence == subscriber.counters.lost  # a loan that was refused may count as skipped
+
+
+EXPECTED = 400_000
+
+
+def slots_of(publisher):
+    """Number and size of a publisher's slots; None if there is no ring."""
+    with publisher._pub_sockets.lock:
+        ring = publisher._fanout.ring._ring
+        return None if ring is None else (ring.slots, ring.slot_bytes)
+
+
+@pytest.mark.parametrize("policy", [latest(), keep_last(), keep_last(256), reliable()])
+def test_messages_find_the_memory_that_was_made_before_them(node, policy):
+    """When a reader came; larger ones than expected get their own, and small ones need none."""
+    publisher = node.publisher("/large", Scan, expected_bytes=EXPECTED)
+    small = node.publisher("/small", Scan, expected_bytes=1000)
+    assert slots_of(publisher) is None  # nobody listens
+    subscriber, other = (node.subscriber(topic, Scan, policy=policy) for topic in ("/large", "/small"))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert small.wait_for_subscribers(timeout_s=SOON_S)
+    made = slots_of(publisher)
+    assert made[1] >= EXPECTED
+    for number, size in enumerate((20_000, 100_000, 30_000, 300_000, EXPECTED - 4096, 3 * EXPECTED)):
+        publisher.publish(scan(number, size // 4))
+        assert subscriber.recv(SOON_S) == scan(number, size // 4)
+        assert (slots_of(publisher) == made) == (size < EXPECTED)
+    assert slots_of(publisher)[1] >= 3 * EXPECTED
+    small.publish(scan(1, 100))
+    assert other.recv(SOON_S).stamp_ns == 1
+    assert slots_of(small) == (0, 0)
+
+
+def test_one_reader_more_is_given_its_share_when_it_comes(node):
+    """A share is two slots: more readers need more, and who is there already is told of the new ring."""
+    publisher = node.publisher("/large", Scan, expected_bytes=3_000_000)
+    subscribers = []
+    for count in range(1, 4):
+        subscribers.append(node.subscriber("/large", Scan, policy=reliable()))
+        assert publisher.wait_for_subscribers(count, timeout_s=SOON_S)
+        made = slots_of(publisher)
+        assert made[0] >= 2 * count + 2
+        publisher.publish(scan(count, 2_900_000 // 4))
+        for subscriber in subscribers:
+            message = subscriber.recv(SOON_S)
+            assert (message.stamp_ns, message.ranges.nbytes) == (count, 2_900_000)
+            del message
+        assert slots_of(publisher) == made
+
+
+def test_what_is_not_as_usual_goes_the_long_way(node):
+    """Another class, a wrong dtype, an array that is not contiguous: the same words, and no slot is lost."""
+    publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
+    for number in range(3):
+        publisher.publish(scan(number))
+        subscriber.recv(SOON_S)
+    with pytest.raises(TypeError, match="carries Scan"):
+        publisher.publish(make_block(0, 100_000))
+    with pytest.raises(TypeError, match="float64"):
+        publisher.publish(Scan(1, np.zeros(100_000)))
+    with pytest.raises((TypeError, ValueError), match="stamp_ns"):
+        publisher.publish(Scan("soon", np.zeros(100_000, np.float32)))
+    assert publisher.publish(Scan(5, np.arange(200_000, dtype=np.float32)[::2]))
+    message = subscriber.recv(SOON_S)
+    assert message.stamp_ns == 5
+    assert (message.ranges == np.arange(0, 200_000, 2)).all()
+    del message
+    wait_for(lambda: slots_held(publisher) == 0)
+
+
+def test_publishers_in_several_threads(node):
+    """Messages copied with and without the lock, small ones between them: each arrives once, in order."""
+    publisher, subscriber = connected(node, Block, reliable(64, 60.0))
+    sizes, count, threads = (10, 40_000, 200_000, 600_000), 40, 4
+    made = [[make_block(1000 * k + n, sizes[(n + k) % 4]) for n in range(count)] for k in range(threads)]
+    workers = [Beside(lambda blocks: all(map(publisher.publish, blocks)), blocks) for blocks in made]
+    seen = []
+    for _ in range(count * threads):
+        block = subscriber.recv(SOON_S)
+        assert is_whole(block)
+        seen.append(block.number)
+    assert all(worker.join() == [True] for worker in workers)
+    for k in range(threads):
+        assert [number % 1000 for number in seen if number // 1000 == k] == list(range(count))
+    assert (subscriber.counters.received, subscriber.counters.lost) == (count * threads, 0)
+    assert publisher.counters.published == count * threads
+
+
+def test_closing_while_others_publish(node):
+    """The memory stays as long as somebody copies into it."""
+    message = scan(1, 1_000_000)
+
+    def publish(publisher):
+        with contextlib.suppress(Closed):
+            while True:
+                publisher.publish(message)
+
+    for _ in range(10):
+        publisher, subscriber = connected(node, Scan, keep_last(4))
+        with Beside(publish, publisher):
+            subscriber.recv(SOON_S)
+            time.sleep(0.003)
+            publisher.close(linger_s=0.0)
+        subscriber.close()

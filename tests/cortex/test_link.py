@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
 import random
 import struct
 
-import numpy as np
 import pytest
 import zmq
 from damage import mutate
-from peer import Number, Scan
+from peer import Number, Scan, make, take_all
 from processes import SOON_S, wait_for
 
 from cortex import keep_last
@@ -97,12 +97,7 @@ class Feed:
         return pack_header(Header(kind, self.SOURCE, self.codec.fingerprint, self.sequence, 0, 0, size, aux))
 
     def body(self, value):
-        made = (
-            Number(value, value) if self.codec.type is Number else Scan(value, np.full(9, value, np.float32))
-        )
-        body = self.codec.encode(made, 1 << 20)
-        assert body is not None
-        return body
+        return self.codec.encode(make(self.codec.type, value, 36), 1 << 20)
 
     def frames(self, kind, value):
         """A good message of a kind, as its frames."""
@@ -126,12 +121,7 @@ class Feed:
             self.ring.send(frames[0])
 
     def drain(self):
-        taken = []
-        while True:
-            try:
-                taken.append(self.subscriber.recv(0.0).stamp_ns)
-            except TimeoutError:
-                return taken
+        return [message.stamp_ns for message in take_all(self.subscriber)]
 
     def still_lives(self, value):
         """The next good messages arrive, one of each kind."""
@@ -146,42 +136,29 @@ class Feed:
             self.ring.close()
 
 
-@pytest.fixture(params=[Number, Scan], ids=lambda kind: kind.__name__)
-def feed(request, runtime):
-    """A link to a publisher of either type."""
-    made = Feed(request.param)
-    yield made
-    made.close()
+@pytest.fixture
+def make_feed(runtime, tmp_path):
+    """Makes links to a publisher of a type, and closes them."""
+    with contextlib.ExitStack() as feeds:
+
+        def made(kind, *, through="socket"):
+            return feeds.enter_context(
+                contextlib.closing(Feed(kind, tmp_path if through == "ring" else None))
+            )
+
+        yield made
 
 
-def test_the_feed_is_what_a_publisher_sends(runtime):
-    """Without this the tests below could pass by rejecting everything."""
-    feed = Feed(Number)
-    try:
-        feed.still_lives(7)
-        counters = feed.subscriber.counters
-        assert (counters.received, counters.lost, counters.rejected) == (2, 0, 0)
-    finally:
-        feed.close()
-
-
-BAD = {
-    "short header": lambda f: [f.header(MESSAGE, 0)[:40]],
+BAD = {  # beside what `cortex/vectors/frames.json` has
     "only the prefix": lambda f: [f.header(MESSAGE, 0)[:24]],
-    "wrong fingerprint": lambda f: [_with(f.frames(MESSAGE, 1)[0], 16, "<Q", 12345)],
-    "body too short": lambda f: [f.frames(MESSAGE, 1)[0][:-1]],
-    "body too long": lambda f: [f.frames(MESSAGE, 1)[0] + b"x"],
     "size over the limit": lambda f: [_with(f.frames(MESSAGE, 1)[0], 48, "<Q", BODY_LIMIT + 1)],
     "empty body": lambda f: [f.header(MESSAGE, 0)],
     "large without body": lambda f: [f.header(LARGE, 10)],
     "large of another size": lambda f: [f.header(LARGE, 10), b"123"],
     "large over the limit": lambda f: [f.header(LARGE, BODY_LIMIT + 1), b"123"],
     "large that does not decode": lambda f: [f.header(LARGE, 5), b"12345"],
-    "next with a body": lambda f: [f.header(NEXT, 8) + bytes(8)],
     "next with a body that it does not say": lambda f: [f.header(NEXT, 0) + bytes(8)],
     "next from nowhere": lambda f: [_with(f.frames(NEXT, 1)[0], 24, "<Q", 2**63)],
-    "answer with more than it says": lambda f: [f.answer + b"x"],
-    "answer cut short": lambda f: [f.answer[:50]],
 }
 
 
@@ -192,47 +169,42 @@ def _with(frame, offset, form, value):
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
-    feed = Feed(Number)
+def test_a_bad_frame_is_rejected_counted_and_logged_once(make_feed, name, caplog):
+    feed = make_feed(Number)
+    counters = feed.subscriber.counters
+    feed.still_lives(7)
+    assert (counters.received, counters.lost, counters.rejected) == (2, 0, 0)
     caplog.set_level(logging.DEBUG)
-    try:
-        for _ in range(3):
-            feed.sequence += 1
-            feed.socket.send_multipart(BAD[name](feed))
-            assert feed.drain() == []
-        counters = feed.subscriber.counters
-        assert counters.rejected >= 3
-        assert counters.received == 0
-        logged = [record for record in caplog.records if record.name == "cortex.link"]
-        assert len(logged) == 1, logged
-        assert logged[0].levelno == logging.WARNING
-        assert "/feed" in logged[0].getMessage()
-        feed.still_lives(8)
-    finally:
-        feed.close()
+    for _ in range(3):
+        feed.sequence += 1
+        feed.socket.send_multipart(BAD[name](feed))
+        assert feed.drain() == []
+    assert counters.rejected >= 3
+    assert counters.received == 2
+    (logged,) = [record for record in caplog.records if record.name == "cortex.link"]
+    assert logged.levelno == logging.WARNING
+    assert "/feed" in logged.getMessage()
+    feed.still_lives(8)
 
 
-def test_a_latched_message_that_is_none_is_rejected(runtime):
-    feed = Feed(Number)
-    try:
-        body = feed.body(3)
-        good = pack_header(Header(MESSAGE, feed.SOURCE, feed.codec.fingerprint, 4, 3, 0, len(body), 0)) + body
-        for latched in (b"x", good[:-1], _with(good, 8, "<Q", 1), _with(good, 16, "<Q", 1), good[:70]):
-            feed.link.expected, feed.link.attached = -1, False
-            feed.socket.send(answer_frame(feed.key, AttachAnswer(5, latched)))
-            assert feed.drain() == []
-        assert feed.subscriber.counters.rejected == 5
+def test_a_latched_message_that_is_none_is_rejected(make_feed):
+    feed = make_feed(Number)
+    body = feed.body(3)
+    good = pack_header(Header(MESSAGE, feed.SOURCE, feed.codec.fingerprint, 4, 3, 0, len(body), 0)) + body
+    bad = (b"x", good[:-1], _with(good, 8, "<Q", 1), _with(good, 16, "<Q", 1), good[:70])
+    for latched in (*bad, good):
         feed.link.expected, feed.link.attached = -1, False
-        feed.socket.send(answer_frame(feed.key, AttachAnswer(5, good)))
-        assert feed.drain() == [3]
-        assert feed.link.expected == 5
-    finally:
-        feed.close()
+        feed.socket.send(answer_frame(feed.key, AttachAnswer(5, latched)))
+        assert feed.drain() == ([3] if latched == good else [])
+    assert feed.subscriber.counters.rejected == 5
+    assert feed.link.expected == 5
 
 
+@pytest.mark.parametrize("kind", [Number, Scan])
 @pytest.mark.parametrize("jump", [2**48, 2**63, 2**64 - 1])
-def test_a_number_from_nowhere_does_not_end_the_stream(feed, jump):
+def test_a_number_from_nowhere_does_not_end_the_stream(make_feed, kind, jump):
     """A frame with an absurd sequence is not believed: or all that follow would count as seen before."""
+    feed = make_feed(kind)
     feed.still_lives(1)
     feed.socket.send(_with(feed.frames(MESSAGE, 2)[0], 24, "<Q", jump))
     feed.drain()
@@ -240,30 +212,22 @@ def test_a_number_from_nowhere_does_not_end_the_stream(feed, jump):
     assert feed.subscriber.counters.lost < 2**40
 
 
-@pytest.mark.parametrize(
-    "through", ["socket", pytest.param("ring", marks=pytest.mark.skipif(native is None, reason="no C"))]
-)
-@pytest.mark.parametrize("type_", [Number, Scan])
-def test_mutated_frames_never_hurt(runtime, tmp_path, type_, through):
+@pytest.mark.parametrize("through", ["socket", "ring"])
+@pytest.mark.parametrize("kind", [Number, Scan])
+def test_mutated_frames_never_hurt(make_feed, kind, through):
     """Whatever comes, the next good message arrives."""
-    feed = Feed(type_, tmp_path if through == "ring" else None)
-    rng = random.Random(1)
+    feed, rng = make_feed(kind, through=through), random.Random(1)
     kinds = (MESSAGE, LARGE, NEXT, ATTACH) if through == "socket" else (MESSAGE, SLOT, NEXT, ATTACH)
-    try:
-        for count in range(FRAMES // 4):
-            kind = kinds[count % len(kinds)]
-            frames = feed.frames(kind, 5)
-            place, number = rng.randrange(len(frames)), frames[0][24:32]
-            frames[place] = mutate(rng, frames[place])
-            if len(frames[0]) >= 32:  # not the number: a message with another number is a message
-                frames[0] = frames[0][:24] + number + frames[0][32:]
-            if kind != ATTACH and rng.random() < 0.2:
-                frames.insert(rng.randrange(len(frames) + 1), rng.randbytes(8))
-            feed.send(frames)
-            feed.drain()
-            if count % 8 == 7:
-                feed.still_lives(6)
-        feed.still_lives(6)
-        assert feed.subscriber.counters.rejected > FRAMES // 40
-    finally:
-        feed.close()
+    for count in range(FRAMES // 4):
+        frames = feed.frames(kinds[count % 4], 5)
+        place, number = rng.randrange(len(frames)), frames[0][24:32]
+        frames[place] = mutate(rng, frames[place])
+        if len(frames[0]) >= 32:  # not the number: a message with another number is a message
+            frames[0] = frames[0][:24] + number + frames[0][32:]
+        if kinds[count % 4] != ATTACH and rng.random() < 0.2:
+            frames.insert(rng.randrange(len(frames) + 1), rng.randbytes(8))
+        feed.send(frames)
+        feed.drain()
+        if count % 8 == 7:
+            feed.still_lives(6)
+    assert feed.subscriber.counters.rejected > FRAMES // 40

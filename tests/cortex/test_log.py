@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import itertools
 import json
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,20 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from peer import Block as Large
 from peer import Number, OtherNumber, Scan, is_whole, make_block
-from processes import ROOT, SOON_S, wait_for
+from processes import SOON_S, wait_for
 
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
-from cortex.log import Log, LogError, Player, Recorder, TopicStats, open_log
+from cortex.log import Log, LogError, LogWriter, Player, Recorder, TopicStats, open_log
 from cortex.log.format import CHUNK_BYTES
+from cortex.log.writer import Sink
 from cortex.schema import Schema, schema_of
 
 MakeNode = Callable[..., Node]
-
-
-@pytest.fixture
-def node(make_node):
-    """A node that knows only itself, so that no registry has to start."""
-    return make_node("alone", registry="off")
 
 
 def numbers(log: Log, **options: object) -> list[int]:
@@ -76,17 +70,17 @@ def test_what_is_recorded_can_be_read(node, tmp_path):
     with open_log(path) as log:
         assert log.cut == ""
         assert [(t.topic, t.schema, t.message_count, t.nodes) for t in log.topics] == [
-            ("/block", schema_of(Large), 5, ("alone",)),
-            ("/number", schema_of(Number), 100, ("alone",)),
+            ("/block", schema_of(Large), 5, ("node",)),
+            ("/number", schema_of(Number), 100, ("node",)),
         ]
-        assert log.start["node"] == "alone"
+        assert log.start["node"] == "node"
         assert json.loads(log.end["/number"]) == {
             "written": 100, "bytes": 1600, "lost": 0, "overtaken": 0, "rejected": 0, "cut_off": 0,
         }  # fmt: skip
         typed = list(log.messages(types={"/number": Number}))
         assert [message for _, message, _ in typed] == [Number(10**18 + i, i) for i in range(100)]
         for i, (topic, _, info) in enumerate(typed):
-            assert (topic, info.topic, info.node) == ("/number", "/number", "alone")
+            assert (topic, info.topic, info.node) == ("/number", "/number", "node")
             assert (info.sequence, info.stamp_ns, info.size) == (i, 10**18 + i, 16)
             assert info.source == number.source
             assert before_ns - 10**6 <= info.publish_ns <= info.log_ns <= after_ns + 10**6
@@ -109,11 +103,9 @@ def test_other_tools_can_read_the_file(node, tmp_path):
             publisher.publish(Number(i, i))
         wait_for(lambda: recorder.stats.written == 1000)
     with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        seen = [(schema, channel, message) for schema, channel, message in reader.iter_messages()]
+        seen = list(make_reader(file, validate_crcs=True).iter_messages())
     assert [message.sequence for _, _, message in seen] == list(range(1000))
     schema, channel, _ = seen[0]
-    assert schema is not None
     assert Schema.from_json(schema.data.decode()) == schema_of(Number)
     assert (channel.message_encoding, schema.encoding) == ("cortex", "cortex-json")
     assert channel.metadata["fingerprint"] == f"{schema_of(Number).fingerprint:016x}"
@@ -141,29 +133,28 @@ def test_a_busy_topic_is_recorded_without_loss(node, tmp_path, compression):
 def test_all_topics_are_recorded_also_those_that_come_later(make_node, tmp_path):
     path = tmp_path / "run.mcap"
     robot, logger = make_node("robot"), make_node("logger")
-    first = robot.publisher("/first", Number)
+
+    def publish(node, topic, message):
+        publisher = node.publisher(topic, type(message))
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        publisher.publish(message)
+        return publisher
+
+    robot.publisher("/first", Number)
     with Recorder(logger, path) as recorder:
-        assert first.wait_for_subscribers(timeout_s=SOON_S)
-        first.publish(Number(1, 1))
-        second = make_node("late").publisher("/second", Scan)
-        assert second.wait_for_subscribers(timeout_s=SOON_S)
-        second.publish(Scan(2, np.ones(3, np.float32)))
-        first.close()
-        again = robot.publisher("/first", Number)  # has another number, and counts from 0 again
-        assert again.wait_for_subscribers(timeout_s=SOON_S)
-        again.publish(Number(3, 3))
-        other = robot.publisher("/first", OtherNumber)
-        assert other.wait_for_subscribers(timeout_s=SOON_S)
-        other.publish(OtherNumber(4, 0.5))
+        publish(robot, "/first", Number(1, 1)).close()
+        publish(make_node("late"), "/second", Scan(2, np.ones(3, np.float32)))
+        publish(robot, "/first", Number(3, 3))  # has another number, and counts from 0 again
+        publish(robot, "/first", OtherNumber(4, 0.5))
         wait_for(lambda: recorder.stats.written == 4)
     with open_log(path) as log:
         found = {
-            (t.topic, t.schema.name, t.schema.fingerprint): (t.message_count, t.nodes) for t in log.topics
+            (t.topic, t.schema.fingerprint): (t.schema.name, t.message_count, t.nodes) for t in log.topics
         }
         assert found == {
-            ("/first", "Number", schema_of(Number).fingerprint): (2, ("robot",)),
-            ("/first", "Number", schema_of(OtherNumber).fingerprint): (1, ("robot",)),
-            ("/second", "Scan", schema_of(Scan).fingerprint): (1, ("late",)),
+            ("/first", schema_of(Number).fingerprint): ("Number", 2, ("robot",)),
+            ("/first", schema_of(OtherNumber).fingerprint): ("Number", 1, ("robot",)),
+            ("/second", schema_of(Scan).fingerprint): ("Scan", 1, ("late",)),
         }
         infos = [info for info, _, _ in log.raw(["/first"])]
         assert [info.sequence for info in infos] == [0, 0, 0]
@@ -174,7 +165,7 @@ def test_all_topics_are_recorded_also_those_that_come_later(make_node, tmp_path)
 
 def test_a_node_that_closes_first_ends_the_recording_in_order(make_node, tmp_path):
     path = tmp_path / "run.mcap"
-    node = make_node("alone", registry="off")
+    node = make_node(registry="off")
     publisher = node.publisher("/number", Number)
     recorder = Recorder(node, path)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
@@ -192,24 +183,21 @@ def test_best_effort_counts_what_it_loses(node, tmp_path):
     """Everything that was published is either in the file or counted."""
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
+    sent = itertools.count()
     with Recorder(node, path, ["/number"], policy=keep_last(4)) as recorder:
         assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-        for i in range(30_000):
-            publisher.publish(Number(i, i))
-        published = 30_000
+        for _ in range(30_000):
+            publisher.publish(Number(0, next(sent)))
 
         def is_complete() -> bool:
-            nonlocal published
-            stats = recorder.stats
-            if stats.written + stats.lost == published:
+            if recorder.stats.written + recorder.stats.lost == publisher.counters.published:
                 return True
-            publisher.publish(Number(published, published))  # shows the gap before it
-            published += 1
+            publisher.publish(Number(0, next(sent)))  # shows the gap before it
             return False
 
         wait_for(is_complete, every_s=0.05)
     with open_log(path) as log:
-        values = numbers(log)
+        values, published = numbers(log), publisher.counters.published
         assert values == sorted(set(values))
         assert values[-1] == published - 1
         ended = json.loads(log.end["/number"])
@@ -231,71 +219,18 @@ def test_a_publisher_that_was_killed_is_counted(make_node, tmp_path, start_child
         assert numbers(log) == list(range(10))
 
 
-# Files that were cut off or damaged
-
-RECORD = """
-import sys, time, resource
-from cortex import Node, reliable
-from cortex.log import Recorder
-from peer import Number
-limit = int(sys.argv[2])
-if limit:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-with Node("child", registry="off") as node:
-    publisher = node.publisher("/number", Number)
-    recorder = Recorder(node, sys.argv[1])
-    publisher.wait_for_subscribers(timeout_s=60.0)
-    number = 0
-    while recorder.running:
-        publisher.publish(Number(time.monotonic_ns(), number))
-        number += 1
-        if number % 10 == 0:
-            print(number, flush=True)
-            time.sleep(1e-3)
-    try:
-        recorder.close()
-    except OSError as error:
-        print(recorder.stats.written, recorder.stats.unwritten, error.errno, error, flush=True)
-"""
-
-
-@pytest.fixture
-def recording_child(runtime, tmp_path):
-    children: list[subprocess.Popen[str]] = []
-
-    def start(limit: int) -> subprocess.Popen[str]:
-        path = os.pathsep.join((str(ROOT), str(ROOT / "tests" / "cortex")))
-        child = subprocess.Popen(
-            [sys.executable, "-c", RECORD, str(tmp_path / "run.mcap"), str(limit)],
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "PYTHONPATH": path},
-        )
-        children.append(child)
-        return child
-
-    yield start
-    for child in children:
-        child.kill()
-        child.wait(SOON_S)
-        assert child.stdout is not None
-        child.stdout.close()
-
-
-def test_a_killed_recorder_leaves_all_but_the_last_second(recording_child, tmp_path):
+def test_a_killed_recorder_leaves_all_but_the_last_second(start_child, tmp_path):
     path = tmp_path / "run.mcap"
 
     def missing_ns() -> int:
         path.unlink(missing_ok=True)
-        child = recording_child(0)
-        assert child.stdout is not None
-        child.stdout.readline()
+        child = start_child("recorder", path=str(path))
+        child.line()
         began = path.stat().st_size
         wait_for(lambda: path.stat().st_size > began)
         time.sleep(0.4)  # the worst moment: just before the next flush
         killed_ns = time.monotonic_ns()
-        child.send_signal(signal.SIGKILL)
-        child.wait(SOON_S)
+        child.kill()
         assert path.stat().st_size < CHUNK_BYTES  # so it was time, not size, that brought it into the file
         with open_log(path) as log:
             assert log.cut.startswith("it was not closed")
@@ -308,23 +243,22 @@ def test_a_killed_recorder_leaves_all_but_the_last_second(recording_child, tmp_p
     wait_for(lambda: missing_ns() < 1_000_000_000)  # a machine that stands still makes it more at times
 
 
-def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(recording_child, tmp_path):
+def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(start_child, tmp_path):
     """RLIMIT_FSIZE stands for the full disk: a write fails in the middle."""
     path = tmp_path / "run.mcap"
-    child = recording_child(300_000)
-    output, _ = child.communicate(timeout=SOON_S)
-    assert child.returncode == 0
-    written, unwritten, errno, text = output.splitlines()[-1].split(maxsplit=3)
-    assert "File too large" in text
-    assert f"{unwritten} messages that had arrived are not in the file" in text
-    assert str(path) in text
-    assert int(errno) > 0
+    child = start_child("recorder", path=str(path), limit_file_bytes=300_000)
+    while "error" not in (said := json.loads(child.line())):
+        pass
+    child.finish()
+    assert "File too large" in said["error"]
+    assert f"{said['unwritten']} messages that had arrived are not in the file" in said["error"]
+    assert str(path) in said["error"]
+    assert said["errno"] > 0
     assert path.stat().st_size <= 300_000
     with open_log(path) as log:
-        values = numbers(log)
         assert log.cut == "it was not closed"  # nothing is torn
-        assert values == list(range(int(written)))
-        assert int(unwritten) >= 0  # none, if it is the index of what was written that failed
+        assert numbers(log) == list(range(said["written"]))
+    assert said["unwritten"] >= 0  # none, if it is the index of what was written that failed
 
 
 @pytest.mark.parametrize("where", ["_flush_old", "add_message"])
@@ -383,9 +317,8 @@ def test_a_file_can_be_cut_anywhere(sample, tmp_path):
 
 def test_a_damaged_summary_is_passed_over(sample, tmp_path):
     """The messages are still whole; the file is walked through to find them."""
-    data = bytearray(sample.read_bytes())
+    data, path = bytearray(sample.read_bytes()), tmp_path / "damaged.mcap"
     data[-100] ^= 1
-    path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     with open_log(path) as log:
         assert log.cut == "its summary is missing or damaged"
@@ -444,9 +377,6 @@ def test_a_range_of_time_and_topics_is_read(tmp_path):
             next(log.raw(["/nothing"]))
 
 
-# Playing
-
-
 @pytest.fixture
 def recording(tmp_path):
     """50 messages, one every 10 ms."""
@@ -501,3 +431,32 @@ def test_what_was_latched_is_latched_again(node, tmp_path):
         assert log.topics[0].latch
         player.run()
         assert node.subscriber("/map", Number).recv(SOON_S) == Number(7, 7)
+
+
+def test_a_message_that_cannot_be_written_leaves_no_trace(tmp_path):
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for topic in ("/numbers", "/others"):
+            with pytest.raises(TypeError, match=r"Number\.value"):
+                log.write(topic, Number(0, "one"), 5)
+        log.write("/numbers", Number(0, 1), 10**18)
+    with open_log(path) as read:
+        assert [each.topic for each in read.topics] == ["/numbers"]
+        ((topic, message, info),) = read.messages()
+    assert (topic, message.value, info.sequence, info.log_ns) == ("/numbers", 1, 0, 10**18)
+
+
+def test_a_file_whose_end_does_not_fit_is_closed(tmp_path, monkeypatch):
+    """The error is that of the disk, and comes once."""
+    before = len(os.listdir("/proc/self/fd"))
+    log = LogWriter(tmp_path / "log.mcap")
+    log.write("/numbers", Number(0, 1), 5)
+
+    def refuse(self: Sink, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Sink, "write", refuse)
+    with pytest.raises(OSError, match="No space"):
+        log.close()
+    log.close()
+    assert len(os.listdir("/proc/self/fd")) == before

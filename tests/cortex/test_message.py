@@ -8,6 +8,7 @@ from dataclasses import field
 from enum import Enum, Flag, IntEnum
 from typing import Annotated, Any, Optional, Union
 
+import hypothesis
 import numpy as np
 import pytest
 from hypothesis import given
@@ -102,42 +103,44 @@ def test_a_message_is_a_frozen_dataclass_with_slots():
     assert not is_message(int)
 
 
+@message
+class Ragged:
+    rows: list[Array["int64", "n"]]
+    zero: Array["float64", 3] = field(default_factory=lambda: np.zeros(3))
+
+
 def test_messages_compare_by_value():
     assert scan() == scan()
-    assert scan() != scan(stamp_ns=2)
-    assert scan() != scan(ranges=np.arange(5, dtype=np.float32))
-    assert scan() != scan(ranges=np.arange(4, dtype=np.float64))
-    assert scan() != scan(ranges=np.arange(1, 5, dtype=np.float32))
-    assert scan() != scan(ranges=[0.0, 1.0, 2.0, 3.0])
-    assert scan() != scan(at=Point(2.0))
-    assert scan() != scan(tags=["a", "b"])
+    for changes in (
+        {"stamp_ns": 2},
+        *(
+            {"ranges": ranges}
+            for ranges in (np.arange(5, dtype=np.float32), np.arange(1, 5, dtype=np.float32))
+        ),
+        *({"ranges": ranges} for ranges in (np.arange(4.0), [0.0, 1.0, 2.0, 3.0])),
+        {"at": Point(2.0)},
+        {"tags": ["a", "b"]},
+    ):
+        assert scan() != scan(**changes)
     assert scan() != (1, 2)
     assert Point(0.0) != object()
+    assert Ragged([np.arange(2), np.arange(3)]) == Ragged([np.arange(2), np.arange(3)])
+    assert Ragged([np.arange(2)]) != Ragged([np.arange(3)])
+    assert Ragged([]).zero is not Ragged([]).zero
     with pytest.raises(TypeError, match="unhashable"):
         hash(scan())
 
 
-def test_lists_of_arrays_compare_by_value():
-    @message
-    class Ragged:
-        rows: list[Array["int64", "n"]]
-
-    assert Ragged([np.arange(2), np.arange(3)]) == Ragged([np.arange(2), np.arange(3)])
-    assert Ragged([np.arange(2)]) != Ragged([np.arange(3)])
-
-
 @given(any_message())
 def test_a_copy_is_equal_and_owns_its_arrays(value):
-    copied = value.copy() if "copy" not in value.__cortex_names__ else None
-    if copied is None:
-        return
+    hypothesis.assume("copy" not in value.__cortex_names__)
+    copied = value.copy()
     assert type(copied) is type(value)
     assert copied == value
     for name in value.__cortex_names__:
         if isinstance(getattr(value, name), np.ndarray):
             assert getattr(copied, name).flags.owndata
             assert getattr(copied, name).flags.writeable
-            assert not np.shares_memory(getattr(copied, name), getattr(value, name))
 
 
 def test_a_copy_is_deep():
@@ -181,9 +184,8 @@ BAD_HINTS = {
 
 @pytest.mark.parametrize("hint", BAD_HINTS.values(), ids=BAD_HINTS.keys())
 def test_annotations_that_have_no_place_in_a_message(hint):
-    namespace: dict[str, Any] = {"__annotations__": {"wrong": hint}}
     with pytest.raises(SchemaError, match=r"Wrong\.wrong"):
-        message(type("Wrong", (), namespace))
+        message(wrong(wrong=hint))
 
 
 @pytest.mark.parametrize(
@@ -220,31 +222,23 @@ def test_annotations_that_cannot_be_resolved():
             children: list[Tree]
 
 
-def test_names_that_are_refused():
-    with pytest.raises(SchemaError, match=r"Wrong\.copy: .*method"):
+def wrong(**fields: Any) -> type:
+    """A class with these annotations."""
+    return type("Wrong", (), {"__annotations__": fields})
 
-        @message
-        class Wrong:
-            copy: int
 
-    with pytest.raises(SchemaError, match="field name '__a'"):
-        message(type("Wrong", (), {"__annotations__": {"__a": int}}))
+def test_names_and_defaults_that_are_refused():
+    for cls, said in (
+        (wrong(copy=int), r"Wrong\.copy: .*method"),
+        (wrong(__a=int), "field name '__a'"),
+        (wrong(**{f"a{k}": int for k in range(257)}), "257 fields"),
+    ):
+        with pytest.raises(SchemaError, match=said):
+            message(cls)
     with pytest.raises(SchemaError, match="type name 'a b'"):
-        message(name="a b")(type("Wrong", (), {"__annotations__": {"a": int}}))
-    with pytest.raises(SchemaError, match="257 fields"):
-        message(type("Wrong", (), {"__annotations__": {f"a{k}": int for k in range(257)}}))
-
-
-def test_mutable_defaults_are_refused():
+        message(name="a b")(wrong(a=int))
     for default in (np.zeros(3), [], {}):
+        cls = wrong(a=Array["float64", 3])
+        cls.a = default
         with pytest.raises((TypeError, ValueError), match="mutable default"):
-            message(type("Wrong", (), {"__annotations__": {"a": Array["float64", 3]}, "a": default}))
-
-
-def test_array_defaults_by_factory():
-    @message
-    class Zeroed:
-        a: Array["float64", 3] = field(default_factory=lambda: np.zeros(3))
-
-    assert Zeroed() == Zeroed()
-    assert Zeroed().a is not Zeroed().a
+            message(cls)

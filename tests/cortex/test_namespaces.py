@@ -6,23 +6,20 @@ import contextlib
 import json
 import os
 import re
-import selectors
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cable import ADDRESSES, DEVICE, ip, two_hosts
-from processes import ROOT, SOON_S, Child
+from processes import ROOT, SOON_S, Child, Lines
 
-from cortex.security import AUTHORIZED_FILE, Keys, new_keys
+from cortex.security import AUTHORIZED_FILE, new_keys
 
 
 @pytest.fixture(scope="module")
@@ -40,78 +37,52 @@ def place():
     shutil.rmtree(path)
 
 
-class Process:
+class Process(Lines):
     """A program on one of the hosts; each host has a runtime directory of its own."""
 
     def __init__(self, host: str, place: Path, *arguments: str, prefix: Sequence[str] = (), **more: str):
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(ROOT),
-            "CORTEX_RUNTIME_DIR": str(place / host),
-            "PYTHONUNBUFFERED": "1",
-            **more,
+        own = {"PYTHONPATH": str(ROOT), "CORTEX_RUNTIME_DIR": str(place / host), "PYTHONUNBUFFERED": "1"}
+        pipes = {
+            "stdin": subprocess.PIPE,
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.STDOUT,
+            "bufsize": 0,
         }
-        self._process = subprocess.Popen(
-            ["ip", "netns", "exec", host, *prefix, sys.executable, *arguments],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            bufsize=0,  # what is buffered here, `select` does not see
-        )
-        self.said: list[str] = []
+        command = ["ip", "netns", "exec", host, *prefix, sys.executable, *arguments]
+        super().__init__(subprocess.Popen(command, env=os.environ | own | more, **pipes), host)
 
-    def read(self, pattern: str, timeout_s: float = SOON_S) -> re.Match[str] | None:
-        """The next line that matches; None if there is none in time."""
-        deadline = time.monotonic() + timeout_s
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._process.stdout, selectors.EVENT_READ)
-            while selector.select(max(deadline - time.monotonic(), 0)):
-                line = self._process.stdout.readline().decode()
-                if not line:
-                    return None
-                self.said.append(line)
-                if match := re.search(pattern, line):
-                    return match
-        return None
-
-    def signal(self, number: int) -> None:
-        self._process.send_signal(number)
+    def read(self, pattern: str, timeout_s: float = SOON_S) -> re.Match[str]:
+        """The next line that matches."""
+        deadline_s, said = time.monotonic() + timeout_s, []
+        while (match := re.search(pattern, (said or [""])[-1])) is None:
+            assert self.has_line(deadline_s - time.monotonic()), said
+            said.append(self.line())
+        return match
 
     def close(self) -> None:
-        self._process.stdin.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.5)
-        if self._process.poll() is None:
-            self._process.terminate()
+        self.process.stdin.close()
+        for end, within_s in (
+            (lambda: None, 0.5),
+            (self.process.terminate, SOON_S),
+            (self.process.kill, SOON_S),
+        ):
+            end()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(60.0)
-        self._process.kill()
-        self._process.wait()
-        self._process.stdout.close()
-
-
-@dataclass
-class Keyring:
-    """Directories with keys: of the registry, of a node that it knows, and of one that it does not."""
-
-    registry: Path
-    friend: Path
-    stranger: Path
+                self.process.wait(within_s)
+                break
+        self.process.stdout.close()
 
 
 @pytest.fixture
-def keyring(place):
-    ring = Keyring(*(place / name for name in ("registry", "friend", "stranger")))
-    registry, friend, _ = (new_keys(directory) for directory in (ring.registry, ring.friend, ring.stranger))
-    authorize(ring.registry, friend)
-    for directory in (ring.friend, ring.stranger):
-        authorize(directory, registry, ADDRESSES[0])
-    return ring
-
-
-def authorize(directory: Path, keys: Keys, *hosts: str) -> None:
-    (directory / AUTHORIZED_FILE).write_text(" ".join([keys.public, *hosts]) + "\n")
+def keyring(place) -> dict[str, str]:
+    """Directories with keys: of the registry, of a node that it knows, and of one that it does not."""
+    made = {name: new_keys(place / name) for name in ("registry", "friend", "stranger")}
+    for name, line in (
+        ("registry", made["friend"].public),
+        *((name, f"{made['registry'].public} {ADDRESSES[0]}") for name in ("friend", "stranger")),
+    ):
+        (place / name / AUTHORIZED_FILE).write_text(line + "\n")
+    return {name: str(place / name) for name in made}
 
 
 @pytest.fixture
@@ -126,11 +97,11 @@ def start(place):
         yield start_process
 
 
-def serve(start, host: str, *options: str) -> tuple[Process, str]:
+def serve(start, keyring, host: str, port: str = "0") -> tuple[Process, str]:
+    """A registry, and the port at which it is found."""
+    options = ("--listen", f"tcp://0.0.0.0:{port}", "--keys", keyring["registry"])
     registry = start(host, "-m", "cortex.discovery", *options)
-    match = registry.read(r"serves .*tcp://[0-9.]+:([0-9]+)")
-    assert match, registry.said
-    return registry, match[1]
+    return registry, registry.read(r"serves .*tcp://[0-9.]+:([0-9]+)")[1]
 
 
 @pytest.fixture
@@ -154,9 +125,9 @@ def sees(child: Child, *names: str, timeout_s: float = SOON_S, always: Sequence[
 
 
 def test_nodes_of_two_hosts_see_each_other_through_one_registry(hosts, start, node, keyring):
-    _, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", "--keys", str(keyring.registry))
+    _, port = serve(start, keyring, hosts[0])
     near = node(hosts[0], "near")
-    far = node(hosts[1], "far", registry=f"tcp://{ADDRESSES[0]}:{port}", keys=str(keyring.friend))
+    far = node(hosts[1], "far", registry=f"tcp://{ADDRESSES[0]}:{port}", keys=keyring["friend"])
     assert sees(near, "near", "far")
     assert sees(far, "near", "far")
     # The cable is pulled: the far node's lease runs out here, but it forgets nobody itself.
@@ -170,14 +141,13 @@ def test_nodes_of_two_hosts_see_each_other_through_one_registry(hosts, start, no
 
 
 def test_a_registry_on_another_host_that_is_killed_and_comes_back(hosts, start, node, keyring):
-    options = ("--keys", str(keyring.registry))
-    first, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", *options)
-    place = {"registry": f"tcp://{ADDRESSES[0]}:{port}", "keys": str(keyring.friend)}
+    first, port = serve(start, keyring, hosts[0])
+    place = {"registry": f"tcp://{ADDRESSES[0]}:{port}", "keys": keyring["friend"]}
     far = [node(hosts[1], f"far {k}", **place) for k in range(2)]
     assert all(sees(each, "far 0", "far 1") for each in far)
-    first.signal(signal.SIGKILL)
-    first.close()
-    serve(start, hosts[0], "--listen", f"tcp://0.0.0.0:{port}", *options)
+    first.process.kill()
+    first.process.wait()
+    serve(start, keyring, hosts[0], port)
     late = node(hosts[1], "late", **place)
     assert sees(far[0], "far 0", "far 1", "late", always=["far 1"])  # it was never forgotten
     assert sees(late, "far 0", "far 1", "late")
@@ -185,20 +155,19 @@ def test_a_registry_on_another_host_that_is_killed_and_comes_back(hosts, start, 
 
 @pytest.mark.parametrize("keys", ["stranger", None])
 def test_a_stranger_sees_nobody_and_is_seen_by_nobody(hosts, start, node, keyring, keys):
-    registry, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", "--keys", str(keyring.registry))
+    registry, port = serve(start, keyring, hosts[0])
     address = f"tcp://{ADDRESSES[0]}:{port}"
     near = node(hosts[0], "near")
-    options = {"keys": str(getattr(keyring, keys))} if keys else {"insecure": True}
+    options = {"keys": keyring[keys]} if keys else {"insecure": True}
     stranger = node(hosts[1], "stranger", registry=address, **options)
-    friend = node(hosts[1], "friend", registry=address, keys=str(keyring.friend))
+    friend = node(hosts[1], "friend", registry=address, keys=keyring["friend"])
     assert sees(friend, "friend", "near")
-    assert sees(near, "friend", "near")
     assert not sees(stranger, "friend", "near", "stranger", timeout_s=1.5)
     assert stranger.ask(do="nodes") == {"names": ["stranger"], "connected": False}
     assert sees(near, "friend", "near")
     assert sees(friend, "friend", "near")
     if keys:
-        assert registry.read("refused key"), registry.said
+        registry.read("refused key")
 
 
 DELAY_S, JITTER_S = 0.02, 0.003
@@ -256,8 +225,8 @@ def test_a_closed_loop_over_a_bad_link_between_hosts_whose_clocks_differ(start, 
     Nothing is lost, and what either side says of one way is half of the loop, which needs no clock but one.
     """
     with two_hosts(delay_s=DELAY_S, jitter_s=JITTER_S, loss=0.01) as hosts:
-        _, port = serve(start, hosts[0], "--listen", "tcp://0.0.0.0:0", "--keys", str(keyring.registry))
-        address = {"CORTEX_REGISTRY": f"tcp://{ADDRESSES[0]}:{port}", "CORTEX_KEYS": str(keyring.friend)}
+        _, port = serve(start, keyring, hosts[0])
+        address = {"CORTEX_REGISTRY": f"tcp://{ADDRESSES[0]}:{port}", "CORTEX_KEYS": keyring["friend"]}
         shifted = ("unshare", "--time", "--monotonic", str(HOUR_S))
         near, far = (
             start(host, "-c", code, prefix=prefix, CORTEX_LISTEN=listen, **address)
@@ -266,12 +235,8 @@ def test_a_closed_loop_over_a_bad_link_between_hosts_whose_clocks_differ(start, 
             )
         )
         doctor = start(hosts[1], "-m", "cortex", "doctor", **address)
-        told = []
-        for process in (near, far):
-            match = process.read(r"(?:robot|controller) (\[.*)", 120.0)
-            assert match, near.said + far.said
-            told.append(json.loads(match[1]))
-        assert doctor.read(r"ok     clock: [0-9.]+ [mun]s (ahead of|behind) the registry's"), doctor.said
+        told = [json.loads(each.read(r"(?:robot|controller) (\[.*)", 120.0)[1]) for each in (near, far)]
+        doctor.read(r"ok     clock: [0-9.]+ [mun]s (ahead of|behind) the registry's")
     (loops, commands, *counted), (ages, images, lost, (ahead_ns, error_ns, _)) = told
     assert [*counted, lost] == [0, 0, 0]
     loop_ns, command_ns, age_ns, image_ns = (

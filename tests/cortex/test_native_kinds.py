@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
+import random
 import struct
 import sys
+import tracemalloc
 import weakref
 from enum import Enum
 from typing import Any
@@ -18,14 +21,15 @@ from processes import SOON_S, wait_for
 from random_schemas import any_message, schemas
 from test_codec import Everything, Level, Mode, Point, everything
 from test_large import connected, slots_held
+from wire_vectors import load_vectors
 
 from cortex import reliable
-from cortex.codec import MalformedMessage, Plan, codec_of
+from cortex.codec import Plan, codec_of
 from cortex.compiled import native
 from cortex.message import Array, message
 from cortex.messages import Image
 from cortex.native import make_coder
-from cortex.schema import schema_of, type_from_schema
+from cortex.schema import Schema, schema_of, type_from_schema
 
 pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
@@ -37,49 +41,6 @@ def python_body(value: Any) -> bytes:
 
 def coder_of(cls: type) -> Any:
     return make_coder(schema_of(cls), cls)
-
-
-def assert_same(left: Any, right: Any) -> None:
-    """Both are of the same classes throughout and hold the same bits; nan is nan."""
-    assert type(left) is type(right)
-    if isinstance(left, np.ndarray):
-        assert (left.dtype, left.shape, left.flags.writeable) == (
-            right.dtype,
-            right.shape,
-            right.flags.writeable,
-        )
-        assert left.tobytes() == right.tobytes()
-    elif isinstance(left, list):
-        assert len(left) == len(right)
-        for pair in zip(left, right, strict=True):
-            assert_same(*pair)
-    elif isinstance(left, float):
-        assert struct.pack("<d", left) == struct.pack("<d", right)
-    elif hasattr(left, "__cortex_names__"):
-        for name in left.__cortex_names__:
-            assert_same(getattr(left, name), getattr(right, name))
-    else:
-        assert left == right
-
-
-def check_decoding(cls: type, body: bytes) -> bool:
-    """C takes a body if and only if Python does, as the same message; return whether they do."""
-    expected = outcome(codec_of(cls)._body.read, body)
-    found = coder_of(cls).decode(body, 0, len(body))
-    assert (found is None) == (expected is None)
-    if found is not None:
-        assert_same(found, expected)
-    return found is not None
-
-
-@given(any_message(), st.data())
-def test_damaged_bodies_are_refused_alike(value, data):
-    check_decoding(type(value), mutate(data.draw(st.randoms()), python_body(value)))
-
-
-@given(schemas, st.binary(max_size=300))
-def test_random_bytes_are_refused_alike(schema, data):
-    check_decoding(type_from_schema(schema), data)
 
 
 class Count(int):
@@ -123,14 +84,13 @@ def test_dimensions_that_no_array_can_have():
     class Cube:
         data: Array["float64", "a", "b", "c"]
 
-    good = python_body(Cube(np.zeros((0, 5, 5))))
-    assert check_decoding(Cube, good)
-    for shape in ((0, 2**32 - 1, 2**32 - 1), (2**32 - 1, 0, 2**32 - 1), (2**32 - 1, 2**32 - 1, 0)):
-        body = good[:8] + struct.pack("<3I", *shape) + good[20:]
-        assert not check_decoding(Cube, body)
-        with pytest.raises(MalformedMessage):
-            codec_of(Cube).decode(body)
-    assert check_decoding(Cube, good[:8] + struct.pack("<3I", 0, 2**31, 2**28) + good[20:])
+    codec, good, most = codec_of(Cube), python_body(Cube(np.zeros((0, 5, 5)))), 2**32 - 1
+    for shape, fits in (
+        ((0, 5, 5), True),
+        ((0, 2**31, 2**28), True),
+        *[((0, most, most), False), ((most, 0, most), False), ((most, most, 0), False)],
+    ):
+        assert is_accepted(codec, good[:8] + struct.pack("<3I", *shape) + good[20:], False) == fits
 
 
 def many_names(count: int) -> type:
@@ -203,9 +163,6 @@ def test_nothing_of_any_kind_is_leaked():
     after, grown = counts(), sys.getallocatedblocks() - blocks
     assert grown < 200
     assert all(abs(now - then) < 40 for then, now in zip(before, after, strict=True))  # 50 rounds would be 50
-
-
-# Through a ring
 
 
 @message
@@ -295,3 +252,99 @@ def test_a_list_that_changes_between_measuring_and_writing(node, change):
         del body
     assert changed
     wait_for(lambda: slots_held(publisher) == 0)
+
+
+TARGETS = [
+    (
+        codec_of(type_from_schema(Schema.from_json(vector["schema"]))),
+        [bytes.fromhex(case["body"]) for case in vector["cases"] + vector["malformed"]],
+    )
+    for vector in load_vectors().values()
+]
+"""The types of the test vectors, with good and malformed bodies."""
+
+
+def touch(value: Any) -> int:
+    """Read everything that a decoded value refers to, and return how much that is."""
+    if isinstance(value, np.ndarray):
+        assert not value.flags.writeable
+        return len(value.tobytes())
+    if isinstance(value, (str, bytes)):
+        return len(value)
+    if isinstance(value, list):
+        return sum(map(touch, value)) + len(value)
+    names = getattr(value, "__cortex_names__", ())
+    return sum(touch(getattr(value, name)) for name in names)
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Both are of the same classes throughout and hold the same bits; nan is nan."""
+    assert type(left) is type(right)
+    if isinstance(left, np.ndarray):
+        one, other = ((a.dtype, a.shape, a.flags.writeable, a.tobytes()) for a in (left, right))
+        assert one == other
+    elif isinstance(left, list):
+        for pair in zip(left, right, strict=True):
+            assert_same(*pair)
+    elif isinstance(left, float):
+        assert struct.pack("<d", left) == struct.pack("<d", right)
+    elif hasattr(left, "__cortex_names__"):
+        for name in left.__cortex_names__:
+            assert_same(getattr(left, name), getattr(right, name))
+    else:
+        assert left == right
+
+
+def is_accepted(codec: Any, body: bytes, bounded: bool = True) -> bool:
+    """Decode a body in every way, in C and in Python, and return whether it was accepted."""
+    framed = b"\xff" * 64 + body + b"\xff" * 64
+    first = outcome(codec.decode, body)
+    within = outcome(codec.decode, framed, 64, len(body))
+    general = outcome(codec._body.read, np.frombuffer(framed, np.uint8), 64, len(body))
+    said = (codec.schema.name, body.hex())
+    assert (first is None) == (within is None) == (general is None), said
+    if first is None:
+        return False
+    assert_same(first, general)
+    # Items never share bytes, and a list element takes a byte at least.
+    assert not bounded or touch(first) <= 2 * len(body), said
+    # Through the bytes, which are equal for nan as well.
+    again = codec.encode(first, 2**32)
+    assert again is not None
+    assert again == codec.encode(general, 2**32) == codec.encode(within, 2**32), said
+    assert codec.encode(codec.decode(again), 2**32) == again
+    return True
+
+
+@given(any_message(), st.data())
+def test_damaged_bodies_of_any_type(value, data):
+    body = Plan(codec_of(type(value))._body, value).to_bytes()
+    is_accepted(codec_of(type(value)), mutate(data.draw(st.randoms()), body), bounded=False)
+
+
+@given(schemas, st.binary(max_size=300))
+def test_random_bytes(schema, data):
+    is_accepted(codec_of(type_from_schema(schema)), data, bounded=False)
+
+
+def test_mutated_bodies():
+    rng, accepted, count = random.Random(1), 0, int(os.environ.get("CORTEX_FUZZ_BODIES", "20000"))
+    for index in range(count):
+        codec, bodies = TARGETS[index % len(TARGETS)]
+        accepted += is_accepted(codec, mutate(rng, rng.choice(bodies), reach=120))
+    assert accepted > 2_000  # else the mutations would only show that wrong sizes are rejected
+    assert count - accepted > 5_000
+
+
+def test_rejecting_takes_no_memory():
+    """Whatever counts and offsets a body claims, decoding allocates no more than a small multiple of it."""
+    for codec, body in ((codec, body) for codec, bodies in TARGETS for body in bodies):
+        for place in range(0, min(len(body) - 4, 96), 4):
+            damaged = body[:place] + b"\xff\xff\xff\x7f" + body[place + 4 :]
+            tracemalloc.start()
+            try:
+                outcome(codec.decode, damaged)
+                peak = tracemalloc.get_traced_memory()[1]
+            finally:
+                tracemalloc.stop()
+            assert peak < 50_000 + 100 * len(body), (codec.schema.name, place)

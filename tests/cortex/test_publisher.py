@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-import threading
 import time
 from types import SimpleNamespace
 
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, Scan, connect
-from processes import SOON_S, wait_for
+from processes import SOON_S, Beside, wait_for
 
 from cortex import keep_last, message, reliable
 from cortex.pub_socket import PubSockets
@@ -23,9 +21,6 @@ LARGE = 100_000
 
 def scan(number, size=3):
     return Scan(number, np.full(size, number, np.float32))
-
-
-# What is refused
 
 
 @pytest.mark.parametrize("listened", [False, True])
@@ -39,30 +34,32 @@ def test_a_message_of_another_type_is_refused(node, listened):
             publisher.publish(wrong)
 
 
-def test_a_value_that_does_not_fit_takes_no_number(node):
+@pytest.mark.parametrize(
+    ("kind", "wrong", "right"),
+    [
+        (
+            Scan,
+            [Scan(1, np.zeros(3)), Scan(1, np.zeros(LARGE)), Scan(2**63, np.zeros(LARGE, np.float32))],
+            scan,
+        ),
+        (
+            Number,
+            [Number(1, "none")],
+            lambda number, size=3: Number(number, number),
+        ),  # first written in the ring
+    ],
+)
+def test_a_value_that_does_not_fit_takes_no_number(node, kind, wrong, right):
     """The subscriber sees no gap."""
-    publisher, subscriber = connect(node, "/scans", Scan)
-    publisher.publish(scan(0))
-    with pytest.raises((TypeError, ValueError), match="ranges"):
-        publisher.publish(Scan(1, np.zeros(3)))
-    with pytest.raises((TypeError, ValueError), match="ranges"):
-        publisher.publish(Scan(1, np.zeros(LARGE)))
-    with pytest.raises((TypeError, ValueError), match="stamp_ns"):
-        publisher.publish(Scan(2**63, np.zeros(LARGE, np.float32)))
-    publisher.publish(scan(2))
-    publisher.publish(scan(3, LARGE))
-    assert [subscriber.recv_with_info(SOON_S)[1].sequence for _ in range(3)] == [0, 1, 2]
-    assert subscriber.counters.lost == 0
-
-
-def test_a_value_that_does_not_fit_takes_no_number_in_a_ring(numbers):
-    """A type of fixed size is written there before it is known that a field is of another type."""
-    publisher, subscriber = numbers
+    publisher, subscriber = connect(node, "/topic", kind)
     for number in range(4):
-        with pytest.raises(TypeError):
-            publisher.publish(Number(number, "none"))
-        assert publisher.publish(Number(number, number))
-        assert subscriber.recv_with_info(SOON_S)[1].sequence == number
+        for each in wrong:
+            with pytest.raises((TypeError, ValueError), match=r"ranges|stamp_ns|value"):
+                publisher.publish(each)
+        assert publisher.publish(right(number, LARGE if number % 2 else 3))
+        message, info = subscriber.recv_with_info(SOON_S)
+        assert (message.stamp_ns, info.sequence) == (number, number)
+    assert subscriber.counters.lost == 0
 
 
 @pytest.mark.parametrize("topic", ["scan", "/", "/a//b", "/a b", "/ä", "", "/" + 200 * "x", 3])
@@ -70,6 +67,8 @@ def test_a_topic_has_a_form(node, topic):
     for make in (node.publisher, node.subscriber):
         with pytest.raises(ValueError, match="a topic or service is named like"):
             make(topic, Number)
+    with pytest.raises(ValueError, match="inline_max must not be negative, got -1"):
+        node.publisher("/nothing", Number, inline_max=-1)
     assert node.topics() == []
 
 
@@ -85,45 +84,26 @@ def test_a_message_may_be_empty(node, inline_max):
     assert subscriber.recv(SOON_S) == Nothing()
 
 
-def test_a_size_is_not_negative(node):
-    with pytest.raises(ValueError, match="inline_max must not be negative, got -1"):
-        node.publisher("/nothing", Nothing, inline_max=-1)
-
-
-# Snapshots and order
-
-
 @pytest.mark.parametrize("size", [10, LARGE])
 def test_what_was_published_may_be_changed(node, size):
     publisher, subscriber = connect(node, "/scans", Scan)
     ranges = np.ones(size, np.float32)
     publisher.publish(Scan(1, ranges))
     ranges[:] = 2.0
-    received = subscriber.recv(SOON_S).ranges
-    assert (received == 1.0).all()
-    assert not np.shares_memory(received, ranges)
+    assert (subscriber.recv(SOON_S).ranges == 1.0).all()
+    counters = publisher.counters
+    assert counters.published == 1
+    assert 4 * size <= counters.bytes < 4 * size + 150
 
 
 def test_small_and_large_messages_keep_their_order(node):
     publisher, subscriber = connect(node, "/scans", Scan, reliable(8, 60.0))
     sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
-    received = []
-
-    def take():
-        while len(received) < 240:
-            message, info = subscriber.recv_with_info(SOON_S)
-            assert (message.ranges == np.float32(message.stamp_ns)).all()
-            received.append((message.stamp_ns, info.sequence, len(message.ranges)))
-
-    thread = threading.Thread(target=take)
-    thread.start()
-    for number, size in zip(range(240), itertools.cycle(sizes), strict=False):
-        assert publisher.publish(scan(number, size))
-    thread.join(SOON_S)
-    assert received == [(k, k, sizes[k % len(sizes)]) for k in range(240)]
-
-
-# Latching
+    with Beside(lambda: [subscriber.recv_with_info(SOON_S) for _ in range(240)]) as reading:
+        for number in range(240):
+            assert publisher.publish(scan(number, sizes[number % 12]))
+    for number, (got, info) in enumerate(reading.results[0]):
+        assert (got, info.sequence) == (scan(number, sizes[number % 12]), number)
 
 
 @pytest.mark.parametrize("size", [3, LARGE])
@@ -146,16 +126,6 @@ def test_a_late_subscriber_gets_the_last_message(node, size, policy):
         subscriber.close()
 
 
-def test_a_latch_that_was_filled_before_anybody_came_and_across_nodes(make_node):
-    publisher = make_node("early").publisher("/scans", Scan, latch=True)
-    publisher.publish(scan(1, LARGE))
-    subscriber = make_node("late").subscriber("/scans", Scan)
-    assert subscriber.recv(SOON_S).stamp_ns == 1
-
-
-# Coming and going
-
-
 def test_subscribers_are_counted(node):
     publisher = node.publisher("/numbers", Number)
     subscribers = [node.subscriber("/numbers", Number) for _ in range(3)]
@@ -175,15 +145,6 @@ def test_attached_means_that_nothing_is_missed(node):
         for value in range(3):
             publisher.publish(Number(0, value))
         assert [subscriber.recv(SOON_S).value for _ in range(3)] == [0, 1, 2]
-
-
-def test_counters(node):
-    publisher, _ = connect(node, "/scans", Scan)
-    publisher.publish(scan(1, 10))
-    publisher.publish(scan(2, LARGE))
-    counters = publisher.counters
-    assert counters.published == 2
-    assert 4 * (10 + LARGE) <= counters.bytes < 4 * (10 + LARGE) + 300
 
 
 @pytest.mark.parametrize("options", [{}, {"latch": True}])
@@ -208,60 +169,39 @@ def test_use_after_close(node, options):
 def test_closing_while_another_thread_is_held_up(node):
     """It gets out with `Closed`, not when the reader's time is over."""
     publisher, _ = connect(node, "/numbers", Number, reliable(1, 4 * SOON_S))
-    ended = []
 
     def publish():
-        try:
-            while True:
-                publisher.publish(Number(0, 0))
-        except Closed as error:
-            ended.append(str(error))
+        while True:
+            publisher.publish(Number(0, 0))
 
-    threads = [threading.Thread(target=publish) for _ in range(2)]
-    for thread in threads:
-        thread.start()
+    def ends():
+        with pytest.raises(Closed, match="the publisher of /numbers is closed"):
+            publish()
+        return True
+
+    threads = [Beside(ends), Beside(ends)]
     published = -1
     while published != (published := publisher._fast_send.sequence) or published < 100:
         time.sleep(0.05)
     publisher.close()
-    for thread in threads:
-        thread.join(SOON_S)
-    assert ended == ["the publisher of /numbers is closed"] * 2
+    assert [thread.join() for thread in threads] == [[True], [True]]
 
 
 def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     publisher, subscriber = connect(node, "/numbers", Number, reliable(1, 4 * SOON_S), max_wait_s=4 * SOON_S)
-    done = threading.Event()
-
-    def publish():
-        for value in range(40_000):
-            assert publisher.publish(Number(0, value))
-        done.set()
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    assert not done.wait(0.1)
-    subscriber.close()
-    assert done.wait(SOON_S)
-    thread.join()
+    with Beside(lambda: all(publisher.publish(Number(0, value)) for value in range(40_000))) as publishing:
+        publishing.thread.join(0.1)
+        assert publishing.thread.is_alive()
+        subscriber.close()
+    assert publishing.results == [True]
 
 
 def test_a_flood_of_subscriptions_holds_up_nobody():
     """A peer sends more of them than can be read."""
-
-    class Flood:
-        def get(self, option):
-            return zmq.POLLIN
-
-        def recv(self, flags):
-            return b"\1" + bytes(32)
-
+    flood = SimpleNamespace(get=lambda option: zmq.POLLIN, recv=lambda flags: b"\1" + bytes(32))
     pub_sockets = PubSockets()
-    pub_sockets.add(SimpleNamespace(socket=Flood(), listener=None))
-    thread = threading.Thread(target=pub_sockets.tick, daemon=True)
-    thread.start()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
+    pub_sockets.add(SimpleNamespace(socket=flood, listener=None))
+    Beside(pub_sockets.tick).join()
 
 
 def test_a_log_that_travels_over_cortex(node):

@@ -28,7 +28,7 @@ from directories import (
     registry_pid,
     serving,
 )
-from processes import ROOT, SOON_S, wait_for
+from processes import ROOT, wait_for
 
 import cortex.registry
 from cortex.codec import MalformedMessage
@@ -55,27 +55,22 @@ __all__ = ["context", "make"]
 pytestmark = pytest.mark.usefixtures("runtime")
 
 
-# The registry's process
-
-
 def test_many_processes_at_once_start_one_registry():
     code = (
         "import sys, time\nfrom cortex.registry import ensure_registry\n"
         "print('ready', flush=True)\nsys.stdin.read()\nprint(ensure_registry(0, linger_s=20.0))"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", code]
-    pipe = subprocess.PIPE
-    racers = [
-        subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, text=True) for _ in range(6)
-    ]
-    assert all(racer.stdout.readline() == "ready\n" for racer in racers)
-    for racer in racers:
-        racer.stdin.close()
-    answers = [racer.stdout.read().strip() for racer in racers]
-    for racer in racers:
-        assert racer.wait(SOON_S) == 0
-        racer.stdout.close()
+    options = {"env": environment, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with contextlib.ExitStack() as stack:
+        racers = [
+            stack.enter_context(subprocess.Popen([sys.executable, "-c", code], **options)) for _ in range(6)
+        ]
+        assert all(racer.stdout.readline() == "ready\n" for racer in racers)
+        for racer in racers:
+            racer.stdin.close()
+        answers = [racer.stdout.read().strip() for racer in racers]
+    assert [racer.returncode for racer in racers] == [0] * 6
     assert sorted(answers) == ["False"] * 5 + ["True"]
     wait_for(registry_pid)
 
@@ -162,9 +157,6 @@ def test_a_registry_that_cannot_start_is_tried_again_but_not_in_a_loop(make, mon
     assert caplog.text.count("no process for you") == 1
 
 
-# Limits, and frames that are not what they should be
-
-
 def test_a_flood_of_nodes_is_bounded_and_told_why(make, caplog):
     with serving(nodes_max=3) as registry:
         nodes = [make(f"node {k}") for k in range(5)]
@@ -191,38 +183,20 @@ def test_a_record_that_is_too_large_is_refused_and_the_node_told(make, caplog):
     assert "10000 are allowed" in caplog.text
 
 
-def test_one_connection_speaks_for_one_node(context):
-    with serving() as registry:
-        socket = dealer(context)
-        for index in range(20):
-            socket.send(control_frame(Hello(False, make_record(f"ghost {index}"))))
-        answers = [receive(socket) for _ in range(20)]
-        assert [type(answer) for answer in answers] == [Welcome] + [Refused] * 19
-        assert registry.node_count == 1
-        socket.close()
-
-
 def test_mutated_frames_do_no_harm(context, make, caplog):
-    """20 000 of them over real sockets: all answered or counted, two real nodes undisturbed."""
+    """5000 of them over real sockets: all answered or counted, two real nodes undisturbed."""
     rng = random.Random(7)
     record = make_record("fuzz", publishers=[publisher("/a"), publisher("/b/c")])
     record = dataclasses.replace(record, endpoints=[Endpoint("ipc", "ipc:///x", "", "ipc:///y", "")])
-    seeds = [
-        control_frame(message)
-        for message in (
-            Hello(True, record),
-            Hello(False, record),
-            Heartbeat(record.node, 1, 0),
-            Leave(record.node),
-            Welcome(1, 1, [1, 2], [3, 4]),
-        )
-    ]
+    hellos = (Hello(True, record), Hello(False, record))
+    others = (Heartbeat(record.node, 1, 0), Leave(record.node), Welcome(1, 1, [1, 2], [3, 4]))
+    seeds = [control_frame(message) for message in (*hellos, *others)]
     with serving() as registry:
         one, two = make("one"), make("two")
         drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
-        for _ in range(20):
+        for _ in range(10):
             socket = dealer(context)
-            for _ in range(1000):
+            for _ in range(500):
                 frames = [mutate(rng, rng.choice(seeds))]
                 if rng.random() < 0.02:
                     frames.append(b"more")
@@ -232,16 +206,15 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
                         socket.recv(zmq.NOBLOCK)
             drive_for([one, two], 0.001)
             # What is counted was read; the last frame's answer says that all before it were.
-            sequence = rng.getrandbits(32)
-            socket.send(control_frame(Heartbeat(12345, 1, 0), sequence))
+            socket.send(control_frame(Heartbeat(12345, 1, 0), rng.getrandbits(32)))
             drive([one, two], lambda socket=socket: answers_unknown(socket))
             socket.close()
-        assert registry.rejected > 5_000
+        assert registry.rejected > 1_250
         drive([one, two], lambda: registry.node_count == 2)  # ghosts have no heartbeat
         drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
         assert two.id not in one.ever_lost
         said = sum("rejected a frame" in r.getMessage() for r in caplog.records)
-        assert 1 <= said <= 20 + 2  # once for each connection, not for each frame
+        assert 1 <= said <= 10 + 2  # once for each connection, not for each frame
 
 
 def test_mutated_answers_do_no_harm_to_a_directory(context, make):
@@ -250,16 +223,8 @@ def test_mutated_answers_do_no_harm_to_a_directory(context, make):
     fake = fake_registry(context)
     node = make("one", registry=f"ipc://{runtime_dir(0) / REGISTRY_SOCKET}")
     other = make_record("other")
-    seeds = [
-        control_frame(message)
-        for message in (
-            Welcome(1, 1, [other.node], [1]),
-            Changed(2, other),
-            Gone(3, other.node, "left"),
-            Alive(1, 3, 1),
-            Refused(node.id, "no"),
-        )
-    ]
+    changes = (Welcome(1, 1, [other.node], [1]), Changed(2, other), Gone(3, other.node, "left"))
+    seeds = [control_frame(message) for message in (*changes, Alive(1, 3, 1), Refused(node.id, "no"))]
     drive([node], lambda: fake.poll(1))
     identity, _ = fake.recv_multipart()
     for _ in range(50):
@@ -290,13 +255,15 @@ def test_a_record_that_no_node_of_ours_would_send_is_rejected():
             check_record(bad)
 
 
-def test_a_heartbeat_on_another_connection_keeps_nobody_alive(context):
-    """And another's farewell ends nobody."""
+def test_one_connection_speaks_for_one_node(context):
+    """For no other: neither a heartbeat on another connection counts, nor a farewell."""
     record = make_record("x")
     with serving() as registry:
         mine, stranger = dealer(context), dealer(context)
         mine.send(control_frame(Hello(False, record)))
-        receive(mine)
+        for index in range(20):
+            mine.send(control_frame(Hello(False, make_record(f"ghost {index}"))))
+        assert [type(receive(mine)) for _ in range(21)] == [Welcome] + [Refused] * 20
         stranger.send(control_frame(Heartbeat(record.node, 1, 0)))
         assert receive(stranger).held == 0
         stranger.send(control_frame(Leave(record.node)))

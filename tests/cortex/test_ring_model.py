@@ -142,31 +142,27 @@ def explore(
     return ends
 
 
-def without(steps: list[Step], left_out: Step | None) -> list[Step]:
-    return [step for step in steps if step != left_out]
-
-
-def weakened(steps: list[Step], *, order: bool) -> list[Step]:
-    """The steps; unless `order`, with loads that order nothing."""
-    plain = {"acquire": "load", "acquire unless": "skip unless"}
-    return [step if order else (plain.get(step[0], step[0]), *step[1:]) for step in steps]
+def program(text: str, left_out: str = "", *, plain_loads: bool = False) -> list[Step]:
+    """The steps that are written in a text, without one of them, or with loads that order nothing."""
+    steps: list[Step] = []
+    for step in text.split(", "):
+        kind, *operands = step.replace(" unless", "_unless").split()
+        kind = kind.replace("acquire", "load").replace("load_", "skip_") if plain_loads else kind
+        known = (kind.replace("_", " "), *(int(each) if each.isdigit() else each for each in operands))
+        steps += [] if step == left_out else [known]
+    return steps
 
 
 def test_the_machine_reorders_and_orders_as_it_says():
     """Message passing: what is read after a flag, with each pair of orders; and two loads of one place."""
     for kind in STORES:
         for flag in ("load", "acquire"):
-            ends = explore(
-                {"data": 0, "flag": 0},
-                [("store", "data", 1), (kind, "flag", 1)],
-                [(flag, "flag"), ("load", "data")],
-            )
+            writer, reader = program(f"store data 1, {kind} flag 1"), program(f"{flag} flag, load data")
+            ends = explore({"data": 0, "flag": 0}, writer, reader)
             stale = [read for _, (_, read) in ends if read["flag"] == 1 and read["data"] == 0]
             assert bool(stale) == ((kind, flag) != ("release", "acquire"))
     ends = explore(
-        {"x": 0, "first": 0},
-        [("store", "x", 1)],
-        [("skip unless", "x", 1, 1), ("load", "first"), ("load", "x")],
+        {"x": 0, "first": 0}, program("store x 1"), program("skip unless x 1 1, load first, load x")
     )
     assert all(read["x"] == 1 for _, (_, read) in ends if "first" in read)
 
@@ -174,60 +170,37 @@ def test_the_machine_reorders_and_orders_as_it_says():
 @pytest.mark.parametrize("left_out", [None, "publisher", "reader"], ids=str)
 def test_who_sleeps_is_woken(left_out):
     """The reader has seen no frame and sleeps: then the bell rings."""
-    publisher = [
-        ("release", "head", 1),
-        ("fence",),
-        ("skip unless", "sleeping", 1, 2),
-        ("exchange", "sleeping", 0),
-        ("store", "bell", 1),
-    ]
-    reader = [("store", "sleeping", 1), ("fence",), ("load", "head")]
-    ends = explore(
-        {"head": 0, "sleeping": 0, "bell": 0},
-        without(publisher, ("fence",) if left_out == "publisher" else None),
-        without(reader, ("fence",) if left_out == "reader" else None),
-    )
+    rings = "release head 1, fence, skip unless sleeping 1 2, exchange sleeping 0, store bell 1"
+    publisher = program(rings, "fence" if left_out == "publisher" else "")
+    reader = program("store sleeping 1, fence, load head", "fence" if left_out == "reader" else "")
+    ends = explore({"head": 0, "sleeping": 0, "bell": 0}, publisher, reader)
     overslept = [memory for memory, (_, read) in ends if read["head"] == 0 and not memory["bell"]]
     assert bool(overslept) == (left_out is not None)
 
 
 @pytest.mark.parametrize("entries", [1, 2])
-@pytest.mark.parametrize("left_out", [None, ("order",), ("join",)], ids=str)
+@pytest.mark.parametrize("left_out", ["", "order", "join"])
 def test_what_is_written_over_is_not_taken(left_out, entries):
     """The reader copies two words of an entry while both are replaced, and then looks at `reserved`.
 
     That was raised once for all entries.
     """
-    publisher = [("store", "reserved", 1 + entries), ("order",)]
-    for entry in range(2, 2 + entries):
-        publisher += [("store", "one", entry), ("store", "two", entry), ("release", "head", entry)]
-    reader = [("load", "one"), ("load", "two"), ("join",), ("load", "reserved")]
-    ends = explore(
-        {"reserved": 1, "head": 1, "one": 1, "two": 1},
-        without(publisher, left_out),
-        without(reader, left_out),
-    )
+    written = [f"store one {n}, store two {n}, release head {n}" for n in range(2, 2 + entries)]
+    publisher = program(", ".join([f"store reserved {1 + entries}", "order", *written]), left_out)
+    reader = program("load one, load two, join, load reserved", left_out)
+    ends = explore({"reserved": 1, "head": 1, "one": 1, "two": 1}, publisher, reader)
     taken = [read for _, (_, read) in ends if read["reserved"] == 1]
     assert taken
-    assert any((read["one"], read["two"]) != (1, 1) for read in taken) == (left_out is not None)
+    assert any((read["one"], read["two"]) != (1, 1) for read in taken) == bool(left_out)
 
 
 @pytest.mark.parametrize("left_out", [None, "release", "acquire"], ids=str)
 def test_what_is_announced_is_whole(left_out):
     """A reader that sees the new head sees the entry; so it is with the word of a slot and its body."""
-    publisher = [
-        ("store", "reserved", 2),
-        ("order",),
-        ("store", "one", 2),
-        ("store", "two", 2),
-        ("store" if left_out == "release" else "release", "head", 2),
-    ]
-    reader = [("acquire unless", "head", 2, 2), ("load", "one"), ("load", "two")]
-    ends = explore(
-        {"reserved": 1, "head": 1, "one": 1, "two": 1},
-        publisher,
-        weakened(reader, order=left_out != "acquire"),
-    )
+    announce = "store" if left_out == "release" else "release"
+    publisher = program(f"store reserved 2, order, store one 2, store two 2, {announce} head 2")
+    reader = program("acquire unless head 2 2, load one, load two", plain_loads=left_out == "acquire")
+    ends = explore({"reserved": 1, "head": 1, "one": 1, "two": 1}, publisher, reader)
     found = [read for _, (_, read) in ends if read["head"] == 2]
     assert found
     assert any((read["one"], read["two"]) != (2, 2) for read in found) == (left_out is not None)
@@ -236,9 +209,9 @@ def test_what_is_announced_is_whole(left_out):
 @pytest.mark.parametrize("tail", ["release", "store", "early"])
 def test_what_a_reliable_reader_has_not_read_is_not_written_over(tail):
     """The publisher writes once the tail says so; a tail that comes too early gives the entry away."""
-    publisher = [("acquire unless", "tail", 1, 2), ("store", "one", 2), ("store", "two", 2)]
-    loads: list[Step] = [("load", "one"), ("load", "two")]
-    reader = [("release", "tail", 1), *loads] if tail == "early" else [*loads, (tail, "tail", 1)]
+    early = "release tail 1, load one, load two"
+    reader = program(early if tail == "early" else f"load one, load two, {tail} tail 1")
+    publisher = program("acquire unless tail 1 2, store one 2, store two 2")
     ends = explore({"tail": 0, "one": 1, "two": 1}, publisher, reader)
     torn = [read for _, (_, read) in ends if (read["one"], read["two"]) != (1, 1)]
     assert bool(torn) == (tail != "release")
@@ -247,36 +220,22 @@ def test_what_a_reliable_reader_has_not_read_is_not_written_over(tail):
 @pytest.mark.parametrize("left_out", [None, "publisher", "reader"], ids=str)
 def test_what_is_leased_is_not_written(left_out):
     """The publisher takes a slot while a reader leases it: one of the two sees the other."""
-    publisher = [("store", "word", 0), ("fence",), ("skip unless", "lease", 0, 1), ("store", "body", 2)]
-    reader = [("store", "lease", 1), ("fence",), ("acquire unless", "word", 1, 1), ("load", "body")]
-    ends = explore(
-        {"word": 1, "lease": 0, "body": 1},
-        without(publisher, ("fence",) if left_out == "publisher" else None),
-        without(reader, ("fence",) if left_out == "reader" else None),
-    )
+    takes = "store word 0, fence, skip unless lease 0 1, store body 2"
+    leases = "store lease 1, fence, acquire unless word 1 1, load body"
+    publisher = program(takes, "fence" if left_out == "publisher" else "")
+    reader = program(leases, "fence" if left_out == "reader" else "")
+    ends = explore({"word": 1, "lease": 0, "body": 1}, publisher, reader)
     read = [read["body"] for _, (_, read) in ends if "body" in read]
     assert read
     assert (2 in read) == (left_out is not None)
 
 
-@pytest.mark.parametrize("left_out", [None, ("fence",), ("join",)], ids=str)
+@pytest.mark.parametrize("left_out", ["", "fence", "join"])
 def test_what_is_copied_without_a_lease_is_whole(left_out):
     """The word of a slot is looked at before and after."""
-    publisher = [
-        ("store", "word", 0),
-        ("fence",),
-        ("store", "one", 2),
-        ("store", "two", 2),
-        ("release", "word", 2),
-    ]
-    reader = [
-        ("acquire unless", "word", 1, 4),
-        ("load", "one"),
-        ("load", "two"),
-        ("join",),
-        ("load", "word"),
-    ]
-    ends = explore({"word": 1, "one": 1, "two": 1}, without(publisher, left_out), without(reader, left_out))
+    publisher = program("store word 0, fence, store one 2, store two 2, release word 2", left_out)
+    reader = program("acquire unless word 1 4, load one, load two, join, load word", left_out)
+    ends = explore({"word": 1, "one": 1, "two": 1}, publisher, reader)
     taken = [read for _, (_, read) in ends if "one" in read and read["word"] == 1]
     assert taken
-    assert any((read["one"], read["two"]) != (1, 1) for read in taken) == (left_out is not None)
+    assert any((read["one"], read["two"]) != (1, 1) for read in taken) == bool(left_out)

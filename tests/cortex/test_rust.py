@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
 import shutil
 import subprocess
-import threading
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from peer import Block, Number, Scan, is_whole, make_block
-from processes import ROOT, SOON_S
+from peer import Block, Number, Scan, is_whole, make_block, take_all
+from processes import ROOT, SOON_S, Beside, Lines
 from test_end_of_stream import expected, leavers
 from wire_vectors import message_to_plain
 
@@ -87,7 +85,7 @@ def start(runtime):
     def run(*arguments: str) -> subprocess.Popen[bytes]:
         pipe = subprocess.PIPE
         command = [str(TARGET / "debug" / "cortex-peer"), *arguments]
-        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))
+        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0))
         return started[-1]
 
     yield run
@@ -103,23 +101,19 @@ def finish(process: subprocess.Popen[bytes]) -> tuple[list[Any], list[str]]:
     return [json.loads(line) for line in output.splitlines()], errors.decode().splitlines()
 
 
-class Publishing:
+class Publishing(Lines):
     """A running `cortex-peer pub` that publishes messages of a type."""
 
     def __init__(self, process: subprocess.Popen[bytes], kind: type) -> None:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        self._process, self._schema = process, schema_of(kind)
-        self._input: IO[bytes] = process.stdin
-        self._output: IO[bytes] = process.stdout
+        super().__init__(process, "cortex-peer pub")
+        self._schema = schema_of(kind)
         self._say(self._schema.to_json())
 
     def _say(self, line: str) -> None:
-        self._input.write(line.encode() + b"\n")
-        self._input.flush()
+        self.process.stdin.write(line.encode() + b"\n")
 
     def await_subscribers(self, count: int) -> None:
-        while json.loads(self._output.readline())["subscribers"] != count:
+        while json.loads(self.line())["subscribers"] != count:
             pass
 
     def publish(self, message: Any) -> None:
@@ -127,25 +121,9 @@ class Publishing:
 
     def close(self) -> dict[str, int]:
         """End its input; what it has counted."""
-        lines, errors = finish(self._process)
+        lines, errors = finish(self.process)
         assert not errors
-        counted: dict[str, int] = lines[-1]
-        return counted
-
-
-class Reading:
-    """A `cortex-peer sub` that ends by itself, and whose output is read meanwhile: it must never wait."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._results: list[tuple[list[Any], list[str]]] = []
-        self._thread = threading.Thread(target=lambda: self._results.append(finish(process)))
-        self._thread.start()
-
-    def finish(self) -> tuple[list[Any], dict[str, int]]:
-        """The messages, and what it has counted."""
-        self._thread.join()
-        ((messages, errors),) = self._results
-        return messages, json.loads(errors[-1])
+        return lines[-1]
 
 
 def test_vectors():
@@ -161,12 +139,13 @@ def blocks_of(count: int) -> list[Block]:
 def test_reliable_from_python(start, make_node):
     """More than all queues hold: the subscriber gets each message, and the publisher's end."""
     publisher = make_node().publisher("/blocks", Block, max_wait_s=SOON_S)
-    reading = Reading(start("sub", "/blocks", "--reliable", "--once"))
+    reading = Beside(finish, start("sub", "/blocks", "--reliable", "--once"))  # it must never wait for us
     assert publisher.wait_for_subscribers(1, SOON_S)
     blocks = blocks_of(6_000)
     delivered = sum(map(publisher.publish, blocks))
     publisher.close()
-    messages, counted = reading.finish()
+    ((messages, errors),) = reading.join(PATIENCE_S)
+    counted = json.loads(errors[-1])
     assert len(messages) == counted["received"] >= delivered
     assert counted["received"] + counted["lost"] == len(blocks)
     assert (counted["rejected"], counted["cut_off"]) == (0, 0)
@@ -181,22 +160,14 @@ def test_reliable_from_rust(start, make_node):
     subscriber = node.subscriber("/blocks", Block, policy=reliable(16, timeout_s=SOON_S))
     publishing.await_subscribers(1)
     count, blocks = 3_000, blocks_of(3_000)
-    closing: list[dict[str, int]] = []
-
-    def feed() -> None:
-        for block in blocks:
-            publishing.publish(block)
-        closing.append(publishing.close())
-
-    feeding = threading.Thread(target=feed)
-    feeding.start()
+    feeding = Beside(lambda: [*map(publishing.publish, blocks), publishing.close()][-1])
     received = []
     while subscriber.counters.received + subscriber.counters.lost < count:
         received.append(subscriber.recv(SOON_S))
-    feeding.join()
-    assert closing[0]["published"] == count
+    (closed,) = feeding.join()
+    assert closed["published"] == count
     assert len(received) + subscriber.counters.lost == count
-    assert subscriber.counters.lost <= closing[0]["timeouts"]
+    assert subscriber.counters.lost <= closed["timeouts"]
     assert all(is_whole(block) for block in received)
     numbers = [block.number for block in received]
     assert numbers == sorted(set(numbers))
@@ -213,9 +184,9 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
         publishing.publish(make_block(number, 1_000))
     received = 0
     while received + subscriber.counters.lost < count:
-        with contextlib.suppress(TimeoutError):
-            assert is_whole(subscriber.recv(0.01))
-            received += 1
+        blocks = take_all(subscriber)
+        assert all(map(is_whole, blocks))
+        received += len(blocks)
     lost = subscriber.counters.lost
     assert lost > 0
     publishing.publish(make_block(count, 5))

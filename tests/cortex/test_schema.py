@@ -46,16 +46,12 @@ SCAN_TEXT = (
 )
 
 
-def test_the_canonical_text():
+def test_the_canonical_text_and_its_fingerprint():
     assert schema_of(Scan).to_json() == SCAN_TEXT
     assert Schema.from_json(SCAN_TEXT) == schema_of(Scan)
-
-
-def test_the_fingerprint_is_blake2b_of_the_text():
     digest = hashlib.blake2b(SCAN_TEXT.encode("utf-8"), digest_size=8).digest()
-    assert schema_of(Scan).fingerprint == int.from_bytes(digest, "little")
     # A value written down, so that a change of the format cannot go unseen.
-    assert schema_of(Scan).fingerprint == 0xA79F0BA004364C4
+    assert schema_of(Scan).fingerprint == int.from_bytes(digest, "little") == 0xA79F0BA004364C4
 
 
 @given(schemas)
@@ -145,21 +141,14 @@ def test_texts_that_are_refused(text):
         Schema.from_json(text)
 
 
-@given(st.text() | st.binary().map(lambda data: data.decode("latin-1")))
-def test_any_text_is_a_schema_or_a_schema_error(text):
-    with pytest.raises(SchemaError):
-        Schema.from_json(text)
-
-
 @given(st.data())
 def test_damaged_texts_raise_nothing_else(data):
     text = schema_of(Scan).to_json()
     for _ in range(data.draw(st.integers(1, 3))):
         start = data.draw(st.integers(0, len(text)))
         end = data.draw(st.integers(start, min(len(text), start + 4)))
-        text = (
-            text[:start] + data.draw(st.sampled_from(["", "{", "}", '"', ",", "0", "null", "a"])) + text[end:]
-        )
+        piece = st.sampled_from(["", "{", "}", '"', ",", "0", "null", "a"]) | st.text(max_size=5)
+        text = text[:start] + data.draw(piece) + text[end:]
     with contextlib.suppress(SchemaError):
         assert Schema.from_json(text).to_json() == text
 
@@ -189,13 +178,9 @@ def test_limits_are_inclusive():
 def test_a_fixed_part_has_a_limit(make):
     with pytest.raises(SchemaError, match="allowed are 1073741824"):
         make()
-
-
-def test_a_fixed_part_at_the_limit_has_a_codec():
-    """Built without touching any of that memory; a dimension that is not fixed has its own limit."""
+    # At the limit it has a codec, built without touching any of that memory.
     schema = Schema("a", (field(ArrayType("uint8", (2**15, 2**15))),))
-    codec = codec_of(type_from_schema(schema))
-    assert codec.fixed_size == 2**30
+    assert codec_of(type_from_schema(schema)).fixed_size == 2**30
     assert Schema("a", (field(ArrayType("uint8", (2**31, "n"))),))
 
 
@@ -231,9 +216,6 @@ def test_description_shows_the_structure():
     assert "expected: unknown" in str(TypeMismatch("x", None, None))
 
 
-# Classes
-
-
 def test_a_class_from_a_schema():
     cls: Any = type_from_schema(schema_of(Scan))
     assert cls is type_from_schema(Schema.from_json(SCAN_TEXT))
@@ -265,13 +247,14 @@ def test_a_class_from_any_schema(schema):
 @pytest.mark.parametrize(
     "name", ["class", "None", "import", "lambda", "self", "cls", "copy", "mro", "_", "_a"]
 )
-def test_field_names_that_mean_something_to_python(name):
+def test_names_that_mean_something_to_python(name):
     cls: Any = type_from_schema(Schema("a", (field(name=name), field(name="other"))))
-    value = cls(1, 2)
-    assert getattr(value, name) == 1
-    body = codec_of(cls).encode(value, 100)
-    assert body is not None
-    assert getattr(codec_of(cls).decode(body), name) == 1
+    body = codec_of(cls).encode(cls(1, 2), 100)
+    assert getattr(cls(1, 2), name) == getattr(codec_of(cls).decode(body), name) == 1
+    if name in ("mro", "_"):
+        values = (("A", 1), ("mro" if name == "mro" else "_ignore_", 2))
+        with pytest.raises(SchemaError, match="cannot be an enum in Python"):
+            type_from_schema(Schema("a", (field(EnumType("E", values)),)))
 
 
 def test_no_code_is_generated_from_a_schema(monkeypatch):
@@ -288,12 +271,6 @@ def test_no_code_is_generated_from_a_schema(monkeypatch):
     monkeypatch.undo()
     assert cls(1, None, "x").s == "x"
     assert not any("wire" in text for text in texts)  # dataclasses runs an empty text, of no field
-
-
-@pytest.mark.parametrize("name", ["mro", "_ignore_"])
-def test_enum_values_that_python_cannot_have(name):
-    with pytest.raises(SchemaError, match="cannot be an enum in Python"):
-        type_from_schema(Schema("a", (field(EnumType("E", (("A", 1), (name, 2)))),)))
 
 
 def test_the_cache_of_classes_is_bounded():

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cortex.stats import BUCKETS, SubscriberCounters, array_of, quantile_ns
+from cortex.stats import BUCKETS, SubscriberCounters, quantile_ns
 
 
 def histogram(latencies_ns):
@@ -17,10 +16,6 @@ def histogram(latencies_ns):
     for latency in latencies_ns:
         counts[min(max(int(latency), 0).bit_length(), BUCKETS - 1)] += 1
     return counts
-
-
-def test_an_empty_histogram_has_no_quantile():
-    assert math.isnan(quantile_ns(SubscriberCounters().latency, 0.5))
 
 
 @given(st.lists(st.integers(0, 2**39 - 1), min_size=1, max_size=200), st.floats(0.0, 1.0))
@@ -33,21 +28,8 @@ def test_a_quantile_is_right_to_a_factor_of_two(latencies, fraction):
     assert low <= found <= max(2.0 * low, 1.0)
 
 
-@given(st.lists(st.integers(0, 2**45), min_size=1, max_size=200))
-def test_quantiles_grow(latencies):
-    found = [quantile_ns(histogram(latencies), fraction) for fraction in np.linspace(0.0, 1.0, 11)]
-    assert found == sorted(found)
-
-
 def test_the_extremes():
+    assert math.isnan(quantile_ns(SubscriberCounters().latency, 0.5))
     assert quantile_ns(histogram([0]), 0.5) <= 1.0
     assert quantile_ns(histogram([2**60]), 0.5) >= 2.0 ** (BUCKETS - 2)
     assert quantile_ns([0, 0, 0, 4] + [0] * 36, 0.5) == pytest.approx(6.0)  # the middle of [4, 8)
-
-
-def test_it_travels_as_an_array():
-    counters = SubscriberCounters()
-    counters.latency[3] = 7
-    array = array_of(counters.latency)
-    assert (array.dtype, array.shape) == (np.dtype("uint64"), (BUCKETS,))
-    assert array[3] == array.sum() == 7

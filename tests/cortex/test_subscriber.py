@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import queue
 import signal
 import threading
 import time
@@ -14,12 +13,11 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, OtherNumber, Scan, connect
-from processes import SOON_S, in_time, wait_for
+from processes import SOON_S, Beside, in_time, wait_for
 
 from cortex import keep_last, receive_lock, reliable
-from cortex.codec import codec_of
+from cortex.codec import RawMessage, codec_of
 from cortex.publisher import Closed
-from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
 
 LARGE = 100_000
@@ -27,9 +25,6 @@ LARGE = 100_000
 
 def scan(number, size=LARGE):
     return Scan(number, np.full(size, number, np.float32))
-
-
-# Blocking
 
 
 def test_nothing_comes_in_time(numbers):
@@ -88,26 +83,15 @@ def test_a_handler_that_uses_the_subscriber_it_has_interrupted_is_told_so(number
 def test_a_message_wakes_who_waits(numbers):
     """It does not wait for the next look: a tenth of a second would be that."""
     publisher, subscriber = numbers
-    asked, answered = queue.SimpleQueue(), queue.SimpleQueue()
-
-    def receive():
-        while asked.get():
-            sent_ns = subscriber.recv(SOON_S).stamp_ns
-            answered.put(time.monotonic_ns() - sent_ns)
 
     def delay_ns():
-        asked.put(True)
-        time.sleep(2e-3)  # so that it waits, most likely
-        publisher.publish(Number(time.monotonic_ns(), 0))
-        return answered.get(timeout=SOON_S)
+        with Beside(lambda: (subscriber.recv(SOON_S).stamp_ns, time.monotonic_ns())) as receiving:
+            time.sleep(2e-3)  # so that it waits, most likely
+            publisher.publish(Number(time.monotonic_ns(), 0))
+        ((sent_ns, received_ns),) = receiving.results
+        return received_ns - sent_ns
 
-    thread = threading.Thread(target=receive)
-    thread.start()
-    try:
-        wait_for(lambda: max(delay_ns() for _ in range(10)) < 0.02e9)  # the machine may be busy for a while
-    finally:
-        asked.put(False)
-        thread.join()
+    wait_for(lambda: max(delay_ns() for _ in range(10)) < 0.02e9)  # the machine may be busy for a while
 
 
 def test_what_is_known_of_a_message(node, numbers):
@@ -118,12 +102,8 @@ def test_what_is_known_of_a_message(node, numbers):
     for k in range(3):
         message, info = subscriber.recv_with_info(SOON_S)
         assert message == Number(1000 + k, k)
-        assert (info.topic, info.source, info.sequence, info.stamp_ns) == (
-            "/numbers",
-            publisher.source,
-            k,
-            1000 + k,
-        )
+        known = (info.topic, info.source, info.sequence, info.stamp_ns)
+        assert known == ("/numbers", publisher.source, k, 1000 + k)
         assert before_ns <= info.publish_ns <= time.monotonic_ns()
         assert 0 < info.latency_ns < 1e9 * SOON_S
         assert info.size == codec_of(Number).fixed_size
@@ -141,60 +121,34 @@ def test_arrays_cannot_be_written(node):
 
 
 def test_several_threads_share_a_stream(numbers):
-    """Each message goes to one of them."""
+    """Each message goes to one of them, and each ends when the stream is closed."""
     publisher, subscriber = numbers
-    taken = [[] for _ in range(4)]
-
-    def receive(values):
-        while True:
-            try:
-                values.append(subscriber.recv(SOON_S).value)
-            except Closed:
-                return
-
-    threads = [threading.Thread(target=receive, args=(values,)) for values in taken]
-    for thread in threads:
-        thread.start()
+    threads = [Beside(lambda: [message.value for message in subscriber]) for _ in range(4)]
     for value in range(2000):
         assert publisher.publish(Number(0, value))
-    wait_for(lambda: sum(map(len, taken)) >= 2000)
+    wait_for(lambda: subscriber.counters.received == 2000)
     subscriber.close()
-    for thread in threads:
-        thread.join(SOON_S)
-        assert not thread.is_alive()
+    taken = [values for thread in threads for values in thread.join()]
     assert sorted(itertools.chain.from_iterable(taken)) == list(range(2000))
     assert all(values == sorted(values) for values in taken)
-    assert subscriber.counters.received == 2000
-
-
-# Raw and generic
 
 
 @pytest.mark.parametrize("size", [3, LARGE])
 def test_raw_bodies(node, size):
-    """What echo and record read: bytes and schema, enough to decode."""
-    publisher = node.publisher("/scans", Scan)
-    subscriber = node.subscriber("/scans", None)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    publisher.publish(scan(5, size))
-    info, body, schema = subscriber.recv_raw(1.0)
-    assert schema == schema_of(Scan)
-    assert (info.sequence, info.stamp_ns, info.size) == (0, 5, len(body))
-    assert codec_of(Scan).decode(bytes(body)) == scan(5, size)
-
-
-def test_raw_bodies_are_published_as_they_are(node):
-    """What play does."""
+    """What echo and record read, bytes and schema; play publishes them as they are."""
     codec = codec_of(Scan)
-    publisher = node.raw_publisher("/scans", codec.schema)
-    subscriber = node.subscriber("/scans", Scan)
+    publisher, again = node.publisher("/scans", Scan), node.raw_publisher("/again", codec.schema)
+    subscriber, typed = node.subscriber("/scans", None), node.subscriber("/again", Scan)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    for size in (3, LARGE):
-        body = codec.encode(scan(6, size), 1 << 30)
-        publisher.publish(RawMessage(body, 6))
-        message, info = subscriber.recv_with_info(SOON_S)
-        assert message == scan(6, size)
-        assert info.stamp_ns == 6
+    assert again.wait_for_subscribers(timeout_s=SOON_S)
+    publisher.publish(scan(5, size))
+    info, body, schema = subscriber.recv_raw(SOON_S)
+    assert schema == codec.schema
+    assert (info.sequence, info.stamp_ns, info.size) == (0, 5, len(body))
+    assert codec.decode(bytes(body)) == scan(5, size)
+    again.publish(RawMessage(bytes(body), 6))
+    message, info = typed.recv_with_info(SOON_S)
+    assert (message, info.stamp_ns) == (scan(5, size), 6)
 
 
 def test_any_type_is_understood(node):
@@ -213,21 +167,17 @@ def test_any_type_is_understood(node):
         np.testing.assert_array_equal(got.ranges, scan(3, size).ranges)
 
 
-# Another type
-
-
 def test_another_type_is_told_once_with_both_structures(node):
+    """Whoever waits is told; then the messages of others come."""
     node.publisher("/numbers", OtherNumber)
     subscriber = node.subscriber("/numbers", Number)
+    messages = iter(subscriber)
     with pytest.raises(TypeMismatch) as caught:
-        subscriber.recv(SOON_S)
+        next(messages)
     text = str(caught.value)
-    assert "/numbers" in text
-    assert "expected" in text
-    assert "actual" in text
+    assert all(word in text for word in ("/numbers", "expected", "actual"))
     assert text.index("int64") < text.index("float64")
-    assert caught.value.expected == schema_of(Number)
-    assert caught.value.actual == schema_of(OtherNumber)
+    assert (caught.value.expected, caught.value.actual) == (schema_of(Number), schema_of(OtherNumber))
     assert subscriber.counters.rejected == 1
     with pytest.raises(TimeoutError, match="because of its type") as timeout:
         subscriber.recv(0.05)
@@ -238,62 +188,24 @@ def test_another_type_is_told_once_with_both_structures(node):
         subscriber.recv(0.05)
     assert timeout.value.__cause__ is None
     right.publish(Number(1, 1))
-    assert subscriber.recv(SOON_S) == Number(1, 1)
-
-
-# Iterators
-
-
-def test_an_iterator_ends_at_close(numbers):
-    publisher, subscriber = numbers
-    received = []
-
-    def iterate():
-        for message in subscriber:
-            received.append(message.value)
-
-    thread = threading.Thread(target=iterate)
-    thread.start()
-    for value in range(50):
-        publisher.publish(Number(0, value))
-    wait_for(lambda: len(received) == 50)
-    subscriber.close()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
-    assert received == list(range(50))
+    assert next(messages) == Number(1, 1)
 
 
 def test_use_after_close(numbers):
     _, subscriber = numbers
     subscriber.close()
     subscriber.close()
-    calls = [
+    for call in (
         lambda: subscriber.recv(0.0),
         lambda: subscriber.recv_with_info(0.0),
         lambda: subscriber.recv_raw(0.0),
         lambda: subscriber.wait_for_publisher(0.0),
         lambda: asyncio.run(subscriber.recv_async(0.0)),
-    ]
-    for call in calls:
+    ):
         with pytest.raises(Closed, match="/numbers is closed"):
             call()
     assert list(subscriber) == []
     assert subscriber.publisher_count == 0
-
-
-# Publishers that leave
-
-
-def test_what_was_sent_before_a_publisher_left_still_comes(node):
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
-    for round_ in range(3):
-        with node.publisher("/numbers", Number) as publisher:
-            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-            for value in range(100):
-                publisher.publish(Number(round_, value))
-        assert [subscriber.recv(SOON_S).value for _ in range(100)] == list(range(100))
-    counters = subscriber.counters
-    assert (counters.received, counters.lost) == (300, 0)
 
 
 def test_many_publishers_of_a_topic(node):
@@ -316,8 +228,7 @@ def test_many_publishers_of_a_topic(node):
 @pytest.mark.parametrize("policy", [reliable(16, 60.0), keep_last(64)], ids=str)
 def test_no_publisher_starves_another(node, policy, how):
     """Two that send more than is read: both come through."""
-    streams = {0: [], 1: []}
-    done = threading.Event()
+    streams, done = {0: [], 1: []}, threading.Event()
 
     def take(message):
         streams[message.stamp_ns].append(message.value)
@@ -331,30 +242,21 @@ def test_no_publisher_starves_another(node, policy, how):
     wait_for(lambda: subscriber.wait_for_publisher(SOON_S) and subscriber.publisher_count == 2)
 
     def publish(number):
-        value = 0
-        while not done.is_set():
+        for value in itertools.takewhile(lambda _: not done.is_set(), itertools.count()):
             publishers[number].publish(Number(number, value))
-            value += 1
-            if value % 8 == 0:
+            if value % 8 == 7:
                 time.sleep(50e-6)  # else it is the threads of this process that starve each other
 
-    threads = [threading.Thread(target=publish, args=(number,)) for number in range(2)]
-    for thread in threads:
-        thread.start()
-    deadline = time.monotonic() + SOON_S
+    threads = [Beside(publish, number) for number in range(2)]
     try:
-        while not done.is_set() and time.monotonic() < deadline:
-            if how == "callback":
-                done.wait(0.01)
-            else:
-                take(subscriber.recv(SOON_S))
+        if how == "recv":
+            wait_for(lambda: take(subscriber.recv(SOON_S)) or done.is_set(), every_s=0.0)
+        assert done.wait(SOON_S), {number: len(values) for number, values in streams.items()}
     finally:
-        starved = not done.is_set()
         done.set()
         subscriber.close()
         for thread in threads:
             thread.join()
-    assert not starved, {number: len(values) for number, values in streams.items()}
     assert all(values == sorted(values) for values in streams.values())
 
 
@@ -365,9 +267,13 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
     monkeypatch.setattr("cortex.subscriber.LEAVING_NS", 50_000_000)
     callback = (lambda message: None) if how == "callback" else None
     subscriber = node.subscriber("/numbers", Number, callback, policy=policy)
-    for _ in range(3):
+    for round_ in range(3):
         with node.publisher("/numbers", Number) as publisher:
             assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+            for value in range(10 if how == "recv" else 0):
+                publisher.publish(Number(round_, value))
+        if how == "recv":  # what was sent before still comes
+            assert [subscriber.recv(SOON_S) for _ in range(10)] == [Number(round_, k) for k in range(10)]
 
     def closed():
         with contextlib.suppress(TimeoutError):
@@ -378,6 +284,7 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
         return not subscriber.fds()
 
     wait_for(closed)
+    assert subscriber.counters.lost == 0
 
 
 def test_a_publisher_leaves_while_a_task_begins_to_wait(node, monkeypatch):
@@ -421,24 +328,10 @@ def test_a_publisher_that_left_is_let_go_while_another_waits_for_room(node, monk
     assert subscriber.counters.lost == 0
 
 
-def test_iteration_goes_on_after_a_mismatch(node):
-    """One publisher of another type is an error once; the others' messages still come."""
-    subscriber = node.subscriber("/numbers", Number)
-    good, bad = node.publisher("/numbers", Number), node.publisher("/numbers", OtherNumber)
-    assert good.wait_for_subscribers(timeout_s=SOON_S)
-    good.publish(Number(0, 7))
-    messages = iter(subscriber)
-    with pytest.raises(TypeMismatch):
-        next(messages)
-    assert next(messages).value == 7
-    bad.close()
-
-
 @pytest.mark.parametrize("how", ["recv", "recv_async"])
-def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how):
+def test_a_deadline_holds_while_what_comes_cannot_be_read(numbers, monkeypatch, how):
     """A publisher that only sends what is malformed does not keep a control loop waiting."""
-    publisher, subscriber = node.publisher("/number", Number), node.subscriber("/number", Number)
-    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    publisher, subscriber = numbers
     publisher.publish(Number(1, 1))
     assert subscriber.recv(SOON_S) == Number(1, 1)
     (link,) = subscriber._links
@@ -450,11 +343,114 @@ def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how
         return link.message_head + b"\xff" * 48
 
     monkeypatch.setattr(link, "receive", malformed)
-
-    async def receive() -> None:
-        await subscriber.recv_async(0.1)
-
     with pytest.raises(TimeoutError):
-        subscriber.recv(0.1) if how == "recv" else asyncio.run(receive())
+        subscriber.recv(0.1) if how == "recv" else asyncio.run(subscriber.recv_async(0.1))
     assert time.monotonic() < end_s
     assert subscriber.counters.rejected > 0
+
+
+def test_callbacks_are_called_in_order(node):
+    received = []
+    publisher, subscriber = connect(node, "/numbers", Number, reliable(64, 60.0), received.append)
+    for value in range(3000):
+        assert publisher.publish(Number(value, value))
+    wait_for(lambda: len(received) == 3000)
+    assert [message.value for message in received] == list(range(3000))
+    assert subscriber.counters.received == 3000
+    assert sum(subscriber.counters.latency) >= 3000 / 8
+
+
+def test_no_callback_after_close(node):
+    """When `close` has returned, nothing more is called, and nothing is under way."""
+    running, late, closed, started = [], [], threading.Event(), threading.Event()
+
+    def slow(message):
+        late.extend([message] if closed.is_set() else [])
+        running.append(message)
+        started.set()
+        time.sleep(0.02)
+        running.clear()
+
+    publisher, subscriber = connect(node, "/numbers", Number, callback=slow)
+    for value in range(30):
+        publisher.publish(Number(value, value))
+    assert started.wait(SOON_S)
+    subscriber.close()
+    assert not running
+    closed.set()
+    done = threading.Event()
+    node.subscriber("/numbers", Number, lambda message: done.set())
+    wait_for(lambda: publisher.publish(Number(0, 0)) and done.wait(0.01))
+    assert not late
+
+
+def test_a_callback_closes_its_subscriber(node):
+    """It is called no more, although messages were there already."""
+    received, subscribers = [], []
+
+    def once(message):
+        received.append(message.value)
+        subscribers[0].close()
+
+    publisher = node.publisher("/numbers", Number)
+    blocker, free = threading.Event(), threading.Event()
+    block, _ = connect(node, "/block", Number, callback=lambda _: (blocker.set(), free.wait(SOON_S)))
+    subscribers.append(node.subscriber("/numbers", Number, once))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    block.publish(Number(0, 0))
+    assert blocker.wait(SOON_S)
+    for value in range(10):
+        publisher.publish(Number(0, value))
+    free.set()
+    wait_for(lambda: publisher.subscriber_count == 0)
+    assert received == [0]
+
+
+def test_a_callback_closes_its_node(make_node):
+    node = make_node(registry="off")
+    closed = threading.Event()
+
+    def close(message):
+        node.close()
+        closed.set()
+
+    publisher, _ = connect(node, "/numbers", Number, callback=close)
+    publisher.publish(Number(0, 0))
+    assert closed.wait(SOON_S)
+    with pytest.raises(Closed):
+        publisher.publish(Number(0, 0))
+
+
+def test_a_callback_publishes_and_subscribes(node):
+    """A pipeline in one node: the callback thread may call whatever other threads may."""
+    received = []
+    second = node.publisher("/second", Number)
+    extra = []
+
+    def forward(message):
+        if not extra:
+            extra.append(node.subscriber("/second", Number, received.append, policy=reliable()))
+        second.publish(Number(message.stamp_ns, message.value + 1))
+
+    first, _ = connect(node, "/first", Number, reliable(), forward)
+    first.publish(Number(0, 0))
+    assert second.wait_for_subscribers(timeout_s=SOON_S)
+    for value in range(1, 100):
+        first.publish(Number(0, value))
+    wait_for(lambda: received and received[-1].value == 100)
+
+
+def test_coroutine_functions_are_refused(node):
+    """Called, they would give coroutines that nobody awaits: each message would be lost without a word."""
+
+    async def take(message):
+        pass
+
+    for call in (
+        lambda: node.subscriber("/numbers", Number, take),
+        lambda: node.service("/double", Number, Number, take),
+        lambda: node.watch("/**", take),
+    ):
+        with pytest.raises(TypeError, match=r"coroutine function .*take.*, which no loop would run"):
+            call()
+    assert not node.topics()

@@ -14,14 +14,14 @@ import threading
 import time
 
 import pytest
-from peer import Block, is_whole, make_block
-from processes import SOON_S, fork_server, wait_for
+from peer import Block, accounted, is_whole, make_block
+from processes import SOON_S, Beside, fork_server, wait_for
 
-from cortex import reliable
+import cortex.node
+from cortex import keep_last, reliable
 from cortex.context import Closed
 
 RUNS = int(os.environ.get("CORTEX_TCP_RUNS", "8"))
-KINDS = ["a publisher closes", "a publisher is killed", "a subscriber leaves", "connections are cut"]
 SIZES = [[40], [3_000], [40_000], [40, 40_000, 3_000, 200_000]]
 ELSEWHERE = {"listen": "127.0.0.1", "host": "elsewhere", "forked": True}
 
@@ -39,17 +39,12 @@ class Reading:
         self.subscriber = subscriber
         self.wrong = []
         self._pause_s = pause_s
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self._thread = Beside(self._run)
 
     def _run(self):
         last = -1
         with contextlib.suppress(Closed):
-            while True:
-                try:
-                    block = self.subscriber.recv(0.02)
-                except TimeoutError:
-                    continue
+            for block in self.subscriber:
                 if block.number <= last or not is_whole(block):
                     self.wrong.append(block.number)
                 last = block.number
@@ -57,8 +52,7 @@ class Reading:
                     time.sleep(self._pause_s)
 
     def accounted(self):
-        counters = self.subscriber.counters
-        return counters.received + counters.lost
+        return accounted(self.subscriber.counters)
 
     def wait_for_end(self):
         """Until its publisher has left, and all that came of it was read."""
@@ -66,8 +60,7 @@ class Reading:
 
     def close(self):
         self.subscriber.close()
-        self._thread.join(SOON_S)
-        assert not self._thread.is_alive()
+        self._thread.join()
         assert self.wrong == []
         assert self.subscriber.counters.rejected == self.subscriber.counters.overtaken == 0
 
@@ -81,22 +74,6 @@ def cut_connections(port):
             with socket.socket(fileno=os.dup(number)) as each:
                 if each.family in (socket.AF_INET, socket.AF_INET6) and each.getpeername()[1] == port:
                     each.shutdown(socket.SHUT_RDWR)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_reliable_over_tcp(make_node, start_child, runtime, tmp_path, kind):
-    generator = random.Random(kind)
-    node = make_node("here", listen="127.0.0.1")
-    run = {
-        KINDS[0]: a_publisher_closes,
-        KINDS[1]: a_publisher_is_killed,
-        KINDS[2]: a_subscriber_leaves,
-        KINDS[3]: connections_are_cut,
-    }[kind]
-    child = start_child("peer", **ELSEWHERE)
-    for _ in range(max(RUNS // len(KINDS), 1)):
-        run(node, child, start_child, generator, tmp_path)
-    child.finish()
 
 
 def read(node, generator):
@@ -232,3 +209,36 @@ def a_subscriber_leaves(node, child, start_child, generator, tmp_path):
     assert longest_s < SOON_S / 2.0
     child.ask(do="close", topic="/numbers")
     victim.end()
+
+
+def test_the_end_comes_after_a_full_queue(make_node, monkeypatch):
+    """A reader of a lossy socket learns how many messages there were, also where its queue was full."""
+    publisher = make_node("one", listen="127.0.0.1").publisher("/blocks", Block)
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(cortex.node, "host_id", lambda: "another host")
+        node = make_node("two", listen="127.0.0.1")
+    subscriber = node.subscriber("/blocks", Block, policy=keep_last(4))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert subscriber.wait_for_publisher(SOON_S)
+    assert subscriber.carriers == ["tcp"]
+    block, count = make_block(0, 10_000), 6_000
+    with subscriber._receive_lock:  # nobody reads: queues and buffers fill up, and the rest is dropped
+        for _ in range(count):
+            publisher.publish(block)
+        closing = Beside(publisher.close, linger_s=SOON_S)
+        closing.thread.join(0.3)
+        assert closing.thread.is_alive()  # the reader has not said yet that it knows
+    wait_for(lambda: accounted(subscriber.counters) + len(subscriber._queue) == count)
+    closing.join()
+    assert subscriber.counters.lost > 0
+
+
+@pytest.mark.parametrize(
+    "run", [a_publisher_closes, a_publisher_is_killed, a_subscriber_leaves, connections_are_cut]
+)
+def test_reliable_over_tcp(make_node, start_child, runtime, tmp_path, run):
+    node, generator = make_node("here", listen="127.0.0.1"), random.Random(run.__name__)
+    child = start_child("peer", **ELSEWHERE)
+    for _ in range(max(RUNS // 4, 1)):
+        run(node, child, start_child, generator, tmp_path)
+    child.finish()

@@ -15,9 +15,9 @@ from neurosim_core.scene.materials import (
     sample_finest,
     sample_nearest,
     sample_texture,
-    srgb_to_linear,
 )
 from neurosim_core.scene.scene import Material, Texture
+from neurosim_core.scene.srgb import srgb_to_linear
 
 
 @wp.kernel

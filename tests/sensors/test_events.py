@@ -578,7 +578,7 @@ def test_screen_changes_nothing():
     packets = []
     for screened in (True, False):
         camera = make_camera(50, 40, "cpu")
-        camera._pixels.screened = screened
+        camera._pixels.states.screened = screened
         camera.reset(frames[0])
         packets.append([camera.feed(frames[k : k + 8], np.arange(k, k + 8) * MS) for k in (1, 9, 17, 25)])
     for a, b in zip(*packets, strict=True):

@@ -16,7 +16,7 @@ from controller_commands import command_of
 
 import neurosim_core as ns
 from neurosim_core import sim
-from neurosim_core.control import make_controller
+from neurosim_core.control import Controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.render import launch
 from neurosim_core.runtime import cuda
@@ -578,7 +578,7 @@ def test_a_setpoint_is_what_its_controller_makes_of_the_state(outside_model, mod
     """Independent: the controller computes rotor speeds by itself, which are commanded as such."""
     model = outside_model
     direct, by_hand = sim.make_state(model), sim.make_state(model)
-    controller = make_controller(mode, model.airframe, model.config.control.gains, device=model.device)
+    controller = Controller(mode, model.airframe, model.config.control.gains, device=model.device)
     for _ in range(6):
         a = sim.step(model, direct, setpoint, mode=mode)
         now = sim.observe(by_hand)

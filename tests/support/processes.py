@@ -14,6 +14,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing import forkserver
@@ -47,6 +48,35 @@ def in_time(action: Callable[[], object], limit_s: float) -> None:
         return time.monotonic() - begin_s
 
     wait_for(lambda: took_s() < limit_s)
+
+
+class Beside:
+    """Does something in a thread, which has to end in time; as a context, once the block is over.
+
+    Args:
+        action: What to do; `results` will have what it returns.
+        *arguments: Of it.
+        **options: Of it.
+    """
+
+    def __init__(self, action: Callable[..., object], *arguments: Any, **options: Any) -> None:
+        self.results: list[Any] = []
+        self.thread = threading.Thread(
+            target=lambda: self.results.append(action(*arguments, **options)), daemon=True
+        )
+        self.thread.start()
+
+    def __enter__(self) -> Beside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.join()
+
+    def join(self, timeout_s: float = SOON_S) -> list[Any]:
+        """Wait for its end."""
+        self.thread.join(timeout_s)
+        assert not self.thread.is_alive(), "the thread does not end"
+        return self.results
 
 
 @functools.cache

@@ -74,9 +74,9 @@ def silent_error(config: MultirotorConfig, device: str) -> tuple[float, int]:
 
 @pytest.mark.parametrize("airframe", ["crazyflie", "hummingbird"])
 def test_no_mass_between_is_silently_off(airframe, device):
-    """Fixed steps are worst just above the mass at which the guard trips, so the masses lie 3 % apart."""
+    """At masses 12 % apart; fixed steps are worst just above the mass at which the guard trips: see below."""
     errors, counts = [], []
-    for mass_kg in np.geomspace(3e-6, 0.5, 400):
+    for mass_kg in np.geomspace(3e-6, 0.5, 100):
         error, redone = silent_error(preset(airframe, mass_kg=mass_kg, **STORM), device)
         errors.append(error)
         counts.append(redone)
@@ -108,7 +108,7 @@ def test_just_above_the_mass_that_trips_the_guard(airframe, device):
 @pytest.mark.parametrize("parameter", ["inertia", "lag"])
 def test_no_inertia_nor_lag_between_is_silently_off(parameter, device):
     inertia = np.array(preset("crazyflie").inertia_kg_m2)
-    for share in np.geomspace(1e-6, 1.0, 150):
+    for share in np.geomspace(1e-6, 1.0, 60):
         if parameter == "inertia":
             config = preset("crazyflie", inertia_kg_m2=tuple(map(tuple, (share * inertia).tolist())))
         else:

@@ -12,7 +12,7 @@ import pytest
 from controller_commands import command_of
 
 from neurosim_core.clock import Rate, to_ns
-from neurosim_core.control import MODES, PathFollower, Se3Config, make_controller, mode_kernel
+from neurosim_core.control import MODES, Controller, PathFollower, Se3Config, mode_kernel
 from neurosim_core.frames import Mount, as_rows, heading_rad
 from neurosim_core.trajectory import Path, TourConfig
 from neurosim_core.trajectory.feasibility import FlightLimits
@@ -51,7 +51,7 @@ def path() -> Path:
 
 
 def controller(mode: str, path: Path):
-    return make_controller(mode, HUMMINGBIRD, device="cpu", paths=path if mode == "path" else None)
+    return Controller(mode, HUMMINGBIRD, device="cpu", paths=path if mode == "path" else None)
 
 
 # Clock
@@ -151,7 +151,7 @@ def test_stamps_of_a_controller_have_64_bits(path):
 def test_batches_and_modes_exist():
     for bad, error in ((0, ValueError), (-3, ValueError), (1.5, TypeError), (NAN, TypeError)):
         with pytest.raises(error):
-            make_controller("rates", HUMMINGBIRD, count=bad)
+            Controller("rates", HUMMINGBIRD, count=bad)
     with pytest.raises(ValueError, match="unknown command mode 'fly'"):
         mode_kernel("fly")
 

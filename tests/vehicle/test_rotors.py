@@ -7,7 +7,7 @@ import pytest
 from multirotor_oracle import angle, derivative, solve
 from pydantic import ValidationError
 
-from neurosim_core.control import make_controller
+from neurosim_core.control import Controller
 from neurosim_core.vehicle import TERMS, Multirotor, MultirotorState, preset
 
 MS = 1_000_000
@@ -70,7 +70,7 @@ def test_a_controller_knows_its_rotors(device):
     """It hovers level on unlike rotors; on wrong beliefs about them it would tilt at once."""
     config = preset("hummingbird", rotor_thrust_scale=(1.0, 0.8, 1.1, 0.9), motor_time_constant_s=0.0)
     vehicle = Multirotor(config, device=device)
-    controller = make_controller("attitude", config, device=device)
+    controller = Controller("attitude", config, device=device)
     weight = config.mass_kg * config.gravity_m_s2
     controller.setpoint.assign([[weight, 0.0, 0.0, 0.0, 1.0]])
     controller.update(vehicle.arrays)

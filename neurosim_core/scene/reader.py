@@ -1,0 +1,101 @@
+"""Reads a scene in a process of its own, while the one that asks imports its libraries.
+
+Both would hold Python's interpreter lock most of the time: threads take turns. Arrays come in a file without
+a name, which is mapped into memory.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurosim_core.scene.config import SceneConfig
+    from neurosim_core.scene.scene import Scene
+
+_ALIGNMENT = 64
+
+
+class SceneReader:
+    """A process that reads a scene. A context manager, which ends it."""
+
+    def __init__(self, settings: Any) -> None:
+        """Start the process.
+
+        Args:
+            settings: Of the scene, unchecked; relative files are looked up from the working directory.
+        """
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
+        number = self._file.fileno()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, json.dumps(settings, default=str), str(number)],
+            pass_fds=[number],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def scene(self, config: SceneConfig) -> Scene:
+        """Wait for the scene and return it; what the process could not read is read here.
+
+        Args:
+            config: The settings, checked.
+
+        Raises:
+            SceneError: A file cannot be used.
+        """
+        if self._process.wait() == 0:
+            self._file.seek(0)
+            sizes, body = pickle.load(self._file)
+            data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
+            at, buffers = self._file.tell(), []
+            for size in sizes:
+                at += -at % _ALIGNMENT
+                buffers.append(data[at : at + size])
+                at += size
+            read, scene = pickle.loads(body, buffers=buffers)
+            if read == config:
+                return scene
+        return config.load()
+
+    def __enter__(self) -> SceneReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._file.close()
+
+
+def _write(settings: Any, number: int) -> None:
+    """Read a scene and write it to an open file."""
+    from neurosim_core.registry import find
+    from neurosim_core.scene.mesh import scene_kind
+
+    settings = {"kind": settings} if isinstance(settings, str) else settings
+    kind = scene_kind(settings)
+    config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **settings})  # type: ignore[attr-defined]
+    buffers: list[pickle.PickleBuffer] = []
+    body = pickle.dumps((config, config.load()), protocol=5, buffer_callback=buffers.append)
+    views = [buffer.raw() for buffer in buffers]
+    with os.fdopen(number, "wb") as file:
+        pickle.dump(([view.nbytes for view in views], body), file)
+        for view in views:
+            file.write(bytes(-file.tell() % _ALIGNMENT))
+            file.write(view)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
+    _write(json.loads(sys.argv[1]), int(sys.argv[2]))

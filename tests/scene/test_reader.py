@@ -1,0 +1,73 @@
+"""A scene that another process reads is the one that is loaded here."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+from small_room import room_scene
+
+import neurosim_core as ns
+from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.scene.reader import SceneReader
+from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.source import SceneError
+
+
+def arrays_of(scene: Scene) -> dict[str, Any]:
+    found = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+
+def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
+    file = tmp_path / "box.glb"
+    box = trimesh.creation.box(extents=(6.0, 4.0, 3.0))
+    image = PIL.Image.fromarray(np.arange(4 * 4 * 3, dtype=np.uint8).reshape(4, 4, 3))
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2] / 10.0, image=image)
+    box.export(file)
+    config = MeshSceneConfig(file=file)
+    loaded = config.load()
+    monkeypatch.setattr(MeshSceneConfig, "load", None)
+    with SceneReader({"file": str(file)}) as reader:
+        scene = reader.scene(config)
+    for name, values in arrays_of(loaded).items():
+        np.testing.assert_array_equal(getattr(scene, name), values, strict=True)
+    assert scene.notes == loaded.notes
+    assert (scene.lights, scene.instance_names) == (loaded.lights, loaded.instance_names)
+    textures = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
+    assert any(one is not None for one, _ in textures)
+    for one, other in textures:
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            np.testing.assert_array_equal(one.srgb, other.srgb)
+
+
+@pytest.mark.parametrize("settings", [{"kind": "mesh", "file": "elsewhere.ply"}, "hall", 3, {"kind": "no"}])
+def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    with SceneReader(settings) as reader:
+        assert reader.scene(config).name == "room"
+
+
+def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
+    with (
+        SceneReader({"file": "no.glb"}) as reader,
+        pytest.raises(SceneError, match=r"no\.glb: no such file"),
+    ):
+        reader.scene(MeshSceneConfig(file=Path("no.glb")))
+
+
+def test_a_scene_that_nobody_waits_for_is_given_up():
+    with SceneReader("apartment") as reader:
+        process = reader._process
+    assert process.returncode is not None
+
+
+def test_the_kind_of_a_scene_without_one_is_that_of_its_keys(tmp_path):
+    assert ns.load_config({"scene": {"file": str(tmp_path / "a.glb")}}).scene.kind == "mesh"
+    assert ns.load_config({"scene": {"seed": 3}}).scene.kind == "apartment"
