@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import zmq
 
+from cortex import control, records
 from cortex.clock import ClockEstimate
 from cortex.codec import MalformedMessage
-from cortex.control import (
-    HEARTBEAT_NS,
-    LEASE_NS,
-    STALL_NS,
-    control_types,
-    make_control_socket,
-    try_send,
-)
-from cortex.directory_link import DirectoryLink
 from cortex.host import REGISTRY_SOCKET, runtime_dir
-from cortex.records import (
-    CLOCK_OFFSET_MAX_NS,
-    Alive,
-    Changed,
-    Gone,
-    Heartbeat,
-    Hello,
-    Leave,
-    NodeRecord,
-    Refused,
-    Welcome,
-    check_record,
-)
 from cortex.registry import Registry, ensure_registry, main
 from cortex.security import Keys, apply_client, check_address, host_of
 from cortex.wire import Header, control_frame, parse_control
@@ -45,6 +24,7 @@ __all__ = ["Directory", "Registry", "ensure_registry", "main"]
 logger = logging.getLogger(__name__)
 
 _FRAMES_PER_CALL = 256
+_CONNECT_FIRST_NS = 2_000_000
 _CONNECT_LAST_NS = 50_000_000
 _ANSWER_NS = 300_000_000
 """A `Hello` that was not answered for this long is sent again, then after twice as long, up to a second."""
@@ -55,11 +35,54 @@ _REVIVE_FIRST_NS = 1_000_000_000
 _REVIVE_LAST_NS = 10_000_000_000
 
 
+@dataclass(eq=False)
+class _Link:
+    """What is known of the connection to the registry, and through it."""
+
+    address: str
+    socket: zmq.Socket[Any]
+    next_ns: int
+    """When to send the next heartbeat or `Hello`."""
+    heard_ns: int
+    """When the other side, or the start of our waiting for it, was last heard."""
+    wait_ns: int = _CONNECT_FIRST_NS
+    asked: bool = False
+    """Whether a `Hello` has been sent and not answered yet."""
+    quiet_ns: int = 0
+    """Until when an `Alive` is no reason for a further `Hello`."""
+    welcomed: bool = False
+    epoch: int = 0
+    version: int = 0
+    missing: dict[int, int] = field(default_factory=dict)
+    """Revisions that `Welcome` named and that have not arrived yet, by node."""
+    doubted: dict[int, int] = field(default_factory=dict)
+    """When to drop a node that the registry did not name in its last `Welcome` [ns]."""
+    warned: bool = False
+
+    def greet(self, now_ns: int) -> None:
+        """The other side has answered."""
+        if not self.welcomed:
+            self.next_ns = now_ns + control.HEARTBEAT_NS
+        self.welcomed, self.asked, self.quiet_ns = True, False, 0
+
+    def lose(self) -> None:
+        """The connection is gone. What was known through it stays, until its lease says otherwise."""
+        if self.welcomed or self.asked:
+            self.wait_ns = _CONNECT_FIRST_NS
+        self.welcomed = self.asked = False
+
+    def count(self, version: int) -> None:
+        """Take note of a change that the registry has numbered."""
+        # Records of a snapshot are older than the `Welcome` before them; a gap shows at the next `Alive`.
+        if self.welcomed and version == self.version + 1:
+            self.version = version
+
+
 class Directory:
     """Knows the other nodes of a domain, and makes this one known to them.
 
-    It belongs to one thread, which polls `socket`, calls `handle` when that is readable, and `tick` at
-    `deadline_ns`. `nodes` may be read from any thread: it is replaced when it changes, never altered.
+    It belongs to one thread, which polls `socket`, calls `handle` when that is readable, and `tick` often.
+    `nodes` may be read from any thread: it is replaced when it changes, never altered.
 
     Args:
         context: For the sockets.
@@ -81,16 +104,14 @@ class Directory:
         context: zmq.Context[Any],
         *,
         domain: int,
-        record: Callable[[], NodeRecord],
+        record: Callable[[], records.NodeRecord],
         registry: str = "auto",
         keys: Keys | None = None,
         insecure: bool = False,
         on_change: Callable[[frozenset[int]], None] | None = None,
     ):
-        self.nodes: Mapping[int, NodeRecord] = {}
-        """The other nodes' records, by node."""
+        self.nodes: Mapping[int, records.NodeRecord] = {}
         self.rejected = 0
-        """Control frames that were malformed."""
         self.clock = ClockEstimate(local=not registry.startswith("tcp://"))
         self._context = context
         self._domain = domain
@@ -107,20 +128,22 @@ class Directory:
         self._changed: set[int] = set()
         self._logged: set[str] = set()
         self._tick_ns = time.monotonic_ns()
-        self._link_types = control_types(Alive, Changed, Gone, Refused, Welcome)
-        self._link: DirectoryLink | None = None
+        self._link_types = control.control_types(
+            records.Alive, records.Changed, records.Gone, records.Refused, records.Welcome
+        )
+        self._link: _Link | None = None
         if registry != "off":
             address = f"ipc://{runtime_dir(domain) / REGISTRY_SOCKET}" if registry == "auto" else registry
             self._link = self._connect(address)
 
-    def _connect(self, address: str) -> DirectoryLink:
+    def _connect(self, address: str) -> _Link:
         if not address.startswith(("tcp://", "ipc://")):
             raise ValueError(
                 f'registry must be "auto", "off", or a tcp:// or ipc:// address, got {address!r}'
             )
         check_address(address, keys=self._keys, insecure=self._insecure)
         tcp = address.startswith("tcp://")
-        socket = make_control_socket(self._context, zmq.DEALER, tcp=tcp)
+        socket = control.make_control_socket(self._context, zmq.DEALER, tcp=tcp)
         try:
             # Nothing may queue for a registry that is not there: a `send` that fails tells us so at once.
             socket.setsockopt(zmq.IMMEDIATE, 1)
@@ -131,7 +154,7 @@ class Directory:
             socket.close(linger=0)
             raise
         now_ns = time.monotonic_ns()
-        return DirectoryLink(address, socket, next_ns=now_ns, heard_ns=now_ns)
+        return _Link(address, socket, next_ns=now_ns, heard_ns=now_ns)
 
     # What the owner drives
 
@@ -139,16 +162,6 @@ class Directory:
     def socket(self) -> zmq.Socket[Any] | None:
         """The socket to poll for input; None without a registry."""
         return None if self._link is None else self._link.socket
-
-    @property
-    def deadline_ns(self) -> int:
-        """When to call `tick` next, by CLOCK_MONOTONIC [ns]; earlier and later calls do no harm."""
-        times = [self._tick_ns + HEARTBEAT_NS]
-        if self._link is not None:
-            times.append(self._link.next_ns)
-        if self._dirty:
-            times.append(self._announced_ns + _ANNOUNCE_NS)
-        return min(times)
 
     @property
     def connected(self) -> bool:
@@ -173,7 +186,7 @@ class Directory:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
                 message, header = parse_control(frames[0], self._link_types)
-                if isinstance(message, Alive):
+                if isinstance(message, records.Alive):
                     self._read_clock(header, time.monotonic_ns())
                 self._on_message(link, message, now_ns)
             except MalformedMessage as error:
@@ -201,44 +214,46 @@ class Directory:
         """Take leave, and close the sockets."""
         if self._link is not None and not self._link.socket.closed:
             if self._link.welcomed:
-                try_send(self._link.socket, control_frame(Leave(self._own.node)))
+                control.try_send(self._link.socket, control_frame(records.Leave(self._own.node)))
             self._link.socket.close()
 
     # Sending
 
-    def _next_record(self) -> NodeRecord:
+    def _next_record(self) -> records.NodeRecord:
         self._dirty = False  # before the record is read: a change that comes now is announced once more
         self._revision += 1
-        return dataclasses.replace(self._record(), revision=self._revision)
+        return replace(self._record(), revision=self._revision)
 
-    def _beat(self, link: DirectoryLink, now_ns: int) -> None:
+    def _beat(self, link: _Link, now_ns: int) -> None:
         if not link.welcomed:
             self._say_hello(link, now_ns, snapshot=True)
             return
-        heartbeat = Heartbeat(self._own.node, self._own.revision, 0)
-        if try_send(link.socket, control_frame(heartbeat, time.monotonic_ns())):  # the answer returns it
-            link.next_ns = now_ns + HEARTBEAT_NS
+        heartbeat = records.Heartbeat(self._own.node, self._own.revision, 0)
+        if control.try_send(
+            link.socket, control_frame(heartbeat, time.monotonic_ns())
+        ):  # the answer returns it
+            link.next_ns = now_ns + control.HEARTBEAT_NS
             self._warn_of_silence(link, now_ns)
         else:
             link.lose()
             self._retry(link, now_ns)
 
-    def _say_hello(self, link: DirectoryLink, now_ns: int, *, snapshot: bool) -> None:
+    def _say_hello(self, link: _Link, now_ns: int, *, snapshot: bool) -> None:
         try:
-            frame = control_frame(Hello(snapshot, self._own))
+            frame = control_frame(records.Hello(snapshot, self._own))
         except ValueError as error:  # larger than any control frame may be
             self._log_once("this node cannot be announced", error)
-            link.next_ns = now_ns + LEASE_NS
+            link.next_ns = now_ns + control.LEASE_NS
             return
-        if not try_send(link.socket, frame):
+        if not control.try_send(link.socket, frame):
             link.lose()
             self._retry(link, now_ns)
             return
-        link.wait_ns = min(2 * link.wait_ns, LEASE_NS) if link.asked else _ANSWER_NS
+        link.wait_ns = min(2 * link.wait_ns, control.LEASE_NS) if link.asked else _ANSWER_NS
         link.asked, link.quiet_ns = True, now_ns + _ANSWER_NS
-        link.next_ns = now_ns + (HEARTBEAT_NS if link.welcomed else link.wait_ns)
+        link.next_ns = now_ns + (control.HEARTBEAT_NS if link.welcomed else link.wait_ns)
 
-    def _retry(self, link: DirectoryLink, now_ns: int) -> None:
+    def _retry(self, link: _Link, now_ns: int) -> None:
         link.next_ns = now_ns + link.wait_ns
         link.wait_ns = min(2 * link.wait_ns, _CONNECT_LAST_NS)
         self._warn_of_silence(link, now_ns)
@@ -255,7 +270,7 @@ class Directory:
         self._revive_ns = now_ns + self._revive_wait_ns
         self._revive_wait_ns = min(2 * self._revive_wait_ns, _REVIVE_LAST_NS)
 
-    def _warn_of_silence(self, link: DirectoryLink, now_ns: int) -> None:
+    def _warn_of_silence(self, link: _Link, now_ns: int) -> None:
         if now_ns - link.heard_ns > _SILENCE_NS and not link.warned:
             link.warned = True
             keys = " and are its key and ours authorised?" if self._keys and "tcp:" in link.address else ""
@@ -263,18 +278,18 @@ class Directory:
 
     # Receiving
 
-    def _on_message(self, link: DirectoryLink, message: Any, now_ns: int) -> None:
+    def _on_message(self, link: _Link, message: Any, now_ns: int) -> None:
         link.heard_ns, link.warned = now_ns, False
-        if isinstance(message, Refused):
+        if isinstance(message, records.Refused):
             self._log_once(f"{link.address} refuses this node", message.reason)
-            link.wait_ns, link.quiet_ns = LEASE_NS, now_ns + LEASE_NS
+            link.wait_ns, link.quiet_ns = control.LEASE_NS, now_ns + control.LEASE_NS
             if not link.welcomed:
                 link.next_ns = link.quiet_ns
-        elif isinstance(message, Welcome):
+        elif isinstance(message, records.Welcome):
             self._on_welcome(link, message, now_ns)
-        elif isinstance(message, Alive):
+        elif isinstance(message, records.Alive):
             self._on_alive(link, message, now_ns)
-        elif isinstance(message, Gone):
+        elif isinstance(message, records.Gone):
             link.count(message.version)
             link.missing.pop(message.node, None)
             link.doubted.pop(message.node, None)
@@ -283,11 +298,11 @@ class Directory:
             self._on_changed(link, message)
 
     def _read_clock(self, header: Header, now_ns: int) -> None:
-        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < CLOCK_OFFSET_MAX_NS
+        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < records.CLOCK_OFFSET_MAX_NS
         if is_told and not self.clock.local:
             self.clock.add(header.sequence, header.publish_ns, now_ns)
 
-    def _on_welcome(self, link: DirectoryLink, welcome: Welcome, now_ns: int) -> None:
+    def _on_welcome(self, link: _Link, welcome: records.Welcome, now_ns: int) -> None:
         if len(welcome.nodes) != len(welcome.revisions):
             raise MalformedMessage("a welcome with lists of different lengths")
         link.greet(now_ns)
@@ -303,10 +318,14 @@ class Directory:
             if node not in self.nodes or self.nodes[node].revision != revision
         }
         # A registry that was just started does not know everybody yet: one lease of grace.
-        since = {node: link.doubted.get(node, now_ns + LEASE_NS) for node in self.nodes if node not in named}
+        since = {
+            node: link.doubted.get(node, now_ns + control.LEASE_NS)
+            for node in self.nodes
+            if node not in named
+        }
         link.doubted = since
 
-    def _on_alive(self, link: DirectoryLink, alive: Alive, now_ns: int) -> None:
+    def _on_alive(self, link: _Link, alive: records.Alive, now_ns: int) -> None:
         if not link.welcomed or now_ns < link.quiet_ns:
             return  # the answer to our last `Hello` is on its way and says more
         if alive.epoch != link.epoch or alive.version != link.version or link.missing:
@@ -314,9 +333,9 @@ class Directory:
         elif alive.held != self._own.revision:
             self._say_hello(link, now_ns, snapshot=False)
 
-    def _on_changed(self, link: DirectoryLink, changed: Changed) -> None:
+    def _on_changed(self, link: _Link, changed: records.Changed) -> None:
         record = changed.record
-        check_record(record)
+        records.check_record(record)
         link.count(changed.version)
         link.missing.pop(record.node, None)
         link.doubted.pop(record.node, None)
@@ -330,11 +349,11 @@ class Directory:
     def _forgive_stall(self, stall_ns: int) -> None:
         """If this process was stopped, the others' silence is ours: their leases start where they stood."""
         link = self._link
-        if stall_ns > STALL_NS and link is not None:
+        if stall_ns > control.STALL_NS and link is not None:
             link.heard_ns += stall_ns
             link.doubted = {node: at_ns + stall_ns for node, at_ns in link.doubted.items()}
 
-    def _expire(self, link: DirectoryLink, now_ns: int) -> None:
+    def _expire(self, link: _Link, now_ns: int) -> None:
         if link.welcomed:  # without a registry nobody is removed
             for node in [node for node, at_ns in link.doubted.items() if now_ns > at_ns]:
                 link.doubted.pop(node)

@@ -9,7 +9,6 @@ Reference: Prophesee, "EVT 3.0 format".
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +18,6 @@ Buffer = bytes | bytearray | memoryview
 Bytes = NDArray[np.uint8]
 Code = NDArray[np.uint8]
 Words = NDArray[np.uint16]
-Allocate = Callable[[int], Bytes]
-"""Returns so many bytes to write to, or a few more, at an address that is a multiple of 4."""
 
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x8
 _KNOWN = {_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 0x7, 0xA, 0xE, 0xF}
@@ -60,27 +57,18 @@ class Evt3Encoder:
     one time, row and polarity that lie close together become vectors of 12 columns where that is shorter.
     Where time wraps, the last and the first value of its high half are written, so that a decoder notices it
     even after a silence of any length up to an hour.
+
+    Args:
+        begin_us: Time from which on wraps are written [us]; None: that of the first packet.
+        epochs_max: Most wraps that are written for one silence; a longer one sets time anew.
     """
 
     def __init__(self, *, begin_us: int | None = None, epochs_max: int = _EPOCHS_MAX) -> None:
-        """Begin before the first packet.
-
-        Args:
-            begin_us: Time from which on wraps are written [us]; None: that of the first packet.
-            epochs_max: Most wraps that are written for one silence; a longer one sets time anew.
-        """
         self._epochs_max = epochs_max
         self._epoch = None if begin_us is None else begin_us >> _EPOCH_BITS
         self._kept: dict[str, NDArray[Any]] = {}
 
-    def encode(
-        self,
-        events: EventColumns,
-        *,
-        width: int,
-        height: int,
-        end_us: int,
-    ) -> Bytes:
+    def encode(self, events: EventColumns, *, width: int, height: int, end_us: int) -> Bytes:
         """Return a packet, in which time is written before the first event.
 
         Args:
@@ -169,9 +157,7 @@ class Evt3Encoder:
     def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> _Vectors | None:
         """Find groups of events that are shorter as vectors: neighbours at most 11 columns apart.
 
-        Args:
-            column: Column and polarity of each event.
-            apart: 0 where an event has time and row of the one before.
+        `apart` is 0 where an event has time and row of the one before.
         """
         n = len(column)
         gap = np.subtract(column[1:], column[:-1], out=self._room("gap", n - 1, np.uint16))
@@ -207,15 +193,14 @@ class Evt3Encoder:
 
 
 class Evt3Decoder:
-    """Decodes the packets of one camera, one after the other; also what sensors of Prophesee write."""
+    """Decodes the packets of one camera, one after the other; also what sensors of Prophesee write.
+
+    Args:
+        start_us: Time of the first event, known to 8 s [us]: 24 bits do not say how often time has wrapped
+            before. None: it has not.
+    """
 
     def __init__(self, *, start_us: int | None = None) -> None:
-        """Begin before the first packet.
-
-        Args:
-            start_us: Time of its first event, known to 8 s [us]: 24 bits do not say how often time has
-                wrapped before. None: it has not.
-        """
         self._start_us = start_us
         self._is_timed = False
         self._high = 0
@@ -276,7 +261,6 @@ class Evt3Decoder:
     def _columns(
         self, code: Code, value: Words, used: set[int]
     ) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
-        """Return the word, the column and the polarity of each event."""
         where = np.flatnonzero(code == _ADDR_X)
         x, polarity = value[where] & 0x7FF, value[where] >> 11
         if not used & {_BASE_X, _VECT_12, _VECT_8}:
@@ -334,11 +318,9 @@ class _Vectors(NamedTuple):
     groups: NDArray[np.intp]
     """First events of groups: their columns are the bases."""
     members: NDArray[np.intp]
-    """All events of groups."""
     windows: NDArray[np.intp]
     """First events of vectors."""
     bits: Words
-    """The words of these vectors."""
 
 
 class _Places(NamedTuple):
@@ -356,7 +338,6 @@ class _Places(NamedTuple):
     new_low: NDArray[np.intp]
     """Events before which one is written."""
     high: Words
-    """Words of high halves."""
     new_high: NDArray[np.intp]
     vectors: _Vectors | None
 
@@ -404,7 +385,7 @@ def hold_value(
     *,
     selected: bool = False,
 ) -> tuple[NDArray[np.int64], int]:
-    """Hold a value until the next one.
+    """Hold a value, of all words that set it, until the next one; return it at some words, and the last one.
 
     Args:
         mask: Which words set it.
@@ -412,9 +393,6 @@ def hold_value(
         initial: Value before the first one.
         where: Words at which the value is asked for.
         selected: See `values`.
-
-    Returns:
-        The values there, and the last one.
     """
     set_to = values if selected else values[mask]
     table = np.concatenate([[initial], set_to.astype(np.int64)])

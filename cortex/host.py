@@ -38,16 +38,12 @@ def domain_id(domain: int | None = None) -> int:
     Raises:
         ValueError: If it is not an integer from 0 to 232.
     """
-    source = "domain"
+    source, given = "domain", str(domain)
     if domain is None:
-        source = "CORTEX_DOMAIN"
-        text = os.environ.get(source, "0")
-        domain = int(text) if text.isascii() and text.isdigit() else -1
-        shown: object = text
-    else:
-        shown = domain
+        source, given = "CORTEX_DOMAIN", os.environ.get("CORTEX_DOMAIN", "0")
+        domain = int(given) if given.isascii() and given.isdigit() else -1
     if not isinstance(domain, int) or isinstance(domain, bool) or not 0 <= domain <= DOMAIN_MAX:
-        raise ValueError(f"{source} must be an integer from 0 to {DOMAIN_MAX}, got {shown!r}")
+        raise ValueError(f"{source} must be an integer from 0 to {DOMAIN_MAX}, got {given}")
     return domain
 
 

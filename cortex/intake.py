@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from functools import partial
 from typing import Any
 
 import zmq
@@ -34,7 +35,9 @@ class Intake:
         """To all publishers; always this list."""
         self.queue: deque[Item] = deque()
         """What has been read and not been asked for; always this one."""
-        self.fast_receive = make_fast_receive(receive_lock, self.queue, counters, self._accept_timed)
+        self.fast_receive = make_fast_receive(
+            receive_lock, self.queue, counters, partial(self.accept, timed=True)
+        )
         """The short way past all this."""
         self.drained_ns = 0
         """When the sockets were last read as a whole."""
@@ -229,9 +232,6 @@ class Intake:
         if timed:
             self._time(publish_ns, link)
         self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)))
-
-    def _accept_timed(self, link: Link, frame: bytes) -> None:
-        self.accept(link, frame, timed=True)
 
     def _rotated(self) -> list[Link]:
         """The links, a different one first each time, so that no publisher starves another."""

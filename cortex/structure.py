@@ -53,11 +53,6 @@ def finish_class(cls: type, names: tuple[str, ...], shell_init: Callable[..., No
 
     The shell, `__cortex_shell__`, is a subclass of the same layout that may be written to. Filling a shell
     and then changing its class is several times faster than `object.__setattr__` for each field.
-
-    Args:
-        cls: The class.
-        names: Its fields in order.
-        shell_init: Sets all fields, given in order; runs on the shell.
     """
     methods: dict[str, Any] = {"__eq__": _equal, "__hash__": None, "__repr__": _show}
     for name, method in methods.items():

@@ -312,11 +312,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Settings of the command line, by dotted key.
-
-    Raises:
-        ValueError: One is not KEY=VALUE.
-    """
+    """Settings of the command line, by dotted key."""
     overrides = read_settings(arguments.settings)
     for key, value in (
         ("duration_s", arguments.duration),

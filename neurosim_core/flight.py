@@ -37,12 +37,8 @@ from neurosim_core.warp_start import has_kernels
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
     """Return the folder for a new flight; `fly` makes it once there is something to put in it.
 
-    Args:
-        out: Where the user wants it; None: ./flight, or ./flight-2, ... if there is one already.
-        overwrite: Replace a flight that is already in `out`.
-
-    Raises:
-        FileExistsError: `out` holds a flight and may not be overwritten.
+    `out`: where the user wants it; None: ./flight, or ./flight-2, ... if there is one already. `overwrite`:
+    replace a flight that is already in `out`.
     """
     if out is None:
         names = (Path("flight" if number == 1 else f"flight-{number}") for number in itertools.count(1))
@@ -166,13 +162,7 @@ def fly(
 def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     """Return the Rerun file of a flight; write it from the recording if there is none, or to `save` if given.
 
-    Args:
-        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
-        save: Write here.
-
-    Raises:
-        FileNotFoundError: There is no flight.
-        ImportError: Rerun or h5py is not installed.
+    `flight`: the folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
     """
     from neurosim_core.io import is_event_file
     from neurosim_core.io.transfer import as_recording
@@ -218,9 +208,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
 def header_of(model: Model, config: SimulationConfig | None = None) -> RecordingHeader:
     """Return what goes with the packets of a flight.
 
-    Args:
-        model: What is flown.
-        config: Settings that hold in place of those of the model.
+    `config`: settings that hold in place of those of the model.
     """
     config = model.config if config is None else config
     stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
@@ -239,13 +227,7 @@ def header_of(model: Model, config: SimulationConfig | None = None) -> Recording
 def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]:
     """Give what takes the packets of a flight, and write them to a file at the end.
 
-    Args:
-        file: A recording (.h5), or a film of it (.webp, .gif).
-        model: What is flown.
-
-    Raises:
-        ValueError: The file is neither, or a film has nothing to show.
-        OSError: The file cannot be written.
+    `file`: a recording (.h5), or a film of it (.webp, .gif).
     """
     from neurosim_core.view.film import SUFFIXES, save_film
 

@@ -24,7 +24,6 @@ from cortex.bench import roles
 from cortex.bench.cases import METRICS, Bar, Case, Contestant
 from cortex.bench.peers import Job, missing
 from cortex.bench.processes import Child, ChildFailed
-from cortex.bench.tally import make_payloads
 
 _SHM = Path("/dev/shm")
 _GRACE_S = 120.0
@@ -96,9 +95,8 @@ class Verdict(NamedTuple):
     @property
     def is_open(self) -> bool:
         """Whether the bar lies between the quartiles: more repetitions might give another verdict."""
-        return bool(
-            self.measured and not self.note and self.measured.low < self.bar.bound < self.measured.high
-        )
+        found = None if self.note else self.measured
+        return found is not None and found.low < self.bar.bound < found.high
 
 
 def judge(bar: Bar, results: dict[str, list[Report]]) -> Verdict:
@@ -145,7 +143,6 @@ def run_case(case: Case, settings: Settings) -> CaseResult:
 
 
 def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str, Any]:
-    """Do one repetition in a directory of its own; a failure becomes the report's ``error``."""
     runs: dict[str, Callable[..., dict[str, Any]]] = {
         "flood": partial(_flood, subscribers=case.subscribers),
         "roundtrip": _round_trips,
@@ -220,9 +217,7 @@ def _reader_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
 
 
 def _copies(job: Job, child: Callable[..., Child]) -> Any:
-    """Copy into a private array, or into a ring."""
-    ring = roles.make_ring(job) if job.options else [np.zeros(job.floats, np.float32)]
-    with child(roles.copy, (job.seconds, list(make_payloads(job.floats)), ring)) as copier:
+    with child(roles.copy, job) as copier:
         copier.expect()
         copier.tell("go")
         return copier.expect()

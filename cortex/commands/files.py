@@ -116,10 +116,6 @@ def play(options: argparse.Namespace) -> int:
             open_node(options) as node,
             Player(node, log, topics=options.topic or None, remap=remap) as player,
         ):
-            if options.paused:
-                player.pause()
-                threading.Thread(target=_toggle_on_enter, args=(player,), daemon=True).start()
-                hint("paused; Enter goes on and pauses again")
             progress = threading.Thread(target=_show_progress, args=(player, log), daemon=True)
             progress.start()
             status = 0
@@ -158,17 +154,11 @@ def _split(pair: str) -> tuple[str, str]:
     return old, new
 
 
-def _toggle_on_enter(player: Player) -> None:
-    for _ in sys.stdin:
-        (player.resume if player.paused else player.pause)()
-
-
 def _show_progress(player: Player, log: Log) -> None:
     if not sys.stderr.isatty():
         return
     while not player.wait_stopped(_TICK_S):
-        state = "  paused" if player.paused else ""
         played = number_of(player.published, "message")
-        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {played}{state}"
+        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {played}"
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
     print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -547,11 +547,7 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
 
 
 def import_h5py() -> ModuleType:
-    """Return the module `h5py`.
-
-    Raises:
-        ImportError: It is not installed; the message says what to install.
-    """
+    """Return the module `h5py`."""
     try:
         import h5py
     except ImportError as error:

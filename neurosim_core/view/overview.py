@@ -83,9 +83,8 @@ class FlightSummary:
     ) -> None:
         """Start empty.
 
-        Args:
-            sensors: Sensors of the flight; the orientation of the first camera is used.
-            event_window_ns: Length of the window of events that is shown [ns].
+        `sensors`: sensors of the flight; the orientation of the first camera is used. `event_window_ns`:
+        length of the window of events that is shown [ns].
         """
         self._window_ns = event_window_ns
         cameras = [s for s in sensors if s.intrinsics is not None]

@@ -40,8 +40,7 @@ pytestmark = pytest.mark.usefixtures("runtime")
 @pytest.fixture
 def long_leases(monkeypatch):
     """No lease of this process runs out during a test: what ends before has another reason."""
-    for name in ("discovery", "registry"):
-        monkeypatch.setattr(f"cortex.{name}.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
+    monkeypatch.setattr("cortex.control.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
 
 
 def test_two_nodes_see_each_other_change_and_leave(make, long_leases):

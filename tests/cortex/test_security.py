@@ -130,7 +130,7 @@ def test_keys_are_private_and_never_overwritten(tmp_path):
         ),
         (AUTHORIZED_FILE, None, 0o666, PermissionError, "chmod 0644"),
         (AUTHORIZED_FILE, "# fine\nnonsense here\n", 0o644, ValueError, r"_keys:2 must be a key.*'nonsense'"),
-        (PUBLIC_FILE, pair().public, 0o644, ValueError, "does not belong"),
+        (PUBLIC_FILE, "a" * 40, 0o644, ValueError, "does not belong"),
     ],
 )
 def test_keys_that_are_open_to_others_or_broken_are_refused(tmp_path, file, text, mode, error, said):
