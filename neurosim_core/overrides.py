@@ -22,11 +22,7 @@ def set_options(settings: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def read_settings(texts: Sequence[str]) -> dict[str, Any]:
-    """Return values by dotted key; a value is read as YAML.
-
-    Raises:
-        ValueError: A text is not KEY=VALUE, or its value is no YAML.
-    """
+    """Return values by dotted key; a value is read as YAML."""
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")

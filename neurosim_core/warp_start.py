@@ -23,9 +23,6 @@ def start_warp() -> None:
     The line about a CUDA driver or device that is missing, or hidden by CUDA_VISIBLE_DEVICES, is written by
     native code straight to the standard error stream: the stream is held back while Warp starts, and what
     else was written to it is written again.
-
-    Raises:
-        RuntimeError: This process was forked from one that had computed.
     """
     started = _owner is not None
     refuse_forked_process()
@@ -72,11 +69,7 @@ def _header_version() -> str:
 
 
 def refuse_forked_process() -> None:
-    """Refuse to compute in a process that was forked after Warp had started: it would wait forever.
-
-    Raises:
-        RuntimeError: It was; threads and CUDA contexts of the parent do not exist in it.
-    """
+    """Refuse to compute in a process that was forked after Warp had started: it would wait forever."""
     global _owner
     if _owner is None:
         _owner = os.getpid()

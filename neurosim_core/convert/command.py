@@ -192,11 +192,7 @@ def _convert_video(arguments: argparse.Namespace) -> int:
 
 
 def read_config(arguments: argparse.Namespace) -> ConversionConfig:
-    """Return the settings of a command line.
-
-    Raises:
-        ValueError: One is unknown or out of range; the message has one line for each.
-    """
+    """Return the settings of a command line."""
     from pydantic import ValidationError
 
     from neurosim_core.config_errors import explain

@@ -93,15 +93,8 @@ class EventStats:
 def measure_events(path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> EventStats:
     """Return the statistics of a file of events of any format.
 
-    Args:
-        path: The file.
-        size: Width and height of the sensor [px], where the file does not say it.
-        sensor: Event camera, of files that hold several; empty: the first.
-
-    Raises:
-        EventFileError: It is damaged.
-        ImportError: A library for its format is not installed.
-        OSError: It cannot be read.
+    `size`: width and height of the sensor [px], where the file does not say it. `sensor`: event camera, of
+    files that hold several; empty: the first.
     """
     with closing(open_events(path, size=size, sensor=sensor)) as reader:
         stats = EventStats(name=path.name, width=reader.width, height=reader.height)
@@ -198,11 +191,7 @@ def _radial(power: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty figure of matplotlib, of 100 px an inch.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+    """Return an empty figure of matplotlib, of 100 px an inch."""
     try:
         import matplotlib.figure
     except ImportError as error:
@@ -211,12 +200,7 @@ def new_figure(width_in: float, height_in: float) -> Any:
 
 
 def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
-    """Draw a page that compares files, as PNG, PDF or SVG.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        OSError: It cannot be written.
-    """
+    """Draw a page that compares files, as PNG, PDF or SVG."""
     figure = new_figure(14.0, 9.0)
     grid = figure.add_gridspec(3, 6, height_ratios=[1.0, 1.0, 0.9])
     plots = [figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])]

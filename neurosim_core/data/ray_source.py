@@ -158,15 +158,7 @@ def make_flights_on_ray(
 ) -> Iterator[int]:
     """Do what `make_flights` does, on a cluster: recordings are sent here, and no disk need be shared.
 
-    Args:
-        plan: See `make_flights`.
-        address: See `cluster`.
-        workers: How many tasks at a time.
-        stopped: See `make_flights`.
-
-    Raises:
-        ImportError, ConnectionError: See `cluster`.
-        OSError, ValueError: A flight cannot be made.
+    `plan`: see `make_flights`. `address`: see `cluster`. `stopped`: see `make_flights`.
     """
     waiting = stretches_of(plan, workers)
     with cluster(address) as ray:

@@ -121,14 +121,7 @@ def fit_sensor(
 ) -> SensorFit:
     """Return the settings of an event camera whose recordings are like those given.
 
-    Args:
-        stimulus: The recordings.
-        repeats: Simulations for the standard errors, at least 2.
-        seed: Of the simulations.
-        progress: Is told what is done.
-
-    Raises:
-        ValueError: The recordings do not show what they must.
+    `repeats`: simulations for the standard errors, at least 2.
     """
     if repeats < 2:
         raise ValueError(f"repeats must be >= 2, got {repeats}")

@@ -65,11 +65,7 @@ class Evt2Decoder:
         self._high: int | None = None
 
     def decode(self, data: Any) -> EventArrays:
-        """Return the events of some words; those before the first time are left out.
-
-        Raises:
-            EventCodecError: A word is of no kind that EVT2 has.
-        """
+        """Return the events of some words; those before the first time are left out."""
         words = np.frombuffer(data, "<u4")
         code = words >> 28
         used = set(np.flatnonzero(np.bincount(code, minlength=16)).tolist())

@@ -40,12 +40,7 @@ _SPAN_MAX_US = 30 * 24 * 3_600_000_000
 
 
 def open_hdf5(path: Path) -> Any:
-    """Open an HDF5 file for reading.
-
-    Raises:
-        EventFileError: It is no HDF5 file, or not a whole one.
-        OSError: It cannot be read.
-    """
+    """Open an HDF5 file for reading."""
     h5py = import_h5py()
     with contextlib.suppress(ImportError):  # filters of files of DSEC, for whoever has them
         import_module("hdf5plugin")

@@ -23,13 +23,7 @@ _EVENTS = "events"
 
 
 def open_mcap(path: Path, *, sensor: str = "") -> EventSource:
-    """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2.
-
-    Raises:
-        EventFileError: It is neither, or has no events.
-        ImportError: A library is not installed.
-        OSError: It cannot be read.
-    """
+    """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2."""
     from neurosim_core.io.cortex_log import LogSource
 
     with open(path, "rb") as file:

@@ -42,11 +42,7 @@ if TYPE_CHECKING:  # isort: off
 
 
 def need(*modules: str) -> Any:
-    """Import libraries of the extra, and return the first.
-
-    Raises:
-        ImportError: One is not installed; says how to install it.
-    """
+    """Import libraries of the extra, and return the first."""
     try:
         found = [importlib.import_module(module) for module in modules]
         return found[0]

@@ -70,12 +70,7 @@ class PathPlanner:
             process.stdin.flush()
 
     def result(self) -> list[Path]:
-        """Wait for the paths that were begun, and return them in their order.
-
-        Raises:
-            ValueError: One does not exist.
-            RuntimeError: A process has died.
-        """
+        """Wait for the paths that were begun, and return them in their order."""
         answers: list[Iterator[Path]] = []
         for process in self._processes:
             assert process.stdout is not None

@@ -129,11 +129,7 @@ class DepthErrorSums:
                 self._cuts[:, index] += torch.stack([off_m[near].sum(), near.sum().double()]).cpu()
 
     def result(self) -> DepthErrors:
-        """Return the errors of all pictures.
-
-        Raises:
-            ValueError: None has a depth.
-        """
+        """Return the errors of all pictures."""
         if self._count == 0:
             raise ValueError("no picture has a depth to compare with")
         abs_rel, squared, *deltas = (self._sums / self._count).tolist()

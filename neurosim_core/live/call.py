@@ -27,15 +27,8 @@ GRACE_S = 1.0
 def call(arguments: argparse.Namespace) -> int:
     """Send the request of a command line, and print the answer.
 
-    Args:
-        arguments: As `neurosim call` parses them: `what`, `timeout` [s], and the arguments of the request.
-
-    Returns:
-        0 if it was done, 1 if it was refused.
-
-    Raises:
-        ValueError: A value of the command line is not allowed.
-        RuntimeError: There is no simulator, or it does not answer in time.
+    `arguments`: as `neurosim call` parses them: `what`, `timeout` [s], and the arguments of the request.
+    Returns 0 if it was done, 1 if it was refused.
     """
     console = Console(highlight=False, soft_wrap=True)
     timeout_s = arguments.timeout
@@ -58,11 +51,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
-    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text.
-
-    Raises:
-        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false, text nor a list.
-    """
+    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text."""
     values: dict[str, Any] = {}
     for setting in settings:
         key, separator, text = setting.partition("=")
@@ -115,10 +104,8 @@ def describe_status(
 ) -> str:
     """Return a status as Markdown: the run, its vehicles, its sensors.
 
-    Args:
-        status: The status.
-        rates_hz: Messages a second of simulated time [Hz], by vehicle and sensor, if known.
-        lost: Messages that a viewer has not received, by vehicle and sensor, if known.
+    `rates_hz`: messages a second of simulated time [Hz], by vehicle and sensor, if known. `lost`: messages
+    that a viewer has not received, by vehicle and sensor, if known.
     """
     run = f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods"
     counts = f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s"
@@ -192,14 +179,7 @@ def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
 def ask(node: Node, service: str, request: Any, timeout_s: float) -> SimulatorReply:
     """Send a request to the simulator, and return its answer.
 
-    Args:
-        node: Sends it.
-        service: One of `topics.SERVICES`.
-        request: Of the type of the service.
-        timeout_s: How long to wait [s].
-
-    Raises:
-        RuntimeError: There is no simulator, or it does not answer in time.
+    `service`: one of `topics.SERVICES`. `timeout_s`: how long to wait [s].
     """
     request_type, reply_type = SERVICES[service]
     try:

@@ -36,13 +36,7 @@ class ControlPage:
     def __init__(self, node: Node, viewer_url: str, *, port: int = 0) -> None:
         """Begin to serve.
 
-        Args:
-            node: Asks the simulator.
-            viewer_url: The page of Rerun's viewer.
-            port: Port of the page; 0: any that is free.
-
-        Raises:
-            OSError: The port is taken.
+        `port`: port of the page; 0: any that is free.
         """
         self._node = node
         self._viewer_url = viewer_url
@@ -98,12 +92,7 @@ class ControlPage:
     def request(self, what: str, values: Any) -> dict[str, Any]:
         """Ask the simulator for something, and return its answer.
 
-        Args:
-            what: pause, resume, step or reset.
-            values: `seed` of a reset, null or not there: as configured.
-
-        Raises:
-            ValueError: It is none of these, or the seed is none.
+        `values`: `seed` of a reset, null or not there: as configured.
         """
         if not isinstance(values, dict):
             raise ValueError(f"values must be a JSON object, got {values!r}")

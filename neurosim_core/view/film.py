@@ -28,14 +28,7 @@ _PATH_SRGB = (240, 110, 20)
 def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
     """Draw the first colour camera and the first event camera of a recording side by side, with the path.
 
-    Args:
-        recorded: flight.h5.
-        out: File to write, .webp or .gif.
-        rate_hz: Pictures a second of simulated time, and of the film [Hz].
-
-    Raises:
-        ValueError: The recording has no colour camera.
-        OSError: The file cannot be written.
+    `rate_hz`: pictures a second of simulated time, and of the film [Hz].
     """
     with Recording(recorded) as flight:
         scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()

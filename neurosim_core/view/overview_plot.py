@@ -52,18 +52,8 @@ def save_overview(
     Left is a panel for each camera, one for each other sensor as its packets declare it by `display`, and
     numbers against time. Right is the path in the plan of the scene: surfaces cut at the median height of the
     flight as dark lines, cut lower as thin lines, what is below in its own colours; turned by a quarter where
-    that fills the picture better.
-
-    Args:
-        path: File to write.
-        summary: What was collected of the flight.
-        scene: The scene that was flown in.
-        track: Where the vehicle was, if that is not in the packets; may be empty.
-        real_time_factor: Simulated time over wall-clock time, for the title.
-
-    Raises:
-        OSError: The file cannot be written.
-        ImportError: matplotlib is not installed.
+    that fills the picture better. `track`: where the vehicle was, if that is not in the packets; may be
+    empty. `real_time_factor`: simulated time over wall-clock time, for the title.
     """
     try:
         import matplotlib as mpl

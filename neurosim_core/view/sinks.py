@@ -45,11 +45,7 @@ class RerunSink:
         self._logger.log_path(context.header.path_position)
 
     def write(self, packet: Packet) -> None:
-        """Log a packet.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Log a packet."""
         self._logger.log(packet)
         if isinstance(packet, Odometry):
             self._positions.append(packet.stamp_ns, position=packet.position)
@@ -58,11 +54,7 @@ class RerunSink:
             self._logger.check()
 
     def close(self, *, complete: bool = True) -> None:
-        """Complete the file.
-
-        Raises:
-            OSError: It cannot be written.
-        """
+        """Complete the file."""
         if not self._closed:
             self._closed = True
             if complete:
@@ -95,11 +87,7 @@ class OverviewSink:
         self._has_pose |= isinstance(packet, Odometry)
 
     def close(self, *, complete: bool = True) -> None:
-        """Draw what was flown, if that is complete.
-
-        Raises:
-            OSError: The picture cannot be written.
-        """
+        """Draw what was flown, if that is complete."""
         if self._closed:
             return
         self._closed = True
