@@ -247,8 +247,8 @@ def test_an_answer_that_comes_while_others_are_read_took_until_it_is_read(make, 
     with serving(listen="tcp://127.0.0.1:0") as registry:
         one = make("one", registry=str(registry.address))
         drive([one], lambda: one.directory.clock.clock(time.monotonic_ns()))
-        directory, link, waits_s = one.directory, one.directory._link, 0.2
-        alive = Alive(link.epoch, link.version, directory._own.revision)
+        directory, waits_s = one.directory, 0.2
+        alive = Alive(directory._epoch, directory._version, directory._own.revision)
 
         class Slow:
             """Has an answer to what was asked after `handle` has begun."""
@@ -265,7 +265,7 @@ def test_an_answer_that_comes_while_others_are_read_took_until_it_is_read(make, 
         added = []
         with monkeypatch.context() as slow:
             slow.setattr(directory.clock, "add", lambda *times: added.append(times))
-            slow.setattr(link, "socket", Slow())
+            slow.setattr(directory, "socket", Slow())
             directory.handle()
         ((asked_ns, _, answered_ns),) = added
         assert answered_ns - asked_ns >= waits_s * 1e9
