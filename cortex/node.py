@@ -307,10 +307,7 @@ class Node:
         """
         if node == self.id:
             return self._stats()
-        reply = ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
-        if reply is None:
-            raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
-        return reply
+        return ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
 
     def now_ns(self) -> int:
         """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""

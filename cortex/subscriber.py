@@ -237,11 +237,7 @@ class Subscriber(Generic[T]):
                     left_s = deadline_s - time.monotonic()
 
     def _take(self, *, block: bool = False) -> Item | None:
-        """The next item, or None if nothing is there.
-
-        Args:
-            block: Wait up to `BLOCK_S` for a message if there is one socket only.
-        """
+        """The next item if there is one; with `block` and one socket it is waited for up to `BLOCK_S`."""
         with self._lock:
             queue = self._queue
             if self._closed:

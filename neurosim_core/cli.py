@@ -27,7 +27,7 @@ from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
 from neurosim_core.scene.reader import SceneReader
-from neurosim_core.settings_file import scene_settings
+from neurosim_core.settings_file import unchecked_settings
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -41,13 +41,14 @@ _PIPED_COLUMNS = 120
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
-    gc.set_threshold(10_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
+    gc.set_threshold(100_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not faulthandler.is_enabled():
         with contextlib.suppress(ValueError, OSError, RuntimeError):  # standard error may be no file
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")  # it would look through all that is installed
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
     if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
@@ -302,7 +303,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.print_config:
         return _print_config(load_settings(arguments))
-    with SceneReader(scene_settings(arguments.config, settings_of(arguments))) as reader:
+    with SceneReader(unchecked_settings(arguments.config, settings_of(arguments))) as reader:
         from rich.console import Console
 
         with (

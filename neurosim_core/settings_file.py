@@ -93,8 +93,8 @@ def beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     return raw
 
 
-def scene_settings(source: Path | None, overrides: Mapping[str, Any]) -> Any:
-    """Return what a file and the keys that win over it say of the scene; arguments as for `load_config`.
+def unchecked_settings(source: Path | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file and the keys that win over it say; arguments as for `load_config`.
 
     Raises:
         ConfigError: The file cannot be read, or is not YAML.
@@ -104,7 +104,7 @@ def scene_settings(source: Path | None, overrides: Mapping[str, Any]) -> Any:
         raw = merge(raw, nest(key, value))
     if source is not None:
         raw = beside(raw, source.resolve().parent)
-    return raw.get("scene", {})
+    return raw
 
 
 def _in_one_line(error: yaml.YAMLError) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.lighting import RefinedMesh, corner_normals
+from neurosim_core.render.lighting import corner_normals
+from neurosim_core.render.refine import RefinedMesh
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Material
 

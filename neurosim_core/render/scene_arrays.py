@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_width
-from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, shading_mesh
+from neurosim_core.render.lighting import bake_light, corner_normals, shading_mesh
 from neurosim_core.render.ray_intersection import face_normals
 from neurosim_core.render.ray_tree import make_ray_tree
+from neurosim_core.render.refine import RefinedMesh, refine
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.bodies import Body

@@ -78,6 +78,22 @@ class Ambient:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedMesh:
+    """Triangles of a scene after `render.refine`."""
+
+    vertices: NDArray[np.float32]
+    """Positions [m], shape [V, 3]; the first are those of the scene."""
+    normals: NDArray[np.float32]
+    """Unit shading normals, shape [V, 3]."""
+    uv: NDArray[np.float32]
+    """Texture coordinates, shape [V, 2]."""
+    faces: NDArray[np.int32]
+    """Vertex indices, shape [F, 3]."""
+    origin: NDArray[np.int32]
+    """Face of the scene that each face is a part of, shape [F]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """Triangles with materials and lights. World frame: metres, z up.
 
@@ -116,6 +132,9 @@ class Scene:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What was subtracted from the coordinates of the file, in metres and with z up, as float32 could not
     tell places apart so far from its zero [m]."""
+
+    refined: dict[float | None, RefinedMesh] = field(default_factory=dict)
+    """Meshes that `render.refine` has made of it beforehand, by their longest edge [m]."""
 
     def __post_init__(self) -> None:
         """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""

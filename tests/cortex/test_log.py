@@ -47,7 +47,6 @@ def write_numbers(path: Path, values: range, *, gap_ns: int = 10_000_000, chunk_
         channel = writer.register_channel("/number", "cortex", schema, metadata)
         for value in values:
             body = codec_of(Number).encode(Number(-value, value), 1000)
-            assert body is not None
             at_ns = 10**18 + value * gap_ns
             writer.add_message(channel, at_ns, body, at_ns, value)
         writer.finish()

@@ -13,6 +13,7 @@ import trimesh
 from small_room import room_scene
 
 import neurosim_core as ns
+from neurosim_core.render.refine import refine
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.scene.scene import Scene
@@ -33,10 +34,15 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     config = MeshSceneConfig(file=file)
     loaded = config.load()
     monkeypatch.setattr(MeshSceneConfig, "load", None)
-    with SceneReader({"file": str(file)}) as reader:
+    with SceneReader({"scene": {"file": str(file)}}) as reader:
         scene = reader.scene(config)
     for name, values in arrays_of(loaded).items():
         np.testing.assert_array_equal(getattr(scene, name), values, strict=True)
+    (mesh,), wanted = scene.refined.values(), refine(loaded, 0.5)
+    for field in dataclasses.fields(wanted):
+        np.testing.assert_array_equal(getattr(mesh, field.name), getattr(wanted, field.name), strict=True)
+    assert len(mesh.faces) > len(loaded.faces)
+    assert refine(scene, 0.5) is mesh
     assert scene.notes == loaded.notes
     assert (scene.lights, scene.instance_names) == (loaded.lights, loaded.instance_names)
     textures = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
@@ -50,20 +56,20 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
 @pytest.mark.parametrize("settings", [{"kind": "mesh", "file": "elsewhere.ply"}, "hall", 3, {"kind": "no"}])
 def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
-    with SceneReader(settings) as reader:
+    with SceneReader({"scene": settings}) as reader:
         assert reader.scene(config).name == "room"
 
 
 def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
     with (
-        SceneReader({"file": "no.glb"}) as reader,
+        SceneReader({"scene": {"file": "no.glb"}}) as reader,
         pytest.raises(SceneError, match=r"no\.glb: no such file"),
     ):
         reader.scene(MeshSceneConfig(file=Path("no.glb")))
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
-    with SceneReader("apartment") as reader:
+    with SceneReader({"scene": "apartment"}) as reader:
         process = reader._process
     assert process.returncode is not None
 
