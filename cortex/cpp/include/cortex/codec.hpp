@@ -90,8 +90,7 @@ constexpr ListType list_type{
     sizeof(T)};
 
 struct ArrayType {
-  void (*view)(void* array, const CortexArray& found);  // items that lie elsewhere; aligned, or they are copied
-  void (*loan)(void* array, const CortexArray& found);  // as `view`, to be written
+  void (*put)(void* array, const CortexArray& found, bool loaned);  // items that lie elsewhere; aligned, or they are copied
   void (*get)(const void* array, CortexArray& found);
 };
 
@@ -104,11 +103,13 @@ std::array<std::uint32_t, Rank> shape_of(const CortexArray& found) noexcept {
 
 inline bool is_aligned(const void* data, std::size_t alignment) noexcept { return reinterpret_cast<std::uintptr_t>(data) % alignment == 0; }
 
-// A view where memory is aligned (always in a slot), a copy where ZeroMQ put the frame elsewhere.
+// A view where memory is aligned (always in a slot), a copy where ZeroMQ put the frame elsewhere; what is loaned may be written.
 template <class T, std::size_t Rank>
-void view(Array<T, Rank>& array, const CortexArray& found) {
+void put(Array<T, Rank>& array, const CortexArray& found, bool loaned) {
   const auto shape = shape_of<Rank>(found);
-  if (found.bytes > 0 && is_aligned(found.data, alignof(T))) {
+  if (loaned) {
+    array = Array<T, Rank>::loaned(static_cast<T*>(const_cast<void*>(found.data)), shape);
+  } else if (found.bytes > 0 && is_aligned(found.data, alignof(T))) {
     array = Array<T, Rank>::view(static_cast<const T*>(found.data), shape);
   } else {
     array = Array<T, Rank>::uninitialized(shape);
@@ -116,25 +117,15 @@ void view(Array<T, Rank>& array, const CortexArray& found) {
   }
 }
 template <std::size_t Rank>
-void view(AnyArray<Rank>& array, const CortexArray& found) {
+void put(AnyArray<Rank>& array, const CortexArray& found, bool loaned) {
   const auto dtype = static_cast<Dtype>(found.dtype);
   const auto* const data = static_cast<const std::uint8_t*>(found.data);
   const bool aligned = found.bytes > 0 && is_aligned(data, std::min<std::size_t>(item_size(dtype), 8));
-  const std::array<std::uint32_t, 1> bytes{static_cast<std::uint32_t>(found.bytes)};
-  array = AnyArray<Rank>(dtype, shape_of<Rank>(found),
-                         aligned ? Array<std::uint8_t>::view(data, bytes) : Array<std::uint8_t>(bytes, {data, found.bytes}));
-}
-
-template <class T, std::size_t Rank>
-void loan(Array<T, Rank>& array, const CortexArray& found) {
-  array = Array<T, Rank>::loaned(static_cast<T*>(const_cast<void*>(found.data)), shape_of<Rank>(found));
-}
-template <std::size_t Rank>
-void loan(AnyArray<Rank>& array, const CortexArray& found) {
-  Array<std::uint8_t> bytes;
-  const CortexArray items{{static_cast<std::int64_t>(found.bytes)}, 0, found.data, found.bytes};
-  loan(bytes, items);
-  array = AnyArray<Rank>(static_cast<Dtype>(found.dtype), shape_of<Rank>(found), std::move(bytes));
+  const std::array<std::uint32_t, 1> count{static_cast<std::uint32_t>(found.bytes)};
+  auto bytes = loaned    ? Array<std::uint8_t>::loaned(const_cast<std::uint8_t*>(data), count)
+               : aligned ? Array<std::uint8_t>::view(data, count)
+                         : Array<std::uint8_t>(count, {data, found.bytes});
+  array = AnyArray<Rank>(dtype, shape_of<Rank>(found), std::move(bytes));
 }
 
 template <class T, std::size_t Rank>
@@ -153,8 +144,7 @@ void get(const AnyArray<Rank>& array, CortexArray& found) noexcept {
 }
 
 template <class A>
-constexpr ArrayType array_type{[](void* array, const CortexArray& found) { view(*static_cast<A*>(array), found); },
-                               [](void* array, const CortexArray& found) { loan(*static_cast<A*>(array), found); },
+constexpr ArrayType array_type{[](void* array, const CortexArray& found, bool loaned) { put(*static_cast<A*>(array), found, loaned); },
                                [](const void* array, CortexArray& found) { get(*static_cast<const A*>(array), found); }};
 
 // Copies a number of 1, 2, 4 or 8 bytes.
@@ -214,7 +204,7 @@ inline int cortex_put_text(CortexRead* read, const CortexItem* item, const std::
 
 inline int cortex_put_array(CortexRead*, const CortexItem* item, const CortexArray* array, char* place) {
   if (item->object != nullptr) {
-    cortex::detail::type_of<cortex::detail::ArrayType>(item).view(place, *array);
+    cortex::detail::type_of<cortex::detail::ArrayType>(item).put(place, *array, false);
   } else {
     std::memcpy(place, array->data, array->bytes);
   }

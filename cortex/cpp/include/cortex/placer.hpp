@@ -68,7 +68,7 @@ inline std::size_t place_arrays(const CortexItem* items, const char* const* name
     }
     if (body == nullptr) continue;
     array.data = body + start;
-    type_of<ArrayType>(&field).loan(message + field.place, array);
+    type_of<ArrayType>(&field).put(message + field.place, array, true);
   }
   return end;
 }
