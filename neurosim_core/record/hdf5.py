@@ -43,13 +43,12 @@ import zlib
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType, TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, schema_of
 from neurosim_core.record.chunks import import_isal
 from neurosim_core.record.disk import Disk
@@ -206,9 +205,7 @@ class RecordingWriter:
     def __enter__(self) -> RecordingWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:  # keep what is there, but do not hide the error
@@ -572,13 +569,9 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
     return groups
 
 
-def import_h5py() -> ModuleType:
+def import_h5py() -> Any:
     """Return the module `h5py`."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(f"recordings need h5py: {install_hint('record')}") from error
-    return h5py
+    return need("recordings need h5py", "record", "h5py")
 
 
 def _deflate(columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list[bytes]]:

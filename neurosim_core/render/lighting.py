@@ -15,6 +15,7 @@ view: `bake_light` computes it once, with shadows and ambient occlusion, and a r
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -29,7 +30,7 @@ from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_widt
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.light_cache import cached_arrays
 from neurosim_core.render.refine import RefinedMesh
-from neurosim_core.scene.scene import Scene, extent
+from neurosim_core.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
 
@@ -217,35 +218,6 @@ def _sphere(count: int) -> NDArray[np.float32]:
     return np.stack(columns, axis=1, dtype=np.float32)
 
 
-def corner_normals(mesh: RefinedMesh) -> NDArray[np.float32]:
-    """Return the shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
-    tips = mesh.vertices.take(mesh.faces, axis=0)
-    front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-    normals = mesh.normals.take(mesh.faces, axis=0)
-    sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
-    return normals * sign[..., None]
-
-
-def _group_corners(
-    mesh: RefinedMesh, normals: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return a group number for each corner [3F] and one corner of each group: same place, same normal.
-
-    Places are told apart to 2^-20 of the scene's size, normals to 1/64.
-    """
-    low, high = extent(mesh.vertices)
-    quantum = max(float((high - low).max()) / (1 << 20), 1e-9)
-    place = np.rint((mesh.vertices - low) / quantum).astype(np.int64)
-    _, place_id = np.unique(place[:, 0] << 42 | place[:, 1] << 21 | place[:, 2], return_inverse=True)
-    facing = np.rint(normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
-    key = place_id[mesh.faces.reshape(-1)] << 24 | facing[:, 0] << 16 | facing[:, 1] << 8 | facing[:, 2]
-    _, example, group = np.unique(key, return_index=True, return_inverse=True)
-    order = np.argsort(example)  # in the order of faces: neighbours in space run after each other
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return rank[group], example[order]
-
-
 def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
     """Give buried points (a floor under a carpet) the mean light of the neighbours that are not, in place.
 
@@ -300,10 +272,9 @@ def bake_light(
     def compute() -> dict[str, NDArray[Any]]:
         with ThreadPoolExecutor(max_workers=1) as aside:
             building = aside.submit(_build_occluders, scene, device, embree=embree)
-            normals = corner_normals(mesh)
-            group, example = _group_corners(mesh, normals)
+            group, _ = mesh.corner_groups
             occluders = building.result()
-        light, openness = _light_groups(scene, mesh, config, normals, group, example, occluders, device)
+        light, openness = _light_groups(scene, mesh, config, occluders, device)
         _unbury(light, openness, group.reshape(-1, 3))
         return {"light": light, "group": group.astype(np.int32)}
 
@@ -323,20 +294,18 @@ def _build_occluders(scene: Scene, device: str, *, embree: bool) -> wp.Mesh | Em
 
 @functools.cache
 def _source() -> bytes:
-    return Path(__file__).read_bytes()
+    return Path(__file__).read_bytes() + Path(inspect.getfile(RefinedMesh)).read_bytes()
 
 
 def _light_groups(
     scene: Scene,
     mesh: RefinedMesh,
     config: LightingConfig,
-    normals: NDArray[np.float32],
-    group: NDArray[np.int64],
-    example: NDArray[np.int64],
     occluders: wp.Mesh | EmbreeTree,
     device: str,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return light, shape [G, 2, 3], and openness, [G, 2], of each group of corners on both sides."""
+    group, example = mesh.corner_groups
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
@@ -360,7 +329,7 @@ def _light_groups(
             wp.array(_sphere(config.shadow_ray_count), dtype=wp.vec3, device=device),
             wp.array(mesh.vertices, dtype=wp.vec3, device=device),
             wp.array(mesh.faces, dtype=wp.vec3i, device=device),
-            wp.array(normals.reshape(-1, 3)[example], dtype=wp.vec3, device=device),
+            wp.array(mesh.corner_normals.reshape(-1, 3)[example], dtype=wp.vec3, device=device),
             wp.array(starts, dtype=int, device=device),
             wp.array(order, dtype=int, device=device),
         ],

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +82,7 @@ class SceneReader:
 
 
 def _write(settings: Mapping[str, Any], number: int) -> None:
-    """Read a scene, refine it for its light, and write it to an open file."""
+    """Read a scene, compute what its light and its pictures need, and write all to an open file."""
     from neurosim_core.registry import find
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
@@ -92,10 +93,16 @@ def _write(settings: Mapping[str, Any], number: int) -> None:
     kind = scene_kind(given)
     config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
     scene = config.load()
-    lighting = RenderConfig.model_validate(settings["render"]).lighting
-    edge_m = lighting.edge_max_m if lighting.mode == "baked" else None
-    if (mesh := refine_within(scene, edge_m)) is not None:
-        scene.refined[edge_m] = mesh
+    with ThreadPoolExecutor() as aside:
+        for texture in {id(m.texture): m.texture for m in scene.materials if m.texture is not None}.values():
+            aside.submit(texture.__getstate__)
+        render = RenderConfig.model_validate(settings["render"])
+        edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
+        if (mesh := refine_within(scene, edge_m)) is not None:
+            scene.refined[edge_m] = mesh
+            _ = mesh.corner_groups, mesh.corner_normals
+        if render.samples_per_pixel == "adaptive":
+            _ = scene.connections
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
     views = [buffer.raw() for buffer in buffers]

@@ -42,15 +42,23 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     for field in dataclasses.fields(wanted):
         np.testing.assert_array_equal(getattr(mesh, field.name), getattr(wanted, field.name), strict=True)
     assert len(mesh.faces) > len(loaded.faces)
+    for found, expected in zip(mesh.corner_groups, wanted.corner_groups, strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
+    for found, expected in zip(scene.connections, loaded.connections, strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
     assert refine(scene, 0.5) is mesh
     assert scene.notes == loaded.notes
     assert (scene.lights, scene.instance_names) == (loaded.lights, loaded.instance_names)
-    textures = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
-    assert any(one is not None for one, _ in textures)
-    for one, other in textures:
+    pairs = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
+    assert any(one is not None for one, _ in pairs)
+    for one, other in pairs:
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             np.testing.assert_array_equal(one.srgb, other.srgb)
+            levels = one.take_levels()
+            assert len(levels) == 3  # of 4 x 4 texels
+            for found, expected in zip(levels, other.take_levels(), strict=True):
+                np.testing.assert_array_equal(found, expected, strict=True)
 
 
 @pytest.mark.parametrize("settings", [{"kind": "mesh", "file": "elsewhere.ply"}, "hall", 3, {"kind": "no"}])
