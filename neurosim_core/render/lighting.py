@@ -228,9 +228,7 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
     for side in range(2):
         buried = openness[:, side] < _BURIED
         first, second, third = (buried.take(corner) for corner in corners)
-        some = (first | second | third) & ~(
-            first & second & third
-        )  # few faces
+        some = (first | second | third) & ~(first & second & third)  # few faces
         a, b, c = (corner[some] for corner in corners)
         one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
         rim = buried.take(one) & ~buried.take(other)
