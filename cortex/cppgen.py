@@ -247,10 +247,11 @@ class _StructTable(Table):
             of = self._generator.cpp(inner) if isinstance(inner, Schema) else ""
             yield f"offsetof({bound}, {member.name})", of
 
+    def is_plain(self, kind: ArrayType) -> bool:
+        return kind.is_fixed and not _is_large(kind)
+
     def object_of(self, kind: FieldType, bound: str) -> str:
-        if isinstance(kind, Schema) or (
-            isinstance(kind, ArrayType) and kind.is_fixed and not _is_large(kind)
-        ):
+        if isinstance(kind, Schema):
             return "nullptr"
         cpp = self._generator.cpp(kind)
         if isinstance(kind, ArrayType):

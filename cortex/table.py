@@ -128,6 +128,10 @@ class Table(ABC):
     def object_of(self, kind: FieldType, bound: Any) -> Any:
         """What a message, an array, an optional or a list is in the language."""
 
+    def is_plain(self, kind: ArrayType) -> bool:
+        """Whether an array of a fixed shape lies in a message as in a body."""
+        return False
+
     def dimension_of(self, size: int | str) -> Any:
         """What the language has to know of a dimension."""
         return 0
@@ -172,6 +176,8 @@ class Table(ABC):
                 first=self._add(self.members_of(kind, bound)),
                 count=len(set(dict(kind.values).values())),
             )
+        if isinstance(kind, ArrayType) and self.is_plain(kind):
+            return Row(Kind.NUMBER)
         if isinstance(kind, ArrayType):
             return self._array(kind, bound, scope)
         if isinstance(kind, OptionalType):

@@ -286,13 +286,12 @@ static inline int cortex_write_message(CortexWrite *write, const CortexItem *ite
     cortex_begin_scope(sizes, item->scope);
     const CortexItem *field = write->items + item->first, *end = field + item->count;
     for (; field < end; ++field)
-        if (!cortex_write_item(write, field, at + (uint64_t)field->offset, message + field->place, sizes)) return 0;
+        if ((write->out != NULL || field->has_tail) && !cortex_write_item(write, field, at + (uint64_t)field->offset, message + field->place, sizes)) return 0;
     return 1;
 }
 
 /* Write the value whose block is at `at`. While it is only measured, what lies in the block as a whole is not looked at. */
 static inline int cortex_write_item(CortexWrite *write, const CortexItem *item, uint64_t at, const char *place, int64_t *sizes) {
-    if (write->out == NULL && !item->has_tail) return 1;
     switch ((CortexKind)item->kind) {
         case CORTEX_NUMBER:
         case CORTEX_BOOL:

@@ -147,7 +147,7 @@ template <class A>
 constexpr ArrayType array_type{[](void* array, const CortexArray& found, bool loaned) { put(*static_cast<A*>(array), found, loaned); },
                                [](const void* array, CortexArray& found) { get(*static_cast<const A*>(array), found); }};
 
-// Copies a number of 1, 2, 4 or 8 bytes.
+// Copies a number, or a small array of a fixed shape, which lies in a struct as in a body.
 inline void copy_number(void* to, const void* from, std::int64_t size) noexcept {
   switch (size) {
     case 8:
@@ -159,8 +159,11 @@ inline void copy_number(void* to, const void* from, std::int64_t size) noexcept 
     case 2:
       std::memcpy(to, from, 2);
       break;
-    default:
+    case 1:
       std::memcpy(to, from, 1);
+      break;
+    default:
+      std::memcpy(to, from, static_cast<std::size_t>(size));
   }
 }
 
@@ -203,11 +206,7 @@ inline int cortex_put_text(CortexRead* read, const CortexItem* item, const std::
 }
 
 inline int cortex_put_array(CortexRead*, const CortexItem* item, const CortexArray* array, char* place) {
-  if (item->object != nullptr) {
-    cortex::detail::type_of<cortex::detail::ArrayType>(item).put(place, *array, false);
-  } else {
-    std::memcpy(place, array->data, array->bytes);
-  }
+  cortex::detail::type_of<cortex::detail::ArrayType>(item).put(place, *array, false);
   return 1;
 }
 
@@ -226,6 +225,7 @@ inline char* cortex_put_message(CortexRead*, const CortexItem*, char* place) { r
 
 inline int cortex_get_scalar(CortexWrite* write, const CortexItem* item, const char* place, std::uint8_t* out) {
   cortex::detail::copy_number(out, place, item->size);
+  if (item->kind == CORTEX_NUMBER) return 1;
   if (item->kind == CORTEX_BOOL) *out = *out != 0;
   if (item->kind != CORTEX_ENUM || cortex_member(write->items, item, cortex::wire::load<std::int32_t>(out)) != nullptr) return 1;
   return cortex_refuse(write, "a number is no value of its enum");
@@ -246,16 +246,8 @@ inline int cortex_get_text(CortexWrite* write, const CortexItem* item, const cha
 }
 
 inline int cortex_get_array(CortexWrite* write, const CortexItem* item, const char* place, CortexArray* array) {
-  const CortexItem* const axes = write->items + item->first;
-  if (item->object == nullptr) {
-    for (std::int64_t axis = 0; axis < item->count; ++axis) array->shape[axis] = axes[axis].size;
-    array->dtype = 0;
-    array->data = place;
-    array->bytes = static_cast<std::uint64_t>(item->size);
-    return 1;
-  }
   cortex::detail::type_of<cortex::detail::ArrayType>(item).get(place, *array);
-  auto bytes = static_cast<std::uint64_t>(axes[item->count + array->dtype].size);
+  auto bytes = static_cast<std::uint64_t>(write->items[item->first + item->count + array->dtype].size);
   for (std::int64_t axis = 0; axis < item->count; ++axis) bytes *= static_cast<std::uint64_t>(array->shape[axis]);
   return bytes == array->bytes ? 1 : cortex_refuse(write, "an array without its items");
 }

@@ -58,7 +58,7 @@ inline std::size_t place_arrays(const CortexItem* items, const char* const* name
     const CortexItem& field = items[items->first + number];
     const bool is_array = field.kind == CORTEX_VARIABLE || field.kind == CORTEX_FIXED;
     CortexArray array;
-    if (!is_array || field.object == nullptr || !is_given(items, field, names[number], dimensions, dtypes, array)) continue;
+    if (!is_array || !is_given(items, field, names[number], dimensions, dtypes, array)) continue;
     auto start = static_cast<std::uint64_t>(field.offset);
     if (field.kind == CORTEX_VARIABLE) {
       start = wire::round_up(end, array.bytes >= CORTEX_LARGE_BYTES ? 64 : 8);
