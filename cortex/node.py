@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 from cortex.callbacks import CallbackThread, check_callable
 from cortex.clock import Clock, wall_offset_ns
 from cortex.codec import RawCodec, RawMessage, codec_of
-from cortex.context import LINGER_MS, Closed, context
+from cortex.context import LINGER_MS, Closed, Closing, context
 from cortex.control_thread import ControlThread, ask_stats
 from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
@@ -42,7 +42,7 @@ Reply = TypeVar("Reply")
 _nodes: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
-class Node:
+class Node(Closing):
     """A participant: its publishers, subscribers and services, and the thread that keeps them connected.
 
     Args:
@@ -360,12 +360,6 @@ class Node:
             publisher.disown()
         for subscriber in self._subscribers:
             subscriber.disown()
-
-    def __enter__(self) -> Node:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         if self._pid != os.getpid():

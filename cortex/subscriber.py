@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.fast_receive import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Info, Item, Link
@@ -60,7 +60,7 @@ def watch(
     return poll, owners
 
 
-class Subscriber(Generic[T]):
+class Subscriber(Closing, Generic[T]):
     """Receives the messages of a topic; made by `Node.subscriber`. Methods may be called from any thread."""
 
     def __init__(
@@ -507,9 +507,3 @@ class Subscriber(Generic[T]):
         self.wakeup.set()
         if self._on_close is not None:
             self._on_close(self)
-
-    def __enter__(self) -> Subscriber[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
