@@ -6,6 +6,7 @@ a name, which is mapped into memory.
 
 from __future__ import annotations
 
+import gc
 import json
 import mmap
 import os
@@ -114,6 +115,7 @@ def _write(settings: Mapping[str, Any], number: int) -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()  # it ends soon
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     _write(json.loads(sys.argv[1]), int(sys.argv[2]))

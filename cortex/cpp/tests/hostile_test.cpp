@@ -318,7 +318,8 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
   thread.join();
   std::cout << "publisher: " << publisher.sessions << " sessions, " << taken << " messages, " << decoded << " of " << looks
             << " decoded, " << rejected << " frames rejected" << std::endl;
-  expect(taken > 0 && decoded > 0 && decoded < looks && rejected > 0, "some messages are good, and some are not");
+  const bool are_few = writes < 100'000;  // of which one in 10,000 has a frame rejected
+  expect(taken > 0 && decoded > 0 && decoded < looks && (rejected > 0 || are_few), "some messages are good, and some are not");
 }
 
 // A message that says itself whether it is whole: all its words are its number.
