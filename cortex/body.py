@@ -71,21 +71,20 @@ def shared_names(kinds: Sequence[FieldType]) -> frozenset[str]:
     return frozenset(name for name, count in counts.items() if count > 1)
 
 
-class Fields:
-    """The fields of a message type, and of those within it, by class."""
+Fields = dict[type, tuple[Field, ...]]
+"""The fields of a message type, and of those within it, by class."""
 
-    def __init__(self, schema: Schema, cls: type) -> None:
-        self.of: dict[type, tuple[Field, ...]] = {}
-        self._add(schema, cls)
 
-    def _add(self, kind: FieldType, bound: Any) -> None:
-        if isinstance(kind, OptionalType | ListType):
-            self._add(kind.item, bound)
-        elif isinstance(kind, Schema) and bound not in self.of:
-            fields = zip(kind.fields, bound.__cortex_bindings__, layout.measure_fields(kind)[0], strict=True)
-            self.of[bound] = tuple(Field(field.name, field.type, inner, at) for field, inner, at in fields)
-            for field in self.of[bound]:
-                self._add(field.type, field.bound)
+def _find_fields(kind: FieldType, bound: Any, found: Fields) -> Fields:
+    if isinstance(kind, OptionalType | ListType):
+        _find_fields(kind.item, bound, found)
+    elif isinstance(kind, Schema) and bound not in found:
+        offsets = layout.measure_fields(kind)[0]
+        rows = zip(kind.fields, bound.__cortex_bindings__, offsets, strict=True)
+        found[bound] = tuple(Field(field.name, field.type, inner, at) for field, inner, at in rows)
+        for field in found[bound]:
+            _find_fields(field.type, field.bound, found)
+    return found
 
 
 class Writer:
@@ -120,7 +119,7 @@ class Writer:
         if type(value) is not cls:
             raise TypeError(f"{where}: got {type(value).__name__}, expected {cls.__name__}")
         sizes: Sizes = {}
-        for field in self._fields.of[cls]:
+        for field in self._fields[cls]:
             name = f"{where}.{field.name}"
             self.put(field.type, field.bound, getattr(value, field.name), at + field.offset, name, sizes)
 
@@ -262,7 +261,7 @@ class Reader:
         """Return the message whose block begins somewhere in the buffer."""
         sizes: Sizes = {}
         return new_message(
-            cls, [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields.of[cls]]
+            cls, [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields[cls]]
         )
 
     def _get(self, kind: FieldType, bound: Any, at: int, sizes: Sizes) -> Any:
@@ -328,7 +327,7 @@ class Body:
     def __init__(self, schema: Schema, cls: type) -> None:
         self._schema = schema
         self._cls = cls
-        self.fields = Fields(schema, cls)
+        self.fields = _find_fields(schema, cls, {})
         self.block = layout.block_size(schema)
         self._end = layout.BODY_LIMIT if layout.has_tail(schema) else self.block + 1
 

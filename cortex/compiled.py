@@ -13,7 +13,7 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-INTERFACE = 20
+INTERFACE = 21
 """What `_native.c` must say of itself: counts up with each change of what it offers."""
 
 

@@ -6,14 +6,16 @@ import contextlib
 import os
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import zmq
 
 from cortex.compiled import native
 from cortex.wire import BODY_LIMIT, CONTROL_LIMIT, HEADER_SIZE
 
+_C = TypeVar("_C", bound="Closing")
 _lock = threading.Lock()
 _context: zmq.Context[zmq.Socket[bytes]] | None = None
 _owner = 0
@@ -36,6 +38,20 @@ _FRAME_MAX: dict[int, int] = {
 
 class Closed(RuntimeError):
     """The publisher, subscriber, client or node was closed."""
+
+
+class Closing(ABC):
+    """What closes at the end of a `with` block."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it."""
+
+    def __enter__(self: _C) -> _C:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def context() -> zmq.Context[zmq.Socket[bytes]]:

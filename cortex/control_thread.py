@@ -188,8 +188,8 @@ class ControlThread:
             subscriber.top_up(now_ns)
 
 
-def ask_stats(place: Reach, asker: int, timeout_s: float) -> StatsReply | None:
-    """Ask a node for its counters; None if it did not answer in time."""
+def ask_stats(place: Reach, asker: int, timeout_s: float) -> StatsReply:
+    """Ask a node for its counters; TimeoutError if it does not answer in time."""
     deadline_s = time.monotonic() + timeout_s
     types = control_types(StatsReply)
     with place.open() as socket:
@@ -199,4 +199,4 @@ def ask_stats(place: Reach, asker: int, timeout_s: float) -> StatsReply | None:
                 with contextlib.suppress(MalformedMessage):
                     reply: StatsReply = parse_control(socket.recv(zmq.DONTWAIT), types)[0]
                     return reply
-    return None
+    raise TimeoutError(f"node {place.node:016x} did not answer within {timeout_s} s")

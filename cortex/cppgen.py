@@ -1,15 +1,15 @@
 """C++ structs for message types: what `cortex cpp module:Scan > scan.hpp` writes.
 
-The header has one plain struct for each message and enum, and beside it a `cortex::Codec` with the type's
-schema, fingerprint and the code that reads and writes its body. Offsets are computed here, so that the C++
-compiler sees constants. A header may be included together with others that hold the same types.
+The header has one plain struct for each message and enum, and beside a struct a `cortex::Codec` with the
+type's schema, fingerprint and the table by which its body is read and written. A header may be included
+together with others that hold the same types.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import cortex.messages
@@ -27,6 +27,7 @@ from cortex.schema import (
     fingerprint_of,
     schema_of,
 )
+from cortex.table import Kind, Row, Table
 
 _SCALARS = {
     "bool": "bool",
@@ -110,12 +111,11 @@ class _Block:
 
 @dataclass(frozen=True)
 class _Member:
-    """A field of a struct: its C++ name and type, and its place in the block."""
+    """A field of a struct: its C++ name and type."""
 
     name: str
     cpp: str
     field: Field
-    offset: int
 
 
 def write_headers(folder: Path) -> None:
@@ -137,6 +137,7 @@ class _Generator:
 
     def __init__(self, namespace: str | None) -> None:
         self._namespace = namespace
+        self._members: dict[str, list[_Member]] = {}
         self.blocks: list[_Block] = []
 
     def _qualified(self, name: str) -> tuple[str, str, str]:
@@ -165,7 +166,7 @@ class _Generator:
         if isinstance(kind, OptionalType):
             return f"std::optional<{self.cpp(kind.item)}>"
         if isinstance(kind, ListType):
-            return f"std::vector<{self.cpp(kind.item)}>"
+            return f"std::vector<{_ITEMS[kind.item] if kind.item == 'bool' else self.cpp(kind.item)}>"
         return self.message(kind)
 
     def enumeration(self, kind: EnumType) -> str:
@@ -178,24 +179,7 @@ class _Generator:
         for member, value in kind.values:
             members[_identifier(member, members)] = value
         listed = (f"  {member} = {_int32(value)}," for member, value in members.items())
-        lines = [
-            *_within(namespace, [f"enum class {name} : std::int32_t {{", *listed, "};"]),
-            "namespace cortex {",
-            "template <>",
-            f"struct EnumCodec<::{qualified}> {{",
-            f"  static constexpr std::string_view name = {_literal(kind.name)};",
-            "  static constexpr bool known(std::int32_t number) noexcept {",
-            "    switch (number) {",
-            *(f"      case {_int32(number)}:" for number in sorted(set(members.values()))),
-            "        return true;",
-            "      default:",
-            "        return false;",
-            "    }",
-            "  }",
-            "};",
-            "}  // namespace cortex",
-        ]
-        self._add(qualified, key, lines)
+        self._add(qualified, key, _within(namespace, [f"enum class {name} : std::int32_t {{", *listed, "};"]))
         return f"::{qualified}"
 
     def message(self, schema: Schema) -> str:
@@ -205,9 +189,10 @@ class _Generator:
         if self._is_known(qualified, key):
             return f"::{qualified}"
         members: list[_Member] = []
-        for item, offset in zip(schema.fields, layout.measure_fields(schema)[0], strict=True):
+        for item in schema.fields:
             taken = [name, *(member.name for member in members)]
-            members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item, offset))
+            members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item))
+        self._members[f"::{qualified}"] = members
         lines = _within(namespace, _struct(name, members))
         self._add(qualified, key, lines + self._codec(schema, f"::{qualified}", members))
         return f"::{qualified}"
@@ -222,7 +207,6 @@ class _Generator:
             f"  static constexpr std::string_view name = {_literal(schema.name)};",
             f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
             f"  static constexpr std::string_view schema = {_literal(schema.to_json())};",
-            f"  static constexpr std::size_t block = {layout.measure_fields(schema)[1]};",
             f"  static constexpr bool fixed = {str(not layout.has_tail(schema)).lower()};",
             f"  static constexpr bool stamped = {str(stamp is not None).lower()};",
             "",
@@ -230,57 +214,59 @@ class _Generator:
             f"    return {stamp_code};",
             "  }",
             "",
-            "  template <class Visitor, class Message>",
-            *_fields(schema.name, members),
+            "  static constexpr const char* names[] = {",
+            *(f"      {_literal(member.field.name)}," for member in members),
+            "      nullptr};",
+            "#pragma GCC diagnostic push",
+            '#pragma GCC diagnostic ignored "-Winvalid-offsetof"',
+            "  static constexpr CortexItem items[] = {",
+            *(_row(row) for row in _StructTable(schema, cpp, self).rows),
+            "  };",
+            "#pragma GCC diagnostic pop",
             "};",
             "}  // namespace cortex",
         ]
 
-
-def _fields(name: str, members: list[_Member]) -> Iterator[str]:
-    """The function that hands each field, its place and its shape to a visitor."""
-    parameters = ("Visitor& visit", "std::size_t at", "Message& message")
-    yield f"  static void fields({', '.join(f'[[maybe_unused]] {each}' for each in parameters)}) {{"
-    variables: dict[tuple[str, str], str] = {}
-    """By the field whose own they are, or nothing if others share them, and their name."""
-    calls = []
-    for member in members:
-        scope = member.field.name if _holds_list(member.field.type) else ""
-        place = f"at + {member.offset}" if member.offset else "at"
-        shapes = _shapes(member.field.type, f"{name}.{member.field.name}", scope, variables)
-        calls.append(f"    visit({', '.join([place, f'message.{member.name}', *shapes])});")
-    for (_, dimension), variable in variables.items():
-        yield f"    Dimension {variable}{{{_literal(dimension)}}};"
-    yield from calls
-    yield "  }"
+    def members_of(self, cpp: str) -> list[_Member]:
+        """Those of a struct that was made."""
+        return self._members[cpp]
 
 
-def _holds_list(kind: FieldType) -> bool:
-    """Whether dimensions within a field belong to the elements of its lists."""
-    return isinstance(kind, ListType) or (isinstance(kind, OptionalType) and _holds_list(kind.item))
+class _StructTable(Table):
+    """The rows of a struct; what it is bound to is its C++ name."""
+
+    def __init__(self, schema: Schema, cpp: str, generator: _Generator) -> None:
+        self._generator = generator
+        super().__init__(schema, cpp)
+
+    def fields_of(self, schema: Schema, bound: str) -> Iterator[tuple[str, str]]:
+        for member in self._generator.members_of(bound):
+            inner = member.field.type
+            while isinstance(inner, OptionalType | ListType):
+                inner = inner.item
+            of = self._generator.cpp(inner) if isinstance(inner, Schema) else ""
+            yield f"offsetof({bound}, {member.name})", of
+
+    def is_plain(self, kind: ArrayType) -> bool:
+        return kind.is_fixed and not _is_large(kind)
+
+    def object_of(self, kind: FieldType, bound: str) -> str:
+        if isinstance(kind, Schema):
+            return "nullptr"
+        cpp = self._generator.cpp(kind)
+        if isinstance(kind, ArrayType):
+            return f"&detail::array_type<{cpp}>"
+        inner = cpp[cpp.index("<") + 1 : -1]
+        return f"&detail::{'optional' if isinstance(kind, OptionalType) else 'list'}_type<{inner}>"
+
+    def dimension_of(self, size: int | str) -> str:
+        return _literal(size) if isinstance(size, str) else "nullptr"
 
 
-def _shapes(kind: FieldType, where: str, scope: str, variables: dict[tuple[str, str], str]) -> Iterator[str]:
-    """What a visitor has to be told of a field besides its C++ type, from the outside in."""
-    if isinstance(kind, OptionalType):
-        yield f"Held<{layout.measure(kind)[1]}>{{}}"
-        yield from _shapes(kind.item, where, scope, variables)
-    elif isinstance(kind, ListType):
-        alignment = max(layout.ITEM_ALIGNMENT, layout.measure(kind.item)[1])
-        yield f"Elements<{layout.stride_of(kind.item)}, {alignment}, {layout.values_of(kind.item)}>{{}}"
-        yield from _shapes(kind.item, where, scope, variables)
-    elif kind == "bytes":
-        yield "Bytes{}"
-    elif isinstance(kind, ArrayType) and _is_large(kind):
-        yield f"Within<{', '.join(map(str, kind.shape))}>{{}}"
-    elif isinstance(kind, ArrayType) and not kind.is_fixed:
-        extents = [
-            f"{extent}u"
-            if isinstance(extent, int)
-            else variables.setdefault((scope, extent), f"dimension_{len(variables)}")
-            for extent in kind.shape
-        ]
-        yield f"Extents<{len(extents)}>{{{_literal(where)}, {{{{{', '.join(extents)}}}}}}}"
+def _row(row: Row) -> str:
+    kind, *numbers = (int(each) if isinstance(each, bool) else each for each in astuple(row))
+    numbers[7] = numbers[7] or "nullptr"
+    return f"      {{CORTEX_{Kind(kind).name}, {', '.join(map(str, numbers))}}},"
 
 
 def _is_large(kind: ArrayType) -> bool:

@@ -76,10 +76,10 @@ class Drafter:
         self._names = tuple(field.name for field in schema.fields)
         arrays = [
             (field.name, field.type, field.offset)
-            for field in body.fields.of[cls]
+            for field in body.fields[cls]
             if isinstance(field.type, ArrayType)
         ]
-        self._fields = body.fields.of[cls]
+        self._fields = body.fields[cls]
         self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
         self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
         self._defaults = {field.name: field for field in dataclasses.fields(cls)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import zmq
@@ -122,7 +123,7 @@ class Fanout:
         self._lossy_sends = tuple(sends)
         self._strict_sockets = tuple(pub_socket for pub_socket in pub_sockets if pub_socket.strict)
         usual = not (self.latching or self.late or self.ring.has_lost)
-        retries = {pub_socket.send: self._retry_strict(pub_socket) for pub_socket in self._strict_sockets}
+        retries = {each.send: partial(self.send_strict, each) for each in self._strict_sockets}
         self._retries = retries | self.ring.sends
         self._fast_send.sends = (*self._lossy_sends, *self._retries) if usual else ()
         self._fast_send.ring = self.ring.short_cut if usual and not pub_sockets else None
@@ -158,7 +159,7 @@ class Fanout:
             try:
                 pub_socket.send(frame, DONTWAIT)
             except zmq.Again:
-                on_time &= self.send_strict(pub_socket, frame, 0)
+                on_time &= self.send_strict(pub_socket, frame)
         on_time &= self.ring.send(frame)
         if not on_time:
             self.timeouts += 1
@@ -218,10 +219,7 @@ class Fanout:
             self.timeouts += 1
         return on_time
 
-    def _retry_strict(self, pub_socket: PubSocket) -> Callable[[bytes], bool]:
-        return lambda frame: self.send_strict(pub_socket, frame, 0)
-
-    def send_strict(self, pub_socket: PubSocket, frame: bytes, flags: int) -> bool:
+    def send_strict(self, pub_socket: PubSocket, frame: bytes, flags: int = 0) -> bool:
         """Send through a strict socket, waiting for its slowest reader; False if that one lost the frame."""
 
         def send() -> bool:

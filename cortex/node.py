@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 from cortex.callbacks import CallbackThread, check_callable
 from cortex.clock import Clock, wall_offset_ns
 from cortex.codec import RawCodec, RawMessage, codec_of
-from cortex.context import LINGER_MS, Closed, context
+from cortex.context import LINGER_MS, Closed, Closing, context
 from cortex.control_thread import ControlThread, ask_stats
 from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
@@ -42,7 +42,7 @@ Reply = TypeVar("Reply")
 _nodes: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
-class Node:
+class Node(Closing):
     """A participant: its publishers, subscribers and services, and the thread that keeps them connected.
 
     Args:
@@ -307,10 +307,7 @@ class Node:
         """
         if node == self.id:
             return self._stats()
-        reply = ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
-        if reply is None:
-            raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
-        return reply
+        return ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
 
     def now_ns(self) -> int:
         """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""
@@ -363,12 +360,6 @@ class Node:
             publisher.disown()
         for subscriber in self._subscribers:
             subscriber.disown()
-
-    def __enter__(self) -> Node:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         if self._pid != os.getpid():

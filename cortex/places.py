@@ -16,7 +16,7 @@ from cortex.context import context, new_socket
 from cortex.host import NodeFiles
 from cortex.pub_socket import PubSockets, open_pub_socket
 from cortex.records import Endpoint, NodeRecord
-from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address, load_keys
+from cortex.security import Authenticator, Keys, apply_client, check_address, load_keys
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
@@ -70,7 +70,7 @@ class Places:
         path = self._files.endpoint
         listener = self._listener = make_listener(self._files.path("ring"))
         for role, strict in (("lossy", False), ("strict", True)):
-            pub_sockets.add(open_pub_socket([path(role)], strict=strict, local=True, listener=listener))
+            pub_sockets.add(open_pub_socket(path(role), strict=strict, local=True, listener=listener))
         self._router(tcp=False).bind(path("control"))
         self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
 
@@ -78,8 +78,8 @@ class Places:
         secure: Secure | None = None
         if keys is not None:
             self._authenticator = Authenticator.acquire(context())
-            secure = partial(apply_server, keys=keys)
-        any_port = [f"tcp://{_bracket(listen)}:*"]
+            secure = partial(self._authenticator.secure, keys=keys)
+        any_port = f"tcp://{_bracket(listen)}:*"
         opened = []
         for strict in (False, True):
             pub_socket = open_pub_socket(any_port, strict=strict, local=False, secure=secure)
@@ -88,7 +88,7 @@ class Places:
         router = self._router(tcp=True)
         if secure is not None:
             secure(router)
-        router.bind(any_port[0])
+        router.bind(any_port)
         seen = listen if listen not in ("0.0.0.0", "::", "*") else _outward_address()
         bound = (socket.getsockopt_string(zmq.LAST_ENDPOINT) for socket in (*opened, router))
         at = [f"tcp://{_bracket(seen)}:{address.rpartition(':')[2]}" for address in bound]

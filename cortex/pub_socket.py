@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -76,7 +76,7 @@ class PubSocket:
 
 
 def open_pub_socket(
-    addresses: Sequence[str],
+    address: str,
     *,
     strict: bool,
     local: bool,
@@ -90,8 +90,7 @@ def open_pub_socket(
     if secure is not None:
         secure(socket)
     try:
-        for address in addresses:
-            socket.bind(address)
+        socket.bind(address)
     except zmq.ZMQError:
         socket.close(0)
         raise

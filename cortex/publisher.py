@@ -16,7 +16,7 @@ import numpy as np
 
 from cortex.back_pressure import BackPressure
 from cortex.codec import Codec, coder_of
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.fanout import Fanout
 from cortex.fast_send import FastSend, make_fast_send
 from cortex.loan import Loan
@@ -45,7 +45,7 @@ def usual_max_wait_s(message_type: type) -> float:
     return COMMAND_MAX_WAIT_S if message_type.__module__ == "cortex.messages.commands" else MAX_WAIT_S
 
 
-class Publisher(Generic[T]):
+class Publisher(Closing, Generic[T]):
     """Sends messages of one type; made by `Node.publisher`. Every method may be called from any thread."""
 
     def __init__(
@@ -413,12 +413,6 @@ class Publisher(Generic[T]):
         self._pub_sockets.unregister(self.source)
         if self._on_close is not None:
             self._on_close(self)
-
-    def __enter__(self) -> Publisher[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def close_publishers(

@@ -35,7 +35,7 @@ import zmq
 
 from cortex import control, host, records
 from cortex.codec import MalformedMessage
-from cortex.security import Authenticator, Keys, apply_server, check_address, keeps_keys, load_keys
+from cortex.security import Authenticator, Keys, check_address, keeps_keys, load_keys
 from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
@@ -158,7 +158,7 @@ class Registry:
             remote.ipv6 = "[" in listen  # else the address would read [::ffff:127.0.0.1]
             if keys is not None:
                 self._authenticator = Authenticator.acquire(self._context)
-                apply_server(remote, keys)
+                self._authenticator.secure(remote, keys)
             remote.bind(listen)
             self.address = str(remote.getsockopt_string(zmq.LAST_ENDPOINT))
 

@@ -194,21 +194,6 @@ def apply_client(socket: zmq.Socket[Any], keys: Keys, server_key: str) -> None:
     socket.curve_serverkey = server_key.encode()
 
 
-def apply_server(socket: zmq.Socket[Any], keys: Keys) -> None:
-    """Make a socket, before it binds, accept authorised CURVE clients only.
-
-    Raises:
-        RuntimeError: If its context has no `Authenticator`: the socket would refuse everybody.
-    """
-    domain = Authenticator.of(socket.context).domain_of(keys)
-    socket.curve_secretkey = keys.secret.encode()
-    socket.curve_publickey = keys.public.encode()
-    socket.curve_server = True
-    socket.zap_domain = domain.encode()
-    # Without this, libzmq lets everybody in when no authenticator answers.
-    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-
-
 class Authenticator(ThreadAuthenticator):
     """The one place of a context where CURVE clients are let in or refused, on a thread of its own.
 
@@ -237,19 +222,6 @@ class Authenticator(ThreadAuthenticator):
             found._users += 1
             return found
 
-    @classmethod
-    def of(cls, context: zmq.Context[Any]) -> Authenticator:
-        """Return the context's running authenticator.
-
-        Raises:
-            RuntimeError: If there is none.
-        """
-        with cls._lock:
-            found = cls._running.get(context.underlying)
-        if found is None:
-            raise RuntimeError("a CURVE server needs Authenticator.acquire(context) first")
-        return found
-
     def release(self) -> None:
         """Give it back, before its context is terminated."""
         with self._lock:
@@ -276,16 +248,19 @@ class Authenticator(ThreadAuthenticator):
         if self._pid == os.getpid():
             super().stop()
 
-    def domain_of(self, keys: Keys) -> str:
-        """Return the ZAP domain in which these keys decide."""
+    def secure(self, socket: zmq.Socket[Any], keys: Keys) -> None:
+        """Make a socket of the context, before it binds, accept authorised CURVE clients only."""
         with self._lock:
-            for domain, known in self._keys.items():
-                if known == keys:
-                    return domain
-            domain = f"cortex.{len(self._keys)}"
+            known = next((domain for domain, each in self._keys.items() if each == keys), "")
+            domain = known or f"cortex.{len(self._keys)}"
             self._keys[domain] = keys
             self.configure_curve_callback(domain, self)
-            return domain
+        socket.curve_secretkey = keys.secret.encode()
+        socket.curve_publickey = keys.public.encode()
+        socket.curve_server = True
+        socket.zap_domain = domain.encode()
+        # Without this, libzmq lets everybody in when no authenticator answers.
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Decide about a client's key; called by the thread."""

@@ -14,7 +14,7 @@ import zmq
 
 from cortex import wire
 from cortex.codec import MalformedMessage, codec_of
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.places import Reach
 from cortex.records import ServiceError, ServiceRecord
 from cortex.schema import fingerprint_of, schema_of
@@ -161,7 +161,7 @@ def _error(header: wire.Header, kind: str, text: str) -> bytes:
     return _answer(header, wire.ERROR, ServiceError(kind, text))
 
 
-class Client(Generic[Request, Reply]):
+class Client(Closing, Generic[Request, Reply]):
     """Calls a service; made by `Node.client`. Calls from several threads follow one another."""
 
     def __init__(
@@ -312,9 +312,3 @@ class Client(Generic[Request, Reply]):
         self._closed = True
         with self._lock:
             self._disconnect()
-
-    def __enter__(self) -> Client[Request, Reply]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

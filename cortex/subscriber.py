@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.fast_receive import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Info, Item, Link
@@ -60,7 +60,7 @@ def watch(
     return poll, owners
 
 
-class Subscriber(Generic[T]):
+class Subscriber(Closing, Generic[T]):
     """Receives the messages of a topic; made by `Node.subscriber`. Methods may be called from any thread."""
 
     def __init__(
@@ -237,11 +237,7 @@ class Subscriber(Generic[T]):
                     left_s = deadline_s - time.monotonic()
 
     def _take(self, *, block: bool = False) -> Item | None:
-        """The next item, or None if nothing is there.
-
-        Args:
-            block: Wait up to `BLOCK_S` for a message if there is one socket only.
-        """
+        """The next item if there is one; with `block` and one socket it is waited for up to `BLOCK_S`."""
         with self._lock:
             queue = self._queue
             if self._closed:
@@ -511,9 +507,3 @@ class Subscriber(Generic[T]):
         self.wakeup.set()
         if self._on_close is not None:
             self._on_close(self)
-
-    def __enter__(self) -> Subscriber[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

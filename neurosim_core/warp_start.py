@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
 import os
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
@@ -41,12 +44,31 @@ def start_warp() -> None:
         held.seek(0)
         lines = held.read().decode(errors="replace").splitlines(keepends=True)
     sys.stderr.write("".join(line for line in lines if not any(known in line for known in _NO_CUDA)))
-    wp._src.context.runtime.get_clang_pch_dir = _header_folder  # type: ignore[attr-defined]
+    context: Any = wp._src.context
+    context.runtime.get_clang_pch_dir = _header_folder
+    context.Module._compile = _compile_once(context.Module._compile)
 
 
 def has_kernels() -> bool:
     """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
     return any(Path(str(wp.config.kernel_cache_dir)).glob("wp_neurosim_core.*"))
+
+
+def _compile_once(compile_module: Callable[..., bool]) -> Callable[..., bool]:
+    """Return a function that compiles a module; while another process does so, it waits for that instead.
+
+    Simulators, tests or ranks of a training that start at once on a new machine need the same kernels.
+    """
+
+    @functools.wraps(compile_module)
+    def compile_or_wait(module: Any, device: Any, folder: Any, *arguments: Any, **options: Any) -> bool:
+        locks = Path(str(wp.config.kernel_cache_dir), "locks")
+        locks.mkdir(parents=True, exist_ok=True)
+        with open(locks / Path(str(folder)).name, "a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until it is closed, or its process ends
+            return compile_module(module, device, folder, *arguments, **options)
+
+    return compile_or_wait
 
 
 def _header_folder() -> str:

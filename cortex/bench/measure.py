@@ -147,8 +147,8 @@ def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str,
         "flood": partial(_flood, subscribers=case.subscribers),
         "roundtrip": _round_trips,
         "copy": _copies,
-        "publisher dies": _publisher_dies,
-        "reader dies": _reader_dies,
+        "publisher dies": partial(_dies, reader_dies=False),
+        "reader dies": partial(_dies, reader_dies=True),
     }
     with tempfile.TemporaryDirectory(dir=os.environ["CORTEX_BENCH_DIR"], prefix="r") as folder:
         job = Job(
@@ -197,23 +197,19 @@ def _round_trips(job: Job, child: Callable[..., Child]) -> Any:
         return report
 
 
-def _publisher_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
+def _dies(job: Job, child: Callable[..., Child], *, reader_dies: bool) -> dict[str, float]:
+    """Kill one side under load; how long the other takes to know."""
     job = replace(job, seconds=_GRACE_S)
-    with child(roles.publish, job) as publisher, child(roles.await_death, job) as reader:
+    sender, receiver = (
+        (roles.publish_until_freed, roles.stop_reading) if reader_dies else (roles.publish, roles.await_death)
+    )
+    with child(sender, job) as publisher, child(receiver, job) as reader:
         reader.expect([publisher])
         publisher.tell("go")
         time.sleep(_LOADED_S)
-        killed_ns = publisher.kill()
-        return {"known_ms": (reader.expect() - killed_ns) / 1e6}
-
-
-def _reader_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
-    with child(roles.publish_until_freed, job) as publisher, child(roles.stop_reading, job) as reader:
-        reader.expect([publisher])
-        publisher.tell("go")
-        time.sleep(_LOADED_S)
-        killed_ns = reader.kill()
-        return {"known_ms": (publisher.expect() - killed_ns) / 1e6}
+        killed, other = (reader, publisher) if reader_dies else (publisher, reader)
+        killed_ns = killed.kill()
+        return {"known_ms": (other.expect() - killed_ns) / 1e6}
 
 
 def _copies(job: Job, child: Callable[..., Child]) -> Any:

@@ -83,6 +83,7 @@ class Child:
         self._process.join(2.0 if kind is None else 0.0)
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
+        self._process.kill()  # it may have no group of its own yet
         self._process.join()
         self._pipe.close()
 

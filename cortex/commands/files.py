@@ -49,12 +49,9 @@ def record(options: argparse.Namespace) -> int:
     _report(options.output, stats)
     if stats.written:
         return 0
-    hint(f"cortex record: nothing was recorded: no message of {_any_of(options.topic)} has come")
+    topics = " or ".join(options.topic) or "any topic"
+    hint(f"cortex record: nothing was recorded: no message of {topics} has come")
     return 1
-
-
-def _any_of(topics: list[str]) -> str:
-    return " or ".join(topics) if topics else "any topic"
 
 
 def _wait_for_end(
@@ -128,12 +125,11 @@ def play(options: argparse.Namespace) -> int:
             finally:
                 player.stop()
                 progress.join(1.0)
-            hint(f"{number_of(player.published, 'message')} played" + _lateness(player, options.rate))
+            late = (
+                f"; the latest was {seconds(player.late_ns * 1e-9)} late" if options.rate < math.inf else ""
+            )
+            hint(f"{number_of(player.published, 'message')} played{late}")
     return status
-
-
-def _lateness(player: Player, rate: float) -> str:
-    return f"; the latest was {seconds(player.late_ns * 1e-9)} late" if rate != math.inf else ""
 
 
 def _describe(log: Log) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cortex.commands.session import CommandError, hint, look_around, say_empty
-from cortex.commands.text import bytes_of, is_terminal, number_of, plain, rate, seconds, table
+from cortex.commands.text import bytes_of, number_of, plain, rate, seconds, table
 from cortex.node import Node
 from cortex.overview import TopicInfo
 from cortex.records import NodeRecord, PublisherStats, StatsReply, SubscriberStats
@@ -108,7 +109,7 @@ def _show_live(
     topic: str | None = None,
 ) -> int:
     """Print what was counted in each second, again and again unless `--once`."""
-    live = not options.once and is_terminal()
+    live = not options.once and sys.stdout.isatty()
     counts = _Counts(node, topic)
     while True:
         time.sleep(_PERIOD_S)

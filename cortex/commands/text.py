@@ -23,11 +23,6 @@ def terminal_width() -> int:
     return shutil.get_terminal_size((WIDTH_UNKNOWN, 24)).columns
 
 
-def is_terminal() -> bool:
-    """Whether the standard output is a terminal, so that a line may be drawn over another."""
-    return sys.stdout.isatty()
-
-
 def seconds(value_s: float) -> str:
     """A time with a unit that suits it, such as `12.3 ms`."""
     if math.isnan(value_s):

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 
 from cortex.codec import RawMessage
+from cortex.context import Closing
 from cortex.log.format import LogInfo
 from cortex.log.reader import Log
 from cortex.node import Node
@@ -21,7 +22,7 @@ SUBSCRIBERS_WAIT_S = 2.0
 _SPAN_MIN_NS = 1_000_000
 
 
-class Player:
+class Player(Closing):
     """Publishes the messages of a recording; their `stamp_ns` stay as they were.
 
     Args:
@@ -157,12 +158,6 @@ class Player:
         self.stop()
         for publisher in set(self._publishers.values()):
             publisher.close()
-
-    def __enter__(self) -> Player:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _await_subscribers(self, wait_s: float) -> None:
         deadline_s = time.monotonic() + wait_s

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from cortex.codec import codec_of
+from cortex.context import Closing
 from cortex.layout import measure_fields
 from cortex.log.format import (
     END,
@@ -71,7 +72,7 @@ class _Contents:
     cut: str = ""
 
 
-class Log:
+class Log(Closing):
     """A recording that is open for reading; made by `open_log`. One thread at a time may use it."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
@@ -184,12 +185,6 @@ class Log:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Log:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_log(path: str | os.PathLike[str]) -> Log:

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -79,10 +79,7 @@ class RecordStats:
         return sum(topic.lost + topic.overtaken for topic in self.topics.values())
 
 
-class _Taken(NamedTuple):
-    info: Info
-    body: bytes | np.ndarray
-    schema: Schema
+_Taken = tuple[Info, "bytes | np.ndarray", Schema]
 
 
 class Recorder:
@@ -277,7 +274,7 @@ class Recorder:
                 self._stopping = True
                 continue
             (self._busy.add if more else self._busy.discard)(topic)
-        taken.sort(key=lambda item: item.info.publish_ns)
+        taken.sort(key=lambda item: item[0].publish_ns)
         self._received += len(taken)
         return taken
 
@@ -406,14 +403,14 @@ def _take_from(subscriber: Subscriber[Any], taken: list[_Taken]) -> bool:
     size = 0
     for _ in range(_TURN_MESSAGES):
         try:
-            item = _Taken(*subscriber.recv_raw(0.0))
+            item = subscriber.recv_raw(0.0)
         except TimeoutError:
             return False
         except TypeMismatch as error:
             logger.warning("%s", error)
             continue
         taken.append(item)
-        size += item.info.size
+        size += item[0].size
         if size >= _TURN_BYTES:
             return True
     return True

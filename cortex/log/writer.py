@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from cortex.codec import codec_of
+from cortex.context import Closing
 from cortex.log import format as names
 from cortex.schema import Schema
 from cortex.topic import check_topic
@@ -100,7 +101,7 @@ def add_channel(
     return int(writer.register_channel(topic, names.MESSAGE_ENCODING, number, metadata))
 
 
-class LogWriter:
+class LogWriter(Closing):
     """Writes a recording, which `open_log`, `cortex play` and `Player` take like one of a `Recorder`.
 
     Args:
@@ -161,9 +162,3 @@ class LogWriter:
         if writer is not None:
             with contextlib.closing(self._sink):
                 writer.finish()
-
-    def __enter__(self) -> LogWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,7 +17,7 @@ from PIL import Image, ImageOps
 from neurosim_core.clock import Rate
 from neurosim_core.convert.light import BT2020_PRIMARIES, TRANSFERS, transfer_of
 from neurosim_core.convert.luminance import LightTables, LumaDecoder, matrix_of
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Names of pictures in a folder end so, in lower or upper case."""
@@ -246,7 +245,7 @@ class VideoSource:
         stamps_ns: Sequence[int] | None = None,
         transfer: str = "auto",
     ) -> None:
-        self._av = _import_av()
+        self._av = need("videos need PyAV", "video", "av")
         self._path = path
         self._transfer = transfer
         self._clock = _Clock(fps=fps, stamps_ns=stamps_ns, path=path)
@@ -305,14 +304,6 @@ class VideoSource:
                 number += 1
         except self._av.error.FFmpegError as error:
             raise ValueError(f"{self._path}: frame {number} cannot be decoded: {error.strerror}") from None
-
-
-def _import_av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError(f"videos need PyAV: {install_hint('video')}") from error
-    return av
 
 
 def _estimate(stream: Any, container: Any) -> int | None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io import open_events
 from neurosim_core.packets import EventArrays
 
@@ -192,11 +192,8 @@ def _radial(power: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
 
 def new_figure(width_in: float, height_in: float) -> Any:
     """Return an empty figure of matplotlib, of 100 px an inch."""
-    try:
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError(f"plots need matplotlib: {install_hint('view')}") from error
-    return matplotlib.figure.Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+    figure = need("plots need matplotlib", "view", "matplotlib.figure")
+    return figure.Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
 
 
 def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:

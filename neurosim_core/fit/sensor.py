@@ -34,6 +34,7 @@ from neurosim_core.fit.recordings import (
 from neurosim_core.packets import EventArrays
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.events import EventCamera
+from neurosim_core.settings_file import nested
 
 _ROUNDS, _REFIT_ROUNDS = 5, 3
 _GAIN = 1.3
@@ -105,11 +106,7 @@ class SensorFit:
 
 def make_pixel(settings: Mapping[str, Any]) -> EventCameraConfig:
     """Return pixels of dotted settings."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        group, _, name = key.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[name] = value
-    return EventCameraConfig.model_validate(nested)
+    return EventCameraConfig.model_validate(nested(settings))
 
 
 def fit_sensor(

@@ -8,16 +8,14 @@ wanted.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io.event_file import EventFileError, EventSource, PacketCutter, gather_blocks
 from neurosim_core.packets import EventArrays, Odometry, Packet
 
-_BRIDGE = "cortex_ros2_bridge.bag_file"
 _VEHICLE = "drone"
 _EVENTS = "events"
 
@@ -135,7 +133,4 @@ class BagSink:
 
 
 def _bridge() -> Any:
-    try:
-        return importlib.import_module(_BRIDGE)
-    except ImportError as error:
-        raise ImportError(f"bags of ROS 2 need rosbags: {install_hint('ros2')}") from error
+    return need("bags of ROS 2 need rosbags", "ros2", "cortex_ros2_bridge.bag_file")

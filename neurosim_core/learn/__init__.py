@@ -14,7 +14,7 @@ from neurosim_core.lazy import lazy_names
 if TYPE_CHECKING:  # isort: off
     from neurosim_core.learn.dense import DenseNet as DenseNet
     from neurosim_core.learn.dense_train import load_dense as load_dense
-    from neurosim_core.learn.depth import depth_loss as depth_loss
+    from neurosim_core.learn.heads import depth_loss as depth_loss
     from neurosim_core.learn.env import (
         Env as Env,
         make_env as make_env,

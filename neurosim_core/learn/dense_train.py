@@ -23,9 +23,7 @@ from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import find_recordings
 from neurosim_core.learn.dense import DenseNet, Head, Memory
 from neurosim_core.learn.dense_live import flight_settings, live_flights
-from neurosim_core.learn.depth import DepthHead
-from neurosim_core.learn.flow import FlowHead
-from neurosim_core.learn.future import FutureHead
+from neurosim_core.learn.heads import DepthHead, FlowHead, FutureHead
 
 _log = logging.getLogger(__name__)
 HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurosim_core import registry
 from neurosim_core.config import load_config
 from neurosim_core.flight import saved_flight
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.learn.pilot import fly_policy
 from neurosim_core.packets import Events, Packet, PointCloud, as_numpy, join_events, schema_of
 from neurosim_core.sensors.corners import Corners
@@ -87,10 +87,7 @@ def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -
     }
     if only is not None and only not in made:
         raise ValueError(f"unknown section {only!r}, known: {', '.join(made)}")
-    try:
-        import jinja2
-    except ImportError as error:
-        raise ImportError(f"the gallery needs jinja2: {install_hint('view')}") from error
+    jinja2 = need("the gallery needs jinja2", "view", "jinja2")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string((Path(__file__).parent / "gallery.html.j2").read_text("utf-8"))
     sections = {name: make() for name, make in made.items() if only in (None, name)}

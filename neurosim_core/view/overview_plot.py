@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.packets import Packet, as_numpy, schema_of
 from neurosim_core.scene.scene import Scene
 from neurosim_core.view.overview import EventView, FlightSummary, Snapshot, Track
@@ -55,11 +55,7 @@ def save_overview(
     that fills the picture better. `track`: where the vehicle was, if that is not in the packets; may be
     empty. `real_time_factor`: simulated time over wall-clock time, for the title.
     """
-    try:
-        import matplotlib as mpl
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError(f"the overview picture needs matplotlib: {install_hint('view')}") from error
+    mpl = need("the overview picture needs matplotlib", "view", "matplotlib", "matplotlib.figure")
     snapshot = summary.snapshot()
     track = summary.track() if track is None else track
     strips = _strips(summary, track)

@@ -6,10 +6,9 @@ import os
 import sys
 import threading
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
@@ -18,20 +17,16 @@ _QUIET = "warn,re_log_encoding::rrd::file_sink=error"
 _PIPE_BYTES = 1 << 20
 
 
-def import_rerun() -> ModuleType:
+def import_rerun() -> Any:
     """Return the module `rerun`."""
     quiet = "rerun" not in sys.modules and "RUST_LOG" not in os.environ
     if quiet:
         os.environ["RUST_LOG"] = _QUIET  # read once, at the import
     try:
-        import rerun
-        import rerun.blueprint
-    except ImportError as error:
-        raise ImportError(f"the viewer needs Rerun: {install_hint('view')}") from error
+        return need("the viewer needs Rerun", "view", "rerun", "rerun.blueprint")
     finally:
         if quiet:
             del os.environ["RUST_LOG"]
-    return rerun
 
 
 class RerunStream:

@@ -19,7 +19,6 @@ import urllib.parse
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import end_with_parent, stop_at_signals
@@ -116,9 +115,7 @@ class RerunViewer:
     def __enter__(self) -> RerunViewer:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _wait_for(self, port: int, waiting: Callable[[], bool]) -> None:

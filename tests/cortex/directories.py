@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import secrets
-import threading
 import time
 
 import pytest
 import zmq
-from processes import SOON_S
+from processes import SOON_S, Beside
 
 from cortex.control import LEASE_NS, control_types, make_control_socket
 from cortex.discovery import Directory
@@ -133,14 +132,12 @@ def make(runtime, context):
 def serving(domain=0, **options):
     """A registry in a thread."""
     registry = Registry(domain, **options)
-    thread = threading.Thread(target=registry.run)
-    thread.start()
+    serving = Beside(registry.run)
     try:
         yield registry
     finally:
         registry.stop()
-        thread.join(SOON_S)
-        assert not thread.is_alive()
+        serving.join()
         registry.close()
 
 

@@ -43,7 +43,7 @@ def _cargo(*arguments: str, timeout_s: float = PATIENCE_S) -> subprocess.Complet
     if any(DEBIAN.glob("zmq-*")):
         command += ["--offline", "--config", 'source.crates-io.replace-with="debian"']
         command += ["--config", f'source.debian.directory="{DEBIAN}"']
-    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET)}
+    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET), "CARGO_PROFILE_DEV_DEBUG": "0"}
     return subprocess.run(
         command, cwd=CRATE, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False
     )

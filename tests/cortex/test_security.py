@@ -17,7 +17,6 @@ from cortex.security import (
     Authenticator,
     Keys,
     apply_client,
-    apply_server,
     check_address,
     load_keys,
     new_keys,
@@ -53,7 +52,7 @@ def serve(context, authenticator):
 
         def make(keys):
             server = sockets.enter_context(context.socket(zmq.XPUB))
-            apply_server(server, keys)
+            authenticator.secure(server, keys)
             port = server.bind_to_random_port("tcp://127.0.0.1")
 
             def subscribe(prepare):
@@ -104,8 +103,6 @@ def test_others_get_nothing(serve, prepare):
 
 
 def test_what_cannot_be_right_is_refused_before_connecting(context):
-    with context.socket(zmq.XPUB) as socket, pytest.raises(RuntimeError, match=r"Authenticator\.acquire"):
-        apply_server(socket, pair())
     with context.socket(zmq.SUB) as socket, pytest.raises(PermissionError, match=AUTHORIZED_FILE):
         apply_client(socket, pair(), pair().public)
 
