@@ -65,6 +65,8 @@ def _compile_once(compile_module: Callable[..., bool]) -> Callable[..., bool]:
 
     @functools.wraps(compile_module)
     def compile_or_wait(module: Any, device: Any, folder: Any, *arguments: Any, **options: Any) -> bool:
+        if Path(str(folder)).is_dir():  # it is there, maybe in a cache that is not ours to write
+            return compile_module(module, device, folder, *arguments, **options)
         locks = Path(str(wp.config.kernel_cache_dir), "locks")
         locks.mkdir(parents=True, exist_ok=True)
         with open(locks / Path(str(folder)).name, "a") as lock:
