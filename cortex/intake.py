@@ -193,13 +193,6 @@ class Intake:
             self.fast_receive.exhausted = False
         return bool(left)
 
-    def revive(self, source: int) -> bool:
-        """A publisher that had left is back; False if its connection is gone."""
-        found = [link for link in self.leaving if link.source == source]
-        for link in found:
-            del self.leaving[link]
-        return bool(found)
-
     def end_overdue(self, now_ns: int) -> bool:
         """Close links that have ended or had their time, once a reliable one has all; whether any was."""
         overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns or link.has_ended]

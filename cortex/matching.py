@@ -38,14 +38,11 @@ class Matcher:
             if matches(subscriber.topic, publisher.topic)
         }
         subscriber.refused &= wanted.keys()
-        present = subscriber.sources()
-        for source in present.keys() - wanted.keys():
+        for source in subscriber.sources().keys() - wanted.keys():
             subscriber.forget(source)
         for source, (node, publisher) in wanted.items():
             offset_ns = 0 if node.host == self._host else node.clock_offset_ns - own.clock_offset_ns
-            if source in present or subscriber.revive(source):
-                subscriber.set_clock(source, offset_ns)
-            else:
+            if not subscriber.keep(source, offset_ns):
                 self._connect(subscriber, node, publisher, offset_ns)
 
     def _connect(

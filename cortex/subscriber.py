@@ -426,18 +426,21 @@ class Subscriber(Closing, Generic[T]):
         with self._receive_lock:
             return {link.source: link.expected for link in self._links if link not in self._leaving}
 
-    def revive(self, source: int) -> bool:
-        """A publisher that had left is back: keep its connection; False if there is none. For the node."""
-        with self._receive_lock:
-            return self._intake.revive(source)
+    def keep(self, source: int, clock_offset_ns: int) -> bool:
+        """Keep the connection to a publisher that is there, or back; False if there is none. For the node.
 
-    def set_clock(self, source: int, offset_ns: int) -> None:
-        """The clock of a publisher's host has moved beside ours; for the node."""
+        Args:
+            source: The publisher's number.
+            clock_offset_ns: What to add to its clock to read it on ours [ns].
+        """
         with self._receive_lock:
-            for link in self._links:
-                if link.source == source and link.clock_offset_ns != offset_ns:
-                    link.clock_offset_ns = offset_ns
+            found = [link for link in self._links if link.source == source]
+            for link in found:
+                self._leaving.pop(link, None)
+                if link.clock_offset_ns != clock_offset_ns:
+                    link.clock_offset_ns = clock_offset_ns
                     self._open_fast_receive()
+            return bool(found)
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node.

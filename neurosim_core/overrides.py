@@ -62,16 +62,16 @@ def set_options(settings: Mapping[str, Any] | None) -> dict[str, str]:
     return {key: f"--set {key}" for key in settings or {}}
 
 
-def read_settings(texts: Sequence[str]) -> dict[str, Any]:
-    """Return values by dotted key; a value is read as YAML."""
+def read_settings(texts: Sequence[str], *, option: str = "--set") -> dict[str, Any]:
+    """Return values by dotted key; a value is read as YAML. Errors name the option that the texts are of."""
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")
         if not separator or not key:
-            raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
+            raise ValueError(f"{option} takes KEY=VALUE, got {text!r}")
         try:
             settings[key] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             reason = " ".join(str(error).split())
-            raise ValueError(f"--set {key}: the value {value!r} is not YAML: {reason}") from None
+            raise ValueError(f"{option} {key}: the value {value!r} is not YAML: {reason}") from None
     return settings

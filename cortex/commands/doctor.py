@@ -11,10 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import zmq
 
@@ -173,8 +172,10 @@ def _check_exchange() -> str:
             child = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE)
             stack.enter_context(child)
             stack.callback(child.kill)
-            sizes = [len(each.data) for each in _receive(subscriber)]
+            sizes = [len(subscriber.recv(_EXCHANGE_S).data) for _ in _SIZES]
             carriers = subscriber.carriers
+    except TimeoutError:
+        raise Fault(f"nothing came of another process within {_EXCHANGE_S:.0f} s") from None
     finally:
         for name, value in before.items():
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
@@ -187,14 +188,6 @@ def _check_exchange() -> str:
 
 _ENVIRONMENT = ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN", *NETWORK_VARIABLES)
 _SIZES = [10, 1_000_000]
-
-
-def _receive(subscriber: Any) -> Iterator[Sample]:
-    for _ in _SIZES:
-        try:
-            yield subscriber.recv(_EXCHANGE_S)
-        except TimeoutError:
-            raise Fault(f"nothing came of another process within {_EXCHANGE_S:.0f} s") from None
 
 
 def publish() -> None:

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.markup import escape
@@ -18,6 +17,7 @@ from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.live.topics import SERVICES, STATUS, STEP_DEADLINE_S
+from neurosim_core.overrides import read_settings
 
 _TABLE_WIDTH = 100
 GRACE_S = 1.0
@@ -52,20 +52,12 @@ def call(arguments: argparse.Namespace) -> int:
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
     """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text."""
-    values: dict[str, Any] = {}
-    for setting in settings:
-        key, separator, text = setting.partition("=")
-        if not separator or not key:
-            raise ValueError(f"a setting is KEY=VALUE, got {setting!r}")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            value = None
+    values = read_settings(settings, option="set")
+    for key, value in values.items():
         if isinstance(value, list):
-            value = json.dumps(value)
-        if not isinstance(value, bool | int | float | str):
-            raise ValueError(f"{key} takes a number, true, false, text or a list, got {text!r}")
-        values[key] = value
+            values[key] = json.dumps(value)
+        elif not isinstance(value, bool | int | float | str):
+            raise ValueError(f"{key} takes a number, true, false, text or a list, got {value!r}")
     return Parameters.of(values)
 
 

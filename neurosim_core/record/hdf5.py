@@ -65,9 +65,9 @@ LARGE_ROW_BYTES = 4096
 _FLAT_CHUNK = 65536
 """Rows of a chunk of arrays of varying length; of events as many as there are pixels, at most 262,144."""
 _ROW_CHUNK = 1024
-_KEPT_ROWS = 16384
-"""Arrays of varying length are kept, not copied, from this length on. A shorter one may be a small part of a
-large block of memory, which it would hold."""
+_KEPT_BYTES = 65536
+"""Pictures and arrays of varying length are kept, not copied, from this size on. A smaller one may be part
+of a large block of memory, which it would hold."""
 _PARTS_MAX = 64
 """Arrays that are kept apart in a chunk that is not full, when that is flushed."""
 _FIRST_FLUSH_BYTES = 65536
@@ -79,8 +79,8 @@ _scratch = threading.local()
 class RecordingWriter:
     """Writes packets to a file while they are measured. A context manager.
 
-    Packets of one sensor must come in the order of their stamps. Pictures and small arrays are copied; long
-    arrays of varying length, as those of events, are read later and must not change. The first flushes come
+    Packets of one sensor must come in the order of their stamps. Arrays of 64 kB and more, such as pictures
+    and columns of events, are read later and must not change; smaller ones are copied. The first flushes come
     early, so that a disk that is full soon still holds most of what came.
 
     Threads compress each chunk as soon as it is full (gzip with shuffle, by ISA-L where that is installed),
@@ -293,7 +293,7 @@ class _Column:
 
     def append(self, rows: NDArray[Any]) -> int:
         """Add rows; return their size [bytes]."""
-        is_copied = not self.deflates or len(rows) < _KEPT_ROWS
+        is_copied = not self.deflates or rows.nbytes < _KEPT_BYTES
         block = rows.astype(self._dtype, casting="same_kind", copy=is_copied)
         self._rows.append(block)
         self._end += len(block)
@@ -313,7 +313,7 @@ class _Column:
         left = count % self.chunk
         *parts, block = self._rows
         full, rest = np.split(block, [len(block) - left])
-        self._rows = [rest.copy() if left < _KEPT_ROWS else rest]
+        self._rows = [rest.copy() if rest.nbytes < _KEPT_BYTES else rest]
         self._begin = self._end - left
         return first, [*parts, full]
 

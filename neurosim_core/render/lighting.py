@@ -224,10 +224,13 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
     They are not seen, but faces reach from them into the open, and would be dark there. Shapes: light of each
     group on each side [G, 2, 3], openness [G, 2], groups of the corners of each face [F, 3].
     """
-    a, b, c = np.ascontiguousarray(faces.T)
-    one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
+    corners = np.ascontiguousarray(faces.T)
     for side in range(2):
         buried = openness[:, side] < _BURIED
+        first, second, third = (buried.take(corner) for corner in corners)
+        some = (first | second | third) & ~(first & second & third)  # few faces
+        a, b, c = (corner[some] for corner in corners)
+        one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
         rim = buried.take(one) & ~buried.take(other)
         inside, outside = one[rim], other[rim]
         count = np.bincount(inside, minlength=len(light))

@@ -69,12 +69,9 @@ def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:
 
 
 def _beside(panels: list[Pillow.Image]) -> Pillow.Image:
-    width = sum(panel.width + _GAP_PX for panel in panels) - _GAP_PX
-    frame, left = Pillow.new("RGB", (width, _HEIGHT_PX), (255, 255, 255)), 0
-    for panel in panels:
-        frame.paste(panel, (left, 0))
-        left += panel.width + _GAP_PX
-    return frame
+    gap = np.full((_HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
+    parts = [part for panel in panels for part in (gap, np.asarray(panel.convert("RGB")))]
+    return Pillow.fromarray(np.hstack(parts[1:]))
 
 
 class _Way:

@@ -98,7 +98,7 @@ class FlightSummary:
         self._waiting_ns: int | None = None
         self._next_ns = 0
         self._best: tuple[float, Snapshot] | None = None
-        self._series: dict[tuple[str, FieldSchema], _Rows] = {}
+        self._series: dict[str, list[tuple[FieldSchema, _Rows]]] = {}
         self._pose = _Rows()
         self._pose_sensor = ""
         self._stamp_ns = 0
@@ -129,10 +129,10 @@ class FlightSummary:
             texts = (str(getattr(packet, f.name)) for f in schema.fields if f.dtype == "str")
             self.texts.append(f"{packet.stamp_ns * 1e-9:.2f} s  {packet.sensor}: {' '.join(texts)}")
         elif schema.display == "time series":
-            for number in schema.fields:
-                if number.is_number:
-                    rows = self._series.setdefault((packet.sensor, number), _Rows())
-                    rows.add(packet.stamp_ns, as_numpy(getattr(packet, number.name)).ravel())
+            if packet.sensor not in self._series:
+                self._series[packet.sensor] = [(f, _Rows()) for f in schema.fields if f.is_number]
+            for number, rows in self._series[packet.sensor]:
+                rows.add(packet.stamp_ns, as_numpy(getattr(packet, number.name)).ravel())
 
     def snapshot(self) -> Snapshot:
         """Return the moment to show; the last one if there is no picture."""
@@ -154,9 +154,10 @@ class FlightSummary:
     def series(self) -> list[Series]:
         """Return the numbers that sensors measured so far, at no more than 20 000 times each."""
         found = []
-        for (sensor, number), rows in self._series.items():
-            stamp_ns, values = rows.arrays()
-            found.append(Series(sensor=sensor, field=number, stamp_ns=stamp_ns, values=values))
+        for sensor, plotted in self._series.items():
+            for number, rows in plotted:
+                stamp_ns, values = rows.arrays()
+                found.append(Series(sensor=sensor, field=number, stamp_ns=stamp_ns, values=values))
         return found
 
     def _log_pose(self, packet: Any) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import threading
 import time
 from pathlib import Path
 
@@ -77,8 +74,6 @@ class OverviewSink:
         self._begun_s = time.perf_counter()
         self._stamp_ns = 0
         self._has_pose = self._closed = False
-        self._loading = threading.Thread(target=_load_matplotlib, daemon=True)
-        self._loading.start()  # beside the flight
 
     def write(self, packet: Packet) -> None:
         """Take a packet."""
@@ -94,7 +89,6 @@ class OverviewSink:
         if not complete:
             return
         factor = self._stamp_ns / NS_PER_S / (time.perf_counter() - self._begun_s)
-        self._loading.join()
         save_overview(
             self._file,
             self._summary,
@@ -112,8 +106,3 @@ class OverviewSink:
             velocity=samples.velocity,
             heading=np.stack([np.cos(samples.yaw), np.sin(samples.yaw)], axis=1),
         )
-
-
-def _load_matplotlib() -> None:
-    with contextlib.suppress(ImportError):
-        importlib.import_module("matplotlib.figure")

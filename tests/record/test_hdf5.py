@@ -432,7 +432,7 @@ def test_memory_is_bounded(tmp_path):
     assert held_bytes < 20_000_000
 
 
-def test_caller_may_reuse_the_arrays_of_pictures(tmp_path):
+def test_caller_may_reuse_small_arrays(tmp_path):
     data = np.zeros((4, 4), dtype=np.float32)
     with RecordingWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9) as writer:
         for k in range(3):
