@@ -26,8 +26,6 @@ from neurosim_core.data import command as dataset
 from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
-from neurosim_core.scene.reader import SceneReader
-from neurosim_core.settings_file import unchecked_settings
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -301,6 +299,9 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from neurosim_core.scene.reader import SceneReader
+    from neurosim_core.settings_file import unchecked_settings
+
     if arguments.print_config:
         return _print_config(load_settings(arguments))
     with SceneReader(unchecked_settings(arguments.config, settings_of(arguments))) as reader:

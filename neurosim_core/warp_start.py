@@ -8,6 +8,7 @@ import hashlib
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ import warp as wp
 
 _NO_CUDA = ("NVIDIA CUDA driver", "no CUDA-capable device")
 """What Warp writes where there is no driver, and where there is no device."""
+_COMPILE_S = 120.0
+"""After this a process that compiles kernels is no longer waited for."""
 _owner: int | None = None
 """Process that was the first to compute."""
 
@@ -62,13 +65,27 @@ def _compile_once(compile_module: Callable[..., bool]) -> Callable[..., bool]:
 
     @functools.wraps(compile_module)
     def compile_or_wait(module: Any, device: Any, folder: Any, *arguments: Any, **options: Any) -> bool:
+        if Path(str(folder)).is_dir():  # it is there, maybe in a cache that is not ours to write
+            return compile_module(module, device, folder, *arguments, **options)
         locks = Path(str(wp.config.kernel_cache_dir), "locks")
         locks.mkdir(parents=True, exist_ok=True)
         with open(locks / Path(str(folder)).name, "a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # until it is closed, or its process ends
+            _await_lock(lock.fileno())  # it is free when the file is closed, or the process ends
             return compile_module(module, device, folder, *arguments, **options)
 
     return compile_or_wait
+
+
+def _await_lock(file: int) -> None:
+    """Lock a file; give up where there are no locks, or the process that has it seems to be stopped."""
+    deadline_s = time.monotonic() + _COMPILE_S
+    while time.monotonic() < deadline_s:
+        try:
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.01)
+        except OSError:  # of a file system without locks
+            return
 
 
 def _header_folder() -> str:

@@ -20,6 +20,8 @@ from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from neurosim_core.signals import end_with_parent
+
 if TYPE_CHECKING:
     from neurosim_core.scene.config import SceneConfig
     from neurosim_core.scene.scene import Scene
@@ -38,14 +40,15 @@ class SceneReader:
                 working directory.
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
-        number = self._file.fileno()
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
+        # `-m` would look for modules in the working directory first, where a yaml.py may lie
+        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, json.dumps(read, default=str), str(number)],
-            pass_fds=[number],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-c", program, json.dumps(read, default=str)],
+            stdin=self._file,  # which is to be written: its number may be 0 here, and is there
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
     def scene(self, config: SceneConfig) -> Scene:
@@ -82,8 +85,16 @@ class SceneReader:
         self._file.close()
 
 
-def _write(settings: Mapping[str, Any], number: int) -> None:
-    """Read a scene, compute what its light and its pictures need, and write all to an open file."""
+def main() -> None:
+    """Be the process: read the scene of the settings in the first argument, and write it to file 0."""
+    gc.disable()  # it ends soon
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
+    _write(json.loads(sys.argv[1]))
+
+
+def _write(settings: Mapping[str, Any]) -> None:
+    """Read a scene, compute what its light and its pictures need, and write all to standard input."""
     from neurosim_core.registry import find
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
@@ -107,15 +118,8 @@ def _write(settings: Mapping[str, Any], number: int) -> None:
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
     views = [buffer.raw() for buffer in buffers]
-    with os.fdopen(number, "wb") as file:
+    with open(0, "wb") as file:
         pickle.dump(([view.nbytes for view in views], body), file)
         for view in views:
             file.write(bytes(-file.tell() % _ALIGNMENT))
             file.write(view)
-
-
-if __name__ == "__main__":
-    gc.disable()  # it ends soon
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    _write(json.loads(sys.argv[1]), int(sys.argv[2]))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +77,46 @@ def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
         pytest.raises(SceneError, match=r"no\.glb: no such file"),
     ):
         reader.scene(MeshSceneConfig(file=Path("no.glb")))
+
+
+def test_modules_of_the_working_directory_are_left_alone(tmp_path, monkeypatch):
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    (tmp_path / "pickle.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(MeshSceneConfig, "load", None)
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert reader.scene(config).name == "room"
+    assert not (tmp_path / "imported").exists()
+
+
+def test_it_reads_where_standard_input_is_closed(tmp_path):
+    program = f"""
+from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.scene.reader import SceneReader
+settings = {MeshSceneConfig.model_validate(room_scene(tmp_path)).model_dump(mode="json")}
+config, MeshSceneConfig.load = MeshSceneConfig.model_validate(settings), None
+with SceneReader({{"scene": settings}}) as reader:
+    assert reader._file.fileno() == 0
+    assert reader.scene(config).name == "room"
+"""
+    command = [sys.executable, "-c", program]
+    subprocess.run(["sh", "-c", 'exec "$@" <&-', "sh", *command], check=True, timeout=120)
+
+
+def test_its_process_ends_with_the_one_that_asks():
+    program = """
+import os, signal
+from neurosim_core.scene.reader import SceneReader
+reader = SceneReader({"scene": "apartment"})
+print(reader._process.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    state = Path("/proc", done.stdout.strip(), "stat")
+    deadline = time.monotonic() + 1.0  # to read the scene takes longer
+    while state.exists() and state.read_text().split()[2] != "Z":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
