@@ -7,18 +7,17 @@ import numpy
 from setuptools import Extension, setup
 
 SUBJECTS = [
+    "body",
     "broadcast",
     "coder",
     "construct",
     "fast_send",
     "fast_receive",
     "native",
-    "pack",
     "ring_reader",
     "socket",
-    "unpack",
 ]
-HEADERS = ("broadcast", "coder", "items", "native", "numpy")
+HEADERS = ("broadcast", "coder", "native", "numpy")
 
 setup(
     ext_modules=[
@@ -29,7 +28,14 @@ setup(
                 *(f"cortex/_{name}.h" for name in HEADERS),
                 *(
                     f"cortex/cpp/include/cortex/{name}.h"
-                    for name in ("broadcast", "broadcast_os", "broadcast_reader", "broadcast_slots")
+                    for name in (
+                        "body",
+                        "body_walk",
+                        "broadcast",
+                        "broadcast_os",
+                        "broadcast_reader",
+                        "broadcast_slots",
+                    )
                 ),
             ],
             libraries=["dl"] if sys.platform == "linux" else [],

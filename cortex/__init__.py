@@ -9,100 +9,59 @@ import importlib
 from typing import TYPE_CHECKING
 
 # Not on demand: once the module `cortex.message` is loaded, it would stand where the decorator belongs.
-from cortex.message import message
+from cortex.message import message as message
 
 if TYPE_CHECKING:
-    from cortex.codec import MalformedMessage
-    from cortex.context import Closed
-    from cortex.link import Info
-    from cortex.liveliness import Liveliness
-    from cortex.loan import Loan
-    from cortex.message import (
-        Array,
-        Float32,
-        Float64,
-        Int8,
-        Int16,
-        Int32,
-        Int64,
-        UInt8,
-        UInt16,
-        UInt32,
-        UInt64,
-        Unit,
-    )
-    from cortex.node import Node
-    from cortex.policy import Policy, keep_last, latest, reliable
-    from cortex.publisher import Publisher
-    from cortex.schema import TypeMismatch
-    from cortex.service import ServiceFailed, ServiceTimeout, ServiceUnavailable
-    from cortex.subscriber import Subscriber
-    from cortex.synchronise import synchronised
+    from cortex.codec import MalformedMessage as MalformedMessage
+    from cortex.context import Closed as Closed
+    from cortex.link import Info as Info
+    from cortex.loan import Loan as Loan
+    from cortex.message import Array as Array
+    from cortex.message import Float32 as Float32
+    from cortex.message import Float64 as Float64
+    from cortex.message import Int8 as Int8
+    from cortex.message import Int16 as Int16
+    from cortex.message import Int32 as Int32
+    from cortex.message import Int64 as Int64
+    from cortex.message import UInt8 as UInt8
+    from cortex.message import UInt16 as UInt16
+    from cortex.message import UInt32 as UInt32
+    from cortex.message import UInt64 as UInt64
+    from cortex.message import Unit as Unit
+    from cortex.node import Node as Node
+    from cortex.overview import Liveliness as Liveliness
+    from cortex.policy import Policy as Policy
+    from cortex.policy import keep_last as keep_last
+    from cortex.policy import latest as latest
+    from cortex.policy import reliable as reliable
+    from cortex.publisher import Publisher as Publisher
+    from cortex.schema import TypeMismatch as TypeMismatch
+    from cortex.service import ServiceFailed as ServiceFailed
+    from cortex.service import ServiceTimeout as ServiceTimeout
+    from cortex.service import ServiceUnavailable as ServiceUnavailable
+    from cortex.subscriber import Subscriber as Subscriber
+    from cortex.synchronise import synchronised as synchronised
 
 _HOME = {
-    "Array": "message",
-    "Closed": "context",
-    "Float32": "message",
-    "Float64": "message",
-    "Info": "link",
-    "Int8": "message",
-    "Int16": "message",
-    "Int32": "message",
-    "Int64": "message",
-    "Liveliness": "liveliness",
-    "MalformedMessage": "codec",
-    "Node": "node",
-    "Policy": "policy",
-    "Loan": "loan",
-    "Publisher": "publisher",
-    "ServiceFailed": "service",
-    "ServiceTimeout": "service",
-    "ServiceUnavailable": "service",
-    "Subscriber": "subscriber",
-    "TypeMismatch": "schema",
-    "UInt8": "message",
-    "UInt16": "message",
-    "UInt32": "message",
-    "UInt64": "message",
-    "Unit": "message",
-    "keep_last": "policy",
-    "latest": "policy",
-    "reliable": "policy",
-    "synchronised": "synchronise",
+    name: module
+    for module, names in {
+        "codec": "MalformedMessage",
+        "context": "Closed",
+        "link": "Info",
+        "loan": "Loan",
+        "message": "Array Float32 Float64 Int8 Int16 Int32 Int64 UInt8 UInt16 UInt32 UInt64 Unit",
+        "node": "Node",
+        "overview": "Liveliness",
+        "policy": "Policy keep_last latest reliable",
+        "publisher": "Publisher",
+        "schema": "TypeMismatch",
+        "service": "ServiceFailed ServiceTimeout ServiceUnavailable",
+        "subscriber": "Subscriber",
+        "synchronise": "synchronised",
+    }.items()
+    for name in names.split()
 }
-
-__all__ = [
-    "Array",
-    "Closed",
-    "Float32",
-    "Float64",
-    "Info",
-    "Int8",
-    "Int16",
-    "Int32",
-    "Int64",
-    "Liveliness",
-    "Loan",
-    "MalformedMessage",
-    "Node",
-    "Policy",
-    "Publisher",
-    "ServiceFailed",
-    "ServiceTimeout",
-    "ServiceUnavailable",
-    "Subscriber",
-    "TypeMismatch",
-    "UInt8",
-    "UInt16",
-    "UInt32",
-    "UInt64",
-    "Unit",
-    "keep_last",
-    "latest",
-    "message",
-    "reliable",
-    "synchronised",
-]
+__all__ = sorted(["message", *_HOME])
 
 
 def __getattr__(name: str) -> object:

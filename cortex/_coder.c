@@ -147,8 +147,8 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
     Py_ssize_t stamp;
     if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "SO!nS:Coder", names, &rows, &PyTuple_Type, &objects, &stamp, &head))
         return NULL;
-    if (PyBytes_GET_SIZE(rows) == 0 || PyBytes_GET_SIZE(rows) % (Py_ssize_t)sizeof(Item)) {
-        PyErr_Format(PyExc_ValueError, "a row has %zu bytes, got %zd", sizeof(Item), PyBytes_GET_SIZE(rows));
+    if (PyBytes_GET_SIZE(rows) == 0 || PyBytes_GET_SIZE(rows) % (Py_ssize_t)sizeof(CortexItem)) {
+        PyErr_Format(PyExc_ValueError, "a row has %zu bytes, got %zd", sizeof(CortexItem), PyBytes_GET_SIZE(rows));
         return NULL;
     }
     const Py_ssize_t head_size = PyBytes_GET_SIZE(head);
@@ -161,13 +161,15 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
     memcpy(coder->head, PyBytes_AS_STRING(head), (size_t)head_size);
     coder->has_head = head_size != 0;
     coder->stamp = stamp;
-    coder->table = (Table){Py_NewRef(rows), Py_NewRef(objects), (const Item *)(const void *)PyBytes_AS_STRING(rows)};
+    coder->rows = Py_NewRef(rows);
+    coder->objects = Py_NewRef(objects);
+    coder->items = (const CortexItem *)(const void *)PyBytes_AS_STRING(rows);
     return (PyObject *)coder;
 }
 
 static int coder_traverse(Coder *coder, visitproc visit, void *arg) {
     Py_VISIT(coder->slots);
-    Py_VISIT(coder->table.objects);
+    Py_VISIT(coder->objects);
     return 0;
 }
 
@@ -180,8 +182,8 @@ static int coder_clear(Coder *coder) {
 static void coder_dealloc(Coder *coder) {
     PyObject_GC_UnTrack(coder);
     coder_clear(coder);
-    Py_XDECREF(coder->table.rows);
-    Py_XDECREF(coder->table.objects);
+    Py_XDECREF(coder->rows);
+    Py_XDECREF(coder->objects);
     Py_TYPE(coder)->tp_free((PyObject *)coder);
 }
 

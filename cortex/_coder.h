@@ -3,13 +3,17 @@
 #ifndef CORTEX_CODER_H
 #define CORTEX_CODER_H
 
-#include "_items.h"
+#include "_native.h"
+#include "_numpy.h"
+#include "cpp/include/cortex/body.h"
 
 enum { DEFERRED_MAX = 16 };
+static const Py_ssize_t BODY_LIMIT = (Py_ssize_t)1 << 32;
 
 typedef struct {
     PyObject_HEAD
-    Table table;
+    PyObject *rows, *objects;  /* bytes and a tuple of what they name, which are kept */
+    const CortexItem *items;   /* those rows: the first is the outermost message */
     Py_ssize_t stamp; /* row of the field that is the stamp, -1: none */
     int has_head;
     char head[HEAD_SIZE];
@@ -21,19 +25,15 @@ extern PyTypeObject CoderType;
 /* An array that is still to be copied. */
 typedef struct {
     PyObject *array; /* borrowed */
-    const char *data;
-    Py_ssize_t start, size;
+    const void *data;
+    uint64_t start, size;
 } Deferred;
 
 /* One message on its way to bytes. */
 typedef struct {
-    const Table *table;
-    char *out;        /* NULL: it is only measured */
-    Py_ssize_t end;   /* where the next item of the tail may begin */
-    Py_ssize_t limit; /* where the body must end */
+    CortexWrite write;
     const char *place; /* where it goes, if arrays may lie there already; NULL: they do not */
     int64_t stamp_ns;
-    Py_ssize_t values_left; /* objects that the elements of lists may still become */
     int defers; /* whether large arrays are left to `copy_deferred` */
     int deferred_count;
     Deferred deferred[DEFERRED_MAX];

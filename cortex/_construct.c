@@ -20,7 +20,7 @@ typedef struct {
     Py_ssize_t slots[];
 } Maker;
 
-static PyObject *maker_name, *init_name;
+static PyObject *maker_name, *init_name, *type_call; /* the last is `type.__call__` */
 static PyTypeObject MakerType;
 
 /* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
@@ -77,22 +77,13 @@ static int match(
 
 /* As the class's own `tp_call`. */
 static PyObject *call_slowly(PyTypeObject *cls, PyObject *const *given, Py_ssize_t positional, PyObject *keywords) {
-    PyObject *arguments = PyTuple_New(positional), *named = NULL, *made = NULL;
-    if (arguments == NULL) return NULL;
-    for (Py_ssize_t index = 0; index < positional; ++index) {
-        PyTuple_SET_ITEM(arguments, index, Py_NewRef(given[index]));
-    }
-    if (keywords != NULL) {
-        named = PyDict_New();
-        if (named == NULL) goto done;
-        for (Py_ssize_t number = 0; number < PyTuple_GET_SIZE(keywords); ++number) {
-            if (PyDict_SetItem(named, PyTuple_GET_ITEM(keywords, number), given[positional + number]) < 0) goto done;
-        }
-    }
-    made = PyType_Type.tp_call((PyObject *)cls, arguments, named);
-done:
-    Py_XDECREF(named);
-    Py_DECREF(arguments);
+    const Py_ssize_t count = positional + (keywords == NULL ? 0 : PyTuple_GET_SIZE(keywords));
+    PyObject **arguments = PyMem_New(PyObject *, count + 1);
+    if (arguments == NULL) return PyErr_NoMemory();
+    arguments[0] = (PyObject *)cls;
+    for (Py_ssize_t index = 0; index < count; ++index) arguments[index + 1] = given[index];
+    PyObject *made = PyObject_Vectorcall(type_call, arguments, (size_t)positional + 1, keywords);
+    PyMem_Free(arguments);
     return made;
 }
 
@@ -198,6 +189,7 @@ static PyMethodDef functions[] = {
 int add_construct(PyObject *module) {
     maker_name = PyUnicode_InternFromString("__cortex_maker__");
     init_name = PyUnicode_InternFromString("__init__");
-    if (maker_name == NULL || init_name == NULL || PyType_Ready(&MakerType) < 0) return -1;
+    type_call = PyObject_GetAttrString((PyObject *)&PyType_Type, "__call__");
+    if (maker_name == NULL || init_name == NULL || type_call == NULL || PyType_Ready(&MakerType) < 0) return -1;
     return PyModule_AddFunctions(module, functions);
 }

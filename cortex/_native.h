@@ -38,10 +38,6 @@ int may_look_unlocked(PyObject *receive, int may_wait, uint64_t expected);
 /* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
 PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);
 
-static inline Py_ssize_t align_to(Py_ssize_t position, Py_ssize_t alignment) {
-    return (position + alignment - 1) & -alignment;
-}
-
 /* The clock of Python's `time.monotonic_ns`. */
 static inline int64_t monotonic_ns(void) {
 #ifdef __APPLE__

@@ -6,6 +6,7 @@
 #include "cpp/include/cortex/broadcast.h"
 
 #include <poll.h>
+#include <structmember.h>
 
 static PyObject *dont_wait, *no_flags; /* of ZeroMQ, as ints */
 
@@ -224,22 +225,16 @@ static PyObject *reader_ended(RingReader *reader, void *unused) {
     return PyBool_FromLong(reader->ring.state == CORTEX_ENDED);
 }
 
-static PyObject *reader_fd(RingReader *reader, void *unused) {
-    (void)unused;
-    return PyLong_FromLong(reader->ring.bell);
-}
-
-static PyObject *reader_is_crowded(RingReader *reader, void *unused) {
-    (void)unused;
-    return PyBool_FromLong(reader->is_crowded);
-}
-
 static PyGetSetDef reader_properties[] = {
-    {"is_crowded", (getter)reader_is_crowded, NULL, "Whether the next message waits, as too many large ones are kept.", NULL},
     {"broken", (getter)reader_broken, NULL, "Whether there is something in the ring that is no frame.", NULL},
     {"ended", (getter)reader_ended, NULL, "Whether all that follows comes another way.", NULL},
-    {"fd", (getter)reader_fd, NULL, "Becomes readable when a frame comes after none was there.", NULL},
     {NULL, NULL, NULL, NULL, NULL},
+};
+
+static PyMemberDef reader_members[] = {
+    {"fd", T_INT, offsetof(RingReader, ring.bell), READONLY, "Becomes readable when a frame comes after none was there."},
+    {"is_crowded", T_INT, offsetof(RingReader, is_crowded), READONLY, "Whether the next message waits, as too many large ones are kept."},
+    {NULL, 0, 0, 0, NULL},
 };
 
 static PyMethodDef reader_methods[] = {
@@ -264,6 +259,7 @@ static PyTypeObject RingReaderType = {
     .tp_clear = (inquiry)reader_clear,
     .tp_dealloc = (destructor)reader_dealloc,
     .tp_methods = reader_methods,
+    .tp_members = reader_members,
     .tp_getset = reader_properties,
 };
 

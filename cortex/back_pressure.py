@@ -5,20 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from cortex.fast_send import FastSend
 from cortex.pub_socket import Backoff, PubSockets
 
 
 class BackPressure:
-    """The waiting of one publisher. A block of it is the time of one message; the caller holds the lock.
-
-    Args:
-        sockets: Whose lock it is; who has come and gone meanwhile is looked at after each sleep.
-        fast_send: Lets no other message pass meanwhile.
-        check_open: Raises once the publisher is closed.
-    """
+    """The waiting of one publisher. A block of it is the time of one message; the caller holds the lock."""
 
     def __init__(self, pub_sockets: PubSockets, fast_send: FastSend, check_open: Callable[[], None]) -> None:
         self._pub_sockets = pub_sockets
@@ -36,9 +29,7 @@ class BackPressure:
         self.is_waiting = True
         self._fast_send.refresh_ns = 0  # other threads look at this
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.is_waiting = False
 
     def begin(self, sequence: int = -1) -> None:

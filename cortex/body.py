@@ -16,29 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cortex.layout import (
-    BODY_LIMIT,
-    DTYPE_CODES,
-    DTYPES,
-    SCALAR_CODES,
-    VALUES_MAX,
-    align,
-    alignment_of,
-    array_dtype,
-    block_size,
-    has_tail,
-    measure,
-    measure_fields,
-    stride_of,
-    values_of,
-)
-from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
+from cortex import layout
+from cortex.schema import SCALAR_CODES, ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 from cortex.structure import is_tensor, new_message
 from cortex.tensors import to_numpy
 
-_CODE_OF_DTYPE = {dtype: code for code, dtype in enumerate(DTYPES)}
+_CODE_OF_DTYPE = {dtype: code for code, dtype in enumerate(layout.DTYPES)}
 Sizes = dict[str, int]
-"""What the named dimensions of one message are."""
 
 
 class MalformedMessage(ValueError):
@@ -68,7 +52,9 @@ def as_array(value: Any, dtype: np.dtype[Any] | None) -> NDArray[Any]:
         raise TypeError(f"expected an array, got {type(value).__name__}")
     if dtype is None:
         if value.dtype not in _CODE_OF_DTYPE:
-            raise TypeError(f"dtype {value.dtype} is none of {', '.join(DTYPE_CODES)} in native byte order")
+            raise TypeError(
+                f"dtype {value.dtype} is none of {', '.join(layout.DTYPE_CODES)} in native byte order"
+            )
     elif value.dtype != dtype:
         raise TypeError(f"dtype {value.dtype}, expected {dtype}; convert it, as with .astype(np.{dtype})")
     return value
@@ -85,46 +71,41 @@ def shared_names(kinds: Sequence[FieldType]) -> frozenset[str]:
     return frozenset(name for name, count in counts.items() if count > 1)
 
 
-class Fields:
-    """The fields of a message type, and of those within it, by class."""
+Fields = dict[type, tuple[Field, ...]]
+"""The fields of a message type, and of those within it, by class."""
 
-    def __init__(self, schema: Schema, cls: type) -> None:
-        self.of: dict[type, tuple[Field, ...]] = {}
-        self._add(schema, cls)
 
-    def _add(self, kind: FieldType, bound: Any) -> None:
-        if isinstance(kind, OptionalType | ListType):
-            self._add(kind.item, bound)
-        elif isinstance(kind, Schema) and bound not in self.of:
-            fields = zip(kind.fields, bound.__cortex_bindings__, measure_fields(kind)[0], strict=True)
-            self.of[bound] = tuple(Field(field.name, field.type, inner, at) for field, inner, at in fields)
-            for field in self.of[bound]:
-                self._add(field.type, field.bound)
+def _find_fields(kind: FieldType, bound: Any, found: Fields) -> Fields:
+    if isinstance(kind, OptionalType | ListType):
+        _find_fields(kind.item, bound, found)
+    elif isinstance(kind, Schema) and bound not in found:
+        offsets = layout.measure_fields(kind)[0]
+        rows = zip(kind.fields, bound.__cortex_bindings__, offsets, strict=True)
+        found[bound] = tuple(Field(field.name, field.type, inner, at) for field, inner, at in rows)
+        for field in found[bound]:
+            _find_fields(field.type, field.bound, found)
+    return found
 
 
 class Writer:
     """Writes one message.
 
-    Args:
-        fields: Of its type.
-        block: Size of its block [bytes].
-        memory: Where it goes, with a block of zeros; None: it is only measured.
+    Without memory, which has a block of zeros, it is only measured.
     """
 
     def __init__(self, fields: Fields, block: int, memory: NDArray[np.uint8] | None) -> None:
         self._fields = fields
         self._memory = memory
         self.end = block
-        """Where the next item of the tail may begin."""
-        self._values_left = VALUES_MAX
+        self._values_left = layout.VALUES_MAX
 
     def reserve(self, size: int, alignment: int) -> int:
         """Keep room in the tail, and return its offset."""
-        start = align(self.end, alignment)
+        start = layout.align(self.end, alignment)
         if self._memory is not None:
             self._memory[self.end : start] = 0
         self.end = start + size
-        if self.end >= BODY_LIMIT:
+        if self.end >= layout.BODY_LIMIT:
             raise ValueError(f"the body would have {self.end} bytes, it must be shorter than 2^32")
         return start
 
@@ -138,7 +119,7 @@ class Writer:
         if type(value) is not cls:
             raise TypeError(f"{where}: got {type(value).__name__}, expected {cls.__name__}")
         sizes: Sizes = {}
-        for field in self._fields.of[cls]:
+        for field in self._fields[cls]:
             name = f"{where}.{field.name}"
             self.put(field.type, field.bound, getattr(value, field.name), at + field.offset, name, sizes)
 
@@ -147,7 +128,7 @@ class Writer:
         if isinstance(kind, OptionalType):
             if value is not None:
                 self.pack("B", at, 1)
-                self.put(kind.item, bound, value, at + measure(kind)[1], where, sizes)
+                self.put(kind.item, bound, value, at + layout.measure(kind)[1], where, sizes)
         elif isinstance(kind, ListType):
             self._put_list(kind, bound, value, at, where)
         elif isinstance(kind, Schema):
@@ -168,11 +149,13 @@ class Writer:
     def _put_list(self, kind: ListType, bound: Any, value: Any, at: int, where: str) -> None:
         if not isinstance(value, (list, tuple)):
             raise TypeError(f"{where}: {value!r:.80} is no list")
-        self._values_left -= len(value) * values_of(kind.item)
+        self._values_left -= len(value) * layout.values_of(kind.item)
         if self._values_left < 0:
-            raise ValueError(f"the lists hold more than {VALUES_MAX} values; send large ones as arrays")
-        stride = stride_of(kind.item)
-        start = self.reserve(len(value) * stride, max(8, measure(kind.item)[1])) if value else 0
+            raise ValueError(
+                f"the lists hold more than {layout.VALUES_MAX} values; send large ones as arrays"
+            )
+        stride = layout.stride_of(kind.item)
+        start = self.reserve(len(value) * stride, max(8, layout.measure(kind.item)[1])) if value else 0
         self.pack("II", at, start, len(value))
         if self._memory is not None:
             self._memory[start : start + len(value) * stride] = 0
@@ -181,13 +164,13 @@ class Writer:
 
     def _put_array(self, kind: ArrayType, value: Any, at: int, where: str, sizes: Sizes) -> None:
         try:
-            array = as_array(value, None if kind.dtype == "any" else array_dtype(kind))
+            array = as_array(value, None if kind.dtype == "any" else layout.array_dtype(kind))
         except TypeError as error:
             raise TypeError(f"{where}: {error}") from error
         check_shape(kind, array.shape, where, sizes)
         start = at
         if not kind.is_fixed:
-            start = self.reserve(array.nbytes, alignment_of(array.nbytes)) if array.size else 0
+            start = self.reserve(array.nbytes, layout.alignment_of(array.nbytes)) if array.size else 0
             self.describe(array.dtype, array.shape, start, at)
         if self._memory is not None and array.size:
             np.copyto(np.ndarray(array.shape, array.dtype, self._memory, start), array)
@@ -206,14 +189,11 @@ def _number_of(bound: type[Enum], value: Any, where: str) -> Any:
 
 
 def _bytes_of(kind: str, value: Any, where: str) -> bytes:
-    if kind == "bytes":
-        if not isinstance(value, bytes):
-            raise TypeError(f"{where}: {value!r:.80} is no bytes object")
-        return value
-    if not isinstance(value, str):
-        raise TypeError(f"{where}: {value!r:.80} is no str")
+    wanted = bytes if kind == "bytes" else str
+    if not isinstance(value, wanted):
+        raise TypeError(f"{where}: {value!r:.80} is no {wanted.__name__}{' object' * (kind == 'bytes')}")
     try:
-        return value.encode()
+        return value if isinstance(value, bytes) else value.encode()
     except UnicodeEncodeError as error:
         raise ValueError(f"{where}: {value!r:.80} cannot be encoded as UTF-8: {error.reason}") from error
 
@@ -237,7 +217,6 @@ def check_shape(kind: ArrayType, shape: tuple[int, ...], where: str, sizes: Size
 
 
 def _checked_number(kind: str, value: Any, where: str) -> Any:
-    """A number as it is packed."""
     if kind == "bool":
         try:
             return (False, True).index(value)
@@ -255,13 +234,8 @@ def _checked_number(kind: str, value: Any, where: str) -> Any:
 class Reader:
     """Reads one body, and checks all offsets, counts and codes.
 
-    Args:
-        fields: Of its type.
-        buffer: Where it lies.
-        start: Where it begins there.
-        size: Its bytes.
-        left: Bytes that items may take up. They never overlap, so that many offsets to one place cannot make
-            a small body demand any amount of memory.
+    Items may take up so many bytes as are `left`. They never overlap, so that many offsets to one place
+    cannot make a small body demand any amount of memory.
     """
 
     def __init__(self, fields: Fields, buffer: Any, start: int, size: int, left: int) -> None:
@@ -270,10 +244,9 @@ class Reader:
         self._start = start
         self._size = size
         self._left = left
-        self._values_left = VALUES_MAX
+        self._values_left = layout.VALUES_MAX
 
     def _claim(self, offset: int, size: int) -> int:
-        """Where an item lies in the buffer."""
         if offset + size > self._size:
             raise ValueError(f"item at {offset} + {size} lies beyond the body of {self._size} bytes")
         self._left -= size
@@ -288,14 +261,13 @@ class Reader:
         """Return the message whose block begins somewhere in the buffer."""
         sizes: Sizes = {}
         return new_message(
-            cls,
-            [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields.of[cls]],
+            cls, [self._get(each.type, each.bound, at + each.offset, sizes) for each in self._fields[cls]]
         )
 
     def _get(self, kind: FieldType, bound: Any, at: int, sizes: Sizes) -> Any:
         if isinstance(kind, OptionalType):
             present = self._get("bool", None, at, sizes)
-            return self._get(kind.item, bound, at + measure(kind)[1], sizes) if present else None
+            return self._get(kind.item, bound, at + layout.measure(kind)[1], sizes) if present else None
         if isinstance(kind, ListType):
             return self._get_list(kind, bound, at)
         if isinstance(kind, Schema):
@@ -322,25 +294,27 @@ class Reader:
 
     def _get_list(self, kind: ListType, bound: Any, at: int) -> list[Any]:
         offset, count = self._unpack("II", at)
-        self._values_left -= count * values_of(kind.item)
+        self._values_left -= count * layout.values_of(kind.item)
         if self._values_left < 0:
-            raise ValueError(f"the lists hold more than {VALUES_MAX} values; large ones must be arrays")
-        stride = stride_of(kind.item)
+            raise ValueError(
+                f"the lists hold more than {layout.VALUES_MAX} values; large ones must be arrays"
+            )
+        stride = layout.stride_of(kind.item)
         start = self._claim(offset, count * stride)
         return [self._get(kind.item, bound, start + index * stride, {}) for index in range(count)]
 
     def _get_array(self, kind: ArrayType, at: int, sizes: Sizes) -> NDArray[Any]:
         if kind.is_fixed:
-            fixed: NDArray[Any] = np.ndarray(kind.shape, array_dtype(kind), self._buffer, at)  # type: ignore[arg-type]
+            fixed: NDArray[Any] = np.ndarray(kind.shape, layout.array_dtype(kind), self._buffer, at)  # type: ignore[arg-type]
             return fixed
         rank = len(kind.shape)
         offset, code, *extents = self._unpack(f"{2 + rank}I", at)
-        allowed = range(len(DTYPES)) if kind.dtype == "any" else (DTYPE_CODES[kind.dtype],)
+        allowed = range(len(layout.DTYPES)) if kind.dtype == "any" else (layout.DTYPE_CODES[kind.dtype],)
         if code >> 8 != rank or code & 255 not in allowed:
             raise ValueError(
                 f"array descriptor {code:#x}, expected rank {rank} and one of dtypes {[*allowed]}"
             )
-        shape, dtype = tuple(extents), DTYPES[code & 255]
+        shape, dtype = tuple(extents), layout.DTYPES[code & 255]
         check_shape(kind, shape, "array", sizes)
         bytes_ = dtype.itemsize * math.prod(shape)
         array: NDArray[Any] = np.ndarray(shape, dtype, self._buffer, self._claim(offset, bytes_))
@@ -353,10 +327,9 @@ class Body:
     def __init__(self, schema: Schema, cls: type) -> None:
         self._schema = schema
         self._cls = cls
-        self.fields = Fields(schema, cls)
-        self.block = block_size(schema)
-        """Bytes of the outermost block."""
-        self._end = BODY_LIMIT if has_tail(schema) else self.block + 1
+        self.fields = _find_fields(schema, cls, {})
+        self.block = layout.block_size(schema)
+        self._end = layout.BODY_LIMIT if layout.has_tail(schema) else self.block + 1
 
     def write(self, message: Any, memory: NDArray[np.uint8] | None) -> int:
         """Write a message to memory that is large enough, if any is given; return the size of its body.

@@ -16,14 +16,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import zmq
 
-from cortex.back_pressure import BackPressure
 from cortex.compiled import native
 from cortex.pub_socket import PubSocket
 from cortex.wire import AttachKey
+
+if TYPE_CHECKING:
+    from cortex.fanout import Fanout
 
 logger = logging.getLogger(__name__)
 
@@ -72,11 +74,7 @@ class Hello(NamedTuple):
 
 
 class Listener:
-    """Where a node's local readers ask for rings. The caller holds the sockets' lock.
-
-    Args:
-        path: Of its socket.
-    """
+    """Where a node's local readers ask for rings. The caller holds the sockets' lock."""
 
     def __init__(self, path: Path) -> None:
         self._fd = native.listen(str(path))
@@ -144,28 +142,13 @@ class Broadcast:
     """The ring of one publisher and who reads it. The caller holds the sockets' lock.
 
     Args:
-        source: The publisher's number.
-        back_pressure: Waits for readers; the lock is let go meanwhile.
-        await_room: As `back_pressure.wait_for`; says so when a reader was too late.
-        reroute: Called when frames go another way to readers of the ring.
-        note: Says that something goes wrong.
+        fanout: Of the publisher: waits for readers, and sends frames another way to readers of the ring.
         expected_bytes: Make slots for messages of this size before the first reader is answered; 0: do not.
     """
 
-    def __init__(
-        self,
-        source: int,
-        back_pressure: BackPressure,
-        await_room: Callable[[Callable[[], bool], float], bool],
-        reroute: Callable[[], None],
-        note: Callable[[str], None],
-        expected_bytes: int = 0,
-    ) -> None:
-        self._source = source
-        self._back_pressure = back_pressure
-        self._await_room = await_room
-        self._reroute = reroute
-        self._note = note
+    def __init__(self, fanout: Fanout, expected_bytes: int = 0) -> None:
+        self._fanout = fanout
+        self._back_pressure = fanout.back_pressure
         self._expected_bytes = expected_bytes
         self._unavailable_until_s = 0.0
         self._is_dissolved = False
@@ -179,18 +162,20 @@ class Broadcast:
     def admit(self, reader: Reader, sequence: int) -> None:
         """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
         listener = reader.pub_socket.listener
-        hello = None if listener is None else listener.take(self._source, reader.request.reader)
+        hello = None if listener is None else listener.take(self._fanout.source, reader.request.reader)
         if listener is not None and listener.heard_other_version and not listener.has_complained:
             listener.has_complained = True
-            self._note("a subscriber with another version of cortex cannot share memory, which is slower")
+            self._fanout.note(
+                "a subscriber with another version of cortex cannot share memory, which is slower"
+            )
         if hello is None:
             return
         try:
             if self._ring is None and not self._is_dissolved:
-                self._ring = native.Broadcast(self._source, zmq.Again)
+                self._ring = native.Broadcast(self._fanout.source, zmq.Again)
         except OSError as error:
             self._is_dissolved = True
-            self._note(f"no shared memory for a ring: {error}")
+            self._fanout.note(f"no shared memory for a ring: {error}")
         if self._is_dissolved:
             hello.close()
             return
@@ -276,7 +261,7 @@ class Broadcast:
         except OSError as error:
             self._unavailable_until_s = time.monotonic() + RETRY_S
             if ring.slot_bytes < size:
-                self._note(f"no shared memory for slots of {size} bytes: {error}")
+                self._fanout.note(f"no shared memory for slots of {size} bytes: {error}")
         return bool(ring.slot_bytes >= size)
 
     def _dissolve(self) -> None:
@@ -285,7 +270,7 @@ class Broadcast:
         self._is_dissolved = True
         self._ring.dissolve()
         self._forget()
-        self._reroute()
+        self._fanout.route()
         timeout_s = max(MOVE_S, *(reader.timeout_s for reader in self._moving))
         self._back_pressure.wait_for(lambda: not self._moving, timeout_s)
 
@@ -317,7 +302,7 @@ class Broadcast:
             if patience_ms < 0:
                 attempt()
                 return
-            if self._await_room(attempt, patience_ms / 1000.0):
+            if self._fanout.await_room(attempt, patience_ms / 1000.0):
                 return
             waited_ms = int(self._back_pressure.waited_s * 1000.0)
             self._ring.give_up(size, 2**32 if self._back_pressure.is_over() else waited_ms)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cortex.loop_reader import WAIT_MAX_S
-from cortex.subscriber import Subscriber
+from cortex.subscriber import Subscriber, watch
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
@@ -143,13 +143,7 @@ class CallbackThread:
             subscribers = list(self._subscribers)
             # Waiting in the only socket is quicker than polling, but a service's request would not wake us.
             self._alone = subscribers[0] if len(subscribers) == 1 and not self._serving else None
-        poll, owners = select.poll(), {}
-        poll.register(self._wakeup.fd, select.POLLIN)
-        for subscriber in subscribers:
-            for fd in (subscriber.wakeup.fd, *subscriber.fds()):
-                poll.register(fd, select.POLLIN)
-                owners[fd] = subscriber
-        return poll, owners
+        return watch(subscribers, self._wakeup.fd)
 
     def _call(self, job: Callable[[], object]) -> None:
         try:

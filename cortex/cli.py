@@ -13,12 +13,13 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 INTERRUPTED = 130
 TERMINATED = 143
 BROKEN_PIPE = 141
 _HELP_WIDTH = 78
+_OWN_ARGUMENTS = {"bench": "cortex.bench.command", "discovery": "cortex.discovery"}
 
 _EXAMPLES = """examples:
   cortex doctor                                whether all works here
@@ -32,6 +33,8 @@ _EXAMPLES = """examples:
   cortex topics --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex
 """
 
+T = TypeVar("T")
+
 
 class _Terminated(BaseException):
     """SIGTERM: end as after Ctrl-C, with files closed and leave taken."""
@@ -40,10 +43,11 @@ class _Terminated(BaseException):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if arguments[:1] == ["bench"]:
-        return _run_module("cortex.bench.command", arguments[1:])
-    if arguments[:1] == ["discovery"]:
-        return _run_module("cortex.discovery", arguments[1:])
+    if arguments and arguments[0] in _OWN_ARGUMENTS:
+        try:
+            return int(importlib.import_module(_OWN_ARGUMENTS[arguments[0]]).main(arguments[1:]))
+        except KeyboardInterrupt:
+            return INTERRUPTED
     parser = _parser()
     if not arguments:
         parser.print_help(sys.stderr)
@@ -84,15 +88,6 @@ def _call(options: argparse.Namespace) -> int:
         return int(getattr(error, "status", 1))
 
 
-def _run_module(name: str, arguments: Sequence[str]) -> int:
-    """Run a command that reads its own arguments."""
-    run: Callable[[Sequence[str]], int] = importlib.import_module(name).main
-    try:
-        return run(arguments)
-    except KeyboardInterrupt:
-        return INTERRUPTED
-
-
 def _interrupt(number: int, frame: object) -> NoReturn:
     signal.signal(signal.SIGINT, _leave)
     raise KeyboardInterrupt
@@ -112,13 +107,9 @@ class _Version(argparse.Action):
     """Print the version of the package, which is looked up only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        from importlib.metadata import PackageNotFoundError, version
+        from importlib.metadata import version
 
-        try:
-            found = version("neurosim-core")
-        except PackageNotFoundError:
-            found = "of unknown version: the package is not installed"
-        print(f"cortex {found}")
+        print(f"cortex {version('neurosim-core')}")
         parser.exit()
 
 
@@ -148,67 +139,47 @@ def _add(
     examples: Sequence[str] = (),
     interrupted: int = 0,
     network: bool = True,
-) -> argparse.ArgumentParser:
-    shown = "examples:\n" + "\n".join(f"  {line}" for line in examples) if examples else None
-    description = f"{what[0].upper()}{what[1:]}. {details}".strip()
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name,
-        help=what,
-        description=textwrap.fill(description, _HELP_WIDTH) if examples else description,
-        epilog=shown,
-        formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
-    )
+) -> Callable[..., argparse.Action]:
+    """Add a command; return what adds its arguments."""
+    description = textwrap.fill(f"{what[0].upper()}{what[1:]}. {details}".strip(), _HELP_WIDTH)
+    shown = "\n".join(["examples:", *(f"  {line}" for line in examples)]) if examples else None
+    form = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(name, help=what, description=description, epilog=shown, formatter_class=form)
     parser.set_defaults(run=run, interrupted=interrupted)
     if network:
-        group = parser.add_argument_group("where to look")
-        group.add_argument("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
-        group.add_argument(
+        add = parser.add_argument_group("where to look").add_argument
+        add("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
+        add(
             "--registry",
             default=os.environ.get("CORTEX_REGISTRY") or "auto",
             metavar="ADDRESS",
             help='"auto" (this host), "off", or tcp://host:port; default: CORTEX_REGISTRY, else "auto"',
         )
-        group.add_argument(
-            "--listen",
-            metavar="IP",
-            help="let other hosts reach us, e.g. 192.168.1.5; default: CORTEX_LISTEN",
-        )
-        group.add_argument(
-            "--keys", type=_directory, metavar="DIR", help="key directory, for tcp; default: CORTEX_KEYS"
-        )
-        group.add_argument("--insecure", action="store_true", help="allow plain tcp beyond this host")
-    return parser
+        listen = "let other hosts reach us, e.g. 192.168.1.5; default: CORTEX_LISTEN"
+        add("--listen", metavar="IP", help=listen)
+        add("--keys", type=_path, metavar="DIR", help="key directory, for tcp; default: CORTEX_KEYS")
+        add("--insecure", action="store_true", help="allow plain tcp beyond this host")
+    adds: Callable[..., argparse.Action] = parser.add_argument
+    return adds
 
 
 def _add_looking(commands: Any) -> None:
-    _add(
-        commands,
-        "topics",
-        "list the topics, their types, and who publishes and subscribes",
-        ("look", "show_topics"),
-    )
+    what = "list the topics, their types, and who publishes and subscribes"
+    _add(commands, "topics", what, ("look", "show_topics"))
     _add(commands, "nodes", "list the nodes", ("look", "show_nodes"))
-    top = _add(
-        commands,
-        "top",
-        "show all topics live: rate, bandwidth, losses, delay",
-        ("look", "show_top"),
-        details="Losses are counted since each subscriber began.",
-    )
-    top.add_argument("--once", action="store_true", help="print once and end, instead of every second")
-    info = _add(
-        commands,
-        "info",
-        "show the counters of a topic live, and its type",
-        ("look", "show_info"),
-        examples=["cortex info /scan", "cortex info /scan --once"],
-    )
-    info.add_argument("topic", type=_topic)
-    info.add_argument("--once", action="store_true", help="print once and end, instead of every second")
+    once = "print once and end, instead of every second"
+    what, details = "show all topics live: rate, bandwidth, losses, delay", "Losses are counted since each "
+    add = _add(commands, "top", what, ("look", "show_top"), details=f"{details}subscriber began.")
+    add("--once", action="store_true", help=once)
+    examples = ["cortex info /scan", "cortex info /scan --once"]
+    what = "show the counters of a topic live, and its type"
+    add = _add(commands, "info", what, ("look", "show_info"), examples=examples)
+    add("topic", type=_topic)
+    add("--once", action="store_true", help=once)
 
 
 def _add_watching(commands: Any) -> None:
-    echo = _add(
+    add = _add(
         commands,
         "echo",
         "print the messages of a topic",
@@ -220,19 +191,15 @@ def _add_watching(commands: Any) -> None:
             "cortex echo /scan --json | jq .message.stamp_ns",
         ],
     )
-    echo.add_argument("topic", type=_topic)
-    echo.add_argument("-n", "--count", type=_count, metavar="N", help="end after so many messages")
-    echo.add_argument("--json", action="store_true", help="one line of JSON for each message, arrays in full")
-    arrays = echo.add_mutually_exclusive_group()
+    add("topic", type=_topic)
+    add("-n", "--count", type=_count, metavar="N", help="end after so many messages")
+    add("--json", action="store_true", help="one line of JSON for each message, arrays in full")
+    arrays = commands.choices["echo"].add_mutually_exclusive_group()
     arrays.add_argument("--no-arrays", action="store_true", help="of arrays only the type and shape")
     arrays.add_argument("--full", action="store_true", help="arrays and texts in full, however long")
+    period = "Of the time between two messages, as they were published: mean, standard deviation"
     for name, what, run, details in (
-        (
-            "hz",
-            "measure how often and how regularly a topic is published",
-            "show_rate",
-            "Of the time between two messages, as they were published: mean, standard deviation",
-        ),
+        ("hz", "measure how often and how regularly a topic is published", "show_rate", period),
         ("bw", "measure the bandwidth of a topic", "show_bandwidth", "Of the size of a message: mean"),
         (
             "delay",
@@ -241,54 +208,36 @@ def _add_watching(commands: Any) -> None:
             "Of that time: mean, standard deviation",
         ),
     ):
-        watch = _add(
-            commands,
-            name,
-            what,
-            ("watch", run),
-            details=f"{details}, least, median, 99th percentile and most.",
-        )
-        watch.add_argument("topic", type=_topic)
-        watch.add_argument(
-            "--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)"
-        )
-        watch.add_argument("-n", "--count", type=_count, metavar="N", help="end after so many lines")
+        details = f"{details}, least, median, 99th percentile and most."
+        add = _add(commands, name, what, ("watch", run), details=details)
+        add("topic", type=_topic)
+        add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
+        add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
         if name == "delay":
-            watch.add_argument(
-                "--stamp", action="store_true", help="from stamp_ns, where that is the time of day, until now"
-            )
+            stamp = "from stamp_ns, where that is the time of day, until now"
+            add("--stamp", action="store_true", help=stamp)
 
 
 def _add_files(commands: Any) -> None:
-    record = _add(
+    add = _add(
         commands,
         "record",
         "record topics into an MCAP file",
         ("files", "record"),
         details="Ctrl-C ends it.",
-        examples=[
-            "cortex record -o run.mcap /scan /cmd",
-            "cortex record -o run.mcap --all --duration 60",
-        ],
+        examples=["cortex record -o run.mcap /scan /cmd", "cortex record -o run.mcap --all --duration 60"],
         interrupted=INTERRUPTED,
     )
-    record.add_argument("topic", nargs="*", type=_topic)
-    record.add_argument("-o", "--output", type=Path, required=True, metavar="FILE")
-    record.add_argument("-a", "--all", action="store_true", help="every topic, also those that appear later")
-    record.add_argument("--force", action="store_true", help="overwrite the file if it exists")
-    record.add_argument("--duration", type=_positive, metavar="S", help="end after so many seconds")
-    record.add_argument(
-        "--best-effort",
-        action="store_true",
-        help="never hold up a publisher; rather lose messages, which are counted",
-    )
-    record.add_argument(
-        "--compression",
-        choices=("none", "lz4", "zstd"),
-        default="none",
-        help="of the file (none, the fastest)",
-    )
-    play = _add(
+    add("topic", nargs="*", type=_topic)
+    add("-o", "--output", type=Path, required=True, metavar="FILE")
+    add("-a", "--all", action="store_true", help="every topic, also those that appear later")
+    add("--force", action="store_true", help="overwrite the file if it exists")
+    add("--duration", type=_positive, metavar="S", help="end after so many seconds")
+    best_effort = "never hold up a publisher; rather lose messages, which are counted"
+    add("--best-effort", action="store_true", help=best_effort)
+    kinds = ("none", "lz4", "zstd")
+    add("--compression", choices=kinds, default="none", help="of the file (none, the fastest)")
+    add = _add(
         commands,
         "play",
         "publish what was recorded",
@@ -302,85 +251,48 @@ def _add_files(commands: Any) -> None:
         ],
         interrupted=INTERRUPTED,
     )
-    play.add_argument("file", type=Path)
-    play.add_argument("topic", nargs="*", type=_topic, help="only these")
-    play.add_argument("--info", action="store_true", help="say what is in the file, and end")
-    play.add_argument(
-        "--rate", type=_rate, default=1.0, metavar="R", help='factor of speed, or "max": without pauses (1)'
-    )
-    play.add_argument(
-        "--start", type=_not_negative, default=0.0, metavar="S", help="begin so many seconds into the file"
-    )
-    play.add_argument("--duration", type=_positive, metavar="S", help="play so many seconds of the file")
-    play.add_argument("--loop", action="store_true", help="begin anew at the end")
-    play.add_argument("--paused", action="store_true", help="begin paused; Enter goes on and pauses again")
-    play.add_argument(
-        "--remap",
-        action="append",
-        default=[],
-        metavar="/OLD:=/NEW",
-        help="publish under another name; may be repeated",
-    )
+    add("file", type=Path)
+    add("topic", nargs="*", type=_topic, help="only these")
+    add("--info", action="store_true", help="say what is in the file, and end")
+    rate = 'factor of speed, or "max": without pauses (1)'
+    add("--rate", type=_rate, default=1.0, metavar="R", help=rate)
+    start = "begin so many seconds into the file"
+    add("--start", type=_not_negative, default=0.0, metavar="S", help=start)
+    add("--duration", type=_positive, metavar="S", help="play so many seconds of the file")
+    add("--loop", action="store_true", help="begin anew at the end")
+    remap = "publish under another name; may be repeated"
+    add("--remap", action="append", default=[], metavar="/OLD:=/NEW", help=remap)
 
 
 def _add_tools(commands: Any) -> None:
-    commands.add_parser(
-        "discovery",
-        help="run the registry of a domain, also for other hosts (its options: cortex discovery --help)",
-        add_help=False,
-    )
-    keys = _add(
-        commands,
-        "keys",
-        "make a pair of keys for tcp",
-        ("tools", "make_keys"),
-        examples=["cortex keys new", "cortex keys new --dir ./keys"],
-        network=False,
-    )
-    keys.add_argument("action", choices=("new",))
-    keys.add_argument(
-        "--dir", type=_directory, metavar="DIR", help="where to (cortex in XDG_CONFIG_HOME or ~/.config)"
-    )
-    _add(
-        commands,
-        "doctor",
-        "check what Cortex needs on this host, and say how to mend what is wrong",
-        ("doctor", "examine"),
-        examples=["cortex doctor", "cortex doctor --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex"],
-    )
-    schema = _add(
-        commands,
-        "schema",
-        "say what sets two message types apart, and whether one may read the other",
-        ("tools", "compare"),
-        examples=["cortex schema diff robot:Scan /scan", "cortex schema diff run.mcap:/scan robot:Scan"],
-    )
-    schema.add_argument("action", choices=("diff",))
+    for name, what in (
+        ("discovery", "run the registry of a domain, also for other hosts"),
+        ("bench", "measure Cortex beside its peers on this machine"),
+    ):
+        options = f"its options: cortex {name} --help"
+        commands.add_parser(name, help=f"{what} ({options})", add_help=False)
+    examples = ["cortex keys new", "cortex keys new --dir ./keys"]
+    what = "make a pair of keys for tcp"
+    add = _add(commands, "keys", what, ("tools", "make_keys"), examples=examples, network=False)
+    add("action", choices=("new",))
+    add("--dir", type=_path, metavar="DIR", help="where to (cortex in XDG_CONFIG_HOME or ~/.config)")
+    examples = ["cortex doctor", "cortex doctor --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex"]
+    what = "check what Cortex needs on this host, and say how to mend what is wrong"
+    _add(commands, "doctor", what, ("doctor", "examine"), examples=examples)
+    examples = ["cortex schema diff robot:Scan /scan", "cortex schema diff run.mcap:/scan robot:Scan"]
+    what = "say what sets two message types apart, and whether one may read the other"
+    add = _add(commands, "schema", what, ("tools", "compare"), examples=examples)
+    add("action", choices=("diff",))
     for which in ("old", "new"):
-        schema.add_argument(which, help="module:Type, a topic that is published, or FILE.mcap:/topic")
-    cpp = _add(
-        commands,
-        "cpp",
-        "write the C++ header of message types to the standard output",
-        ("tools", "write_cpp"),
-        examples=["cortex cpp cortex.messages:Imu > imu.hpp", "cortex cpp robot:Scan robot:Cmd > robot.hpp"],
-        network=False,
-    )
-    cpp.add_argument(
-        "type", nargs="*", metavar="module:Type", help="modules in this directory are found, too"
-    )
-    cpp.add_argument("--namespace", help="C++ namespace of the structs")
-    cpp.add_argument(
-        "--include-dir", action="store_true", help="print where the headers of Cortex are, and end"
-    )
-    cpp.add_argument(
-        "--headers", type=Path, metavar="DIR", help="write there what the client includes besides, and end"
-    )
-    commands.add_parser(
-        "bench",
-        help="measure Cortex beside its peers on this machine (its options: cortex bench --help)",
-        add_help=False,
-    )
+        add(which, help="module:Type, a topic that is published, or FILE.mcap:/topic")
+    examples = ["cortex cpp cortex.messages:Imu > imu.hpp", "cortex cpp robot:Scan robot:Cmd > robot.hpp"]
+    what = "write the C++ header of message types to the standard output"
+    add = _add(commands, "cpp", what, ("tools", "write_cpp"), examples=examples, network=False)
+    add("type", nargs="*", metavar="module:Type", help="modules in this directory are found, too")
+    add("--namespace", help="C++ namespace of the structs")
+    add("--include-dir", action="store_true", help="print where the headers of Cortex are, and end")
+    headers = "write there what the client includes besides, and end"
+    add("--headers", type=Path, metavar="DIR", help=headers)
 
 
 # Arguments
@@ -395,33 +307,28 @@ def _topic(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _number(text: str, least: float, what: str, *, above: bool) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > least if above else value >= least) or not math.isfinite(value):
+def _checked(read: Callable[[str], T], accepts: Callable[[T], bool], what: str) -> Callable[[str], T]:
+    """Return what reads an argument, and refuses all but `what`."""
+
+    def checked(text: str) -> T:
+        with contextlib.suppress(ValueError):
+            value = read(text)
+            if accepts(value):
+                return value
         raise argparse.ArgumentTypeError(f"must be {what}, got {text!r}")
-    return value
+
+    return checked
 
 
-def _positive(text: str) -> float:
-    return _number(text, 0.0, "a number > 0", above=True)
-
-
-def _not_negative(text: str) -> float:
-    return _number(text, 0.0, "a number >= 0", above=False)
+_positive = _checked(float, lambda value: 0.0 < value < math.inf, "a number > 0")
+_not_negative = _checked(float, lambda value: 0.0 <= value < math.inf, "a number >= 0")
+_count = _checked(int, lambda value: value > 0, "an integer > 0")
 
 
 def _rate(text: str) -> float:
-    return math.inf if text == "max" else _number(text, 0.0, 'a number > 0, or "max"', above=True)
+    wanted = 'a number > 0, or "max"'
+    return math.inf if text == "max" else _checked(float, lambda v: 0.0 < v < math.inf, wanted)(text)
 
 
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"must be an integer > 0, got {text!r}")
-    return int(text)
-
-
-def _directory(text: str) -> Path:
+def _path(text: str) -> Path:
     return Path(text).expanduser()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ from cortex.body import Body, MalformedMessage
 from cortex.draft import Drafter
 from cortex.layout import has_tail
 from cortex.native import make_coder
-from cortex.schema import schema_of
+from cortex.schema import MAX_FIXED_BYTES, Schema, schema_of
 
-__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of", "coder_of"]
+__all__ = ["Codec", "MalformedMessage", "Plan", "RawCodec", "RawMessage", "codec_of", "coder_of"]
 
 
 class Plan:
@@ -28,7 +28,6 @@ class Plan:
         self._body = body
         self._message = message
         self.size = body.write(message, None)
-        """Bytes of the body."""
 
     def write(self, buffer: NDArray[np.uint8]) -> int:
         """Write the body to writable memory, arrays with one copy, and return its size [bytes].
@@ -61,35 +60,17 @@ class Codec:
         """Bytes of every body, if they are always the same."""
         self.stamp_of: Callable[[Any], int] | None = None
         """Gets the stamp of a message, if the type has an integer field `stamp_ns`."""
-        for field in self.schema.fields:
-            if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
-                self.stamp_of = attrgetter("stamp_ns")
-        self.encode: Callable[[Any, int], bytes | None] = self._encode
-        """Message and limit to the body, or None if it would be larger than `limit` bytes.
-
-        Raises:
-            TypeError: A value, or an array's dtype, is not of the field's type.
-            ValueError: A value is out of range, or an array has the wrong shape.
-        """
-        self.decode: Callable[..., Any] = self._body.read
-        """Buffer, offset = 0 and size = None to the message.
-
-        The buffer is `bytes` or a read-only array of bytes. The message keeps it: arrays are views of it.
-
-        Raises:
-            MalformedMessage: The bytes are no body of the type.
-        """
+        if self.schema.stamp_index >= 0:
+            self.stamp_of = attrgetter("stamp_ns")
         self._coder = make_coder(self.schema, message_type)
-        if self._coder is not None:
-            self.encode = _encode_natively(self._coder.encode, self._encode)
-            self.decode = _decode_natively(self._coder.decode, self.decode)
         self.drafter = Drafter(self.schema, message_type, self._body)
-        """Makes messages that are written in place."""
 
     def prepare(self, message: Any, limit: int) -> bytes | Plan:
         """Return the body of a message, or its plan if it would be larger than `limit` bytes.
 
-        It raises as `encode` does.
+        Raises:
+            TypeError: A value, or an array's dtype, is not of the field's type.
+            ValueError: A value is out of range, or an array has the wrong shape.
         """
         if self._coder is not None:
             body: bytes | None = self._coder.encode(message, limit)
@@ -98,40 +79,34 @@ class Codec:
         plan = Plan(self._body, message)
         return plan if plan.size > limit else plan.to_bytes()
 
+    def encode(self, message: Any, limit: int) -> bytes:
+        """Return the body. It raises as `prepare` does, and ValueError if it would exceed `limit` bytes."""
+        body = self.prepare(message, limit)
+        if not isinstance(body, bytes):
+            raise ValueError(f"{self.schema.name}: a body of {body.size} bytes exceeds the limit of {limit}")
+        return body
+
+    def decode(self, buffer: Any, offset: int = 0, size: int | None = None) -> Any:
+        """Return the message of a body, which lies in `bytes` or in a read-only array of bytes.
+
+        The message keeps the buffer: its arrays are views of it.
+
+        Raises:
+            MalformedMessage: The bytes are no body of the type.
+        """
+        if self._coder is not None:
+            message = self._coder.decode(buffer, offset, len(buffer) - offset if size is None else size)
+            if message is not None:
+                return message
+        return self._body.read(buffer, offset, size)
+
     def size(self, message: Any) -> int:
-        """Return the size of the body [bytes]. It raises as `encode` does."""
+        """Return the size of the body [bytes]. It raises as `prepare` does."""
         return self._body.write(message, None)
-
-    def _encode(self, message: Any, limit: int) -> bytes | None:
-        plan = Plan(self._body, message)
-        return None if plan.size > limit else plan.to_bytes()
-
-
-def _encode_natively(
-    native: Callable[[Any, int], bytes | None], fallback: Callable[[Any, int], bytes | None]
-) -> Callable[[Any, int], bytes | None]:
-    def encode(message: Any, limit: int) -> bytes | None:
-        body = native(message, limit)
-        return fallback(message, limit) if body is None else body
-
-    return encode
-
-
-def _decode_natively(native: Callable[..., Any], fallback: Callable[..., Any]) -> Callable[..., Any]:
-    def decode(buffer: Any, offset: int = 0, size: int | None = None) -> Any:
-        message = native(buffer, offset, len(buffer) - offset if size is None else size)
-        return fallback(buffer, offset, size) if message is None else message
-
-    return decode
 
 
 def coder_of(codec: Any, head: bytes) -> Any:
-    """Return what packs and reads the messages of one publisher in C; None: Python does.
-
-    Args:
-        codec: Of its type.
-        head: The first 24 bytes of its plain frames.
-    """
+    """Return what packs and reads the messages of one publisher in C; None: Python does."""
     return make_coder(codec.schema, codec.type, head) if isinstance(codec, Codec) else None
 
 
@@ -154,3 +129,48 @@ def codec_of(message_type: type) -> Codec:
                 message_type.__cortex_codec__ = created  # type: ignore[attr-defined]
             codec = vars(message_type)["__cortex_codec__"]
     return codec
+
+
+# Bodies that are encoded already: what replaying a recording needs
+
+
+class RawMessage(NamedTuple):
+    """The body of a message, and its stamp if its type has one."""
+
+    body: bytes | np.ndarray
+    stamp_ns: int = 0
+
+
+class RawPlan(NamedTuple):
+    """A large body, ready to be written."""
+
+    body: bytes | np.ndarray
+    size: int
+
+    def write(self, buffer: np.ndarray) -> None:
+        """Copy the body."""
+        np.copyto(buffer[: self.size], np.frombuffer(self.body, np.uint8))
+
+
+class RawCodec:
+    """Stands for a type that is known by its schema only: bodies pass through as they are."""
+
+    type = RawMessage
+    fixed_size = None
+
+    def __init__(self, schema: Schema) -> None:
+        self.schema = schema
+        self.fingerprint = schema.fingerprint
+        self.stamp_of = attrgetter("stamp_ns") if schema.stamp_index >= 0 else None
+
+    def prepare(self, message: RawMessage, limit: int) -> bytes | RawPlan:
+        """The body, or what writes it if it is larger than the limit."""
+        size = len(message.body)
+        if size > MAX_FIXED_BYTES:
+            raise ValueError(f"a body has at most {MAX_FIXED_BYTES} bytes, got {size}")
+        return bytes(message.body) if size <= limit else RawPlan(message.body, size)
+
+    @property
+    def drafter(self) -> NoReturn:
+        """Refuse: there are no fields to fill."""
+        raise TypeError("a raw publisher has nothing to loan")

@@ -13,12 +13,11 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-INTERFACE = 20
+INTERFACE = 21
 """What `_native.c` must say of itself: counts up with each change of what it offers."""
 
 
 def _load() -> Any:
-    """Return `cortex._native` if it is there and of this version."""
     if os.environ.get("CORTEX_PURE_PYTHON"):
         return None
     try:
@@ -46,5 +45,4 @@ def _require_gil() -> None:
 
 
 native: Any = _load()
-"""`cortex._native`, or None."""
 _require_gil()

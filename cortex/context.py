@@ -6,14 +6,16 @@ import contextlib
 import os
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import zmq
 
 from cortex.compiled import native
 from cortex.wire import BODY_LIMIT, CONTROL_LIMIT, HEADER_SIZE
 
+_C = TypeVar("_C", bound="Closing")
 _lock = threading.Lock()
 _context: zmq.Context[zmq.Socket[bytes]] | None = None
 _owner = 0
@@ -38,6 +40,20 @@ class Closed(RuntimeError):
     """The publisher, subscriber, client or node was closed."""
 
 
+class Closing(ABC):
+    """What closes at the end of a `with` block."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it."""
+
+    def __enter__(self: _C) -> _C:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 def context() -> zmq.Context[zmq.Socket[bytes]]:
     """The one context of this process. A forked child gets its own."""
     global _context, _owner
@@ -49,24 +65,29 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
 
 
 def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> zmq.Socket[bytes]:
-    """A socket that never blocks its owner at close, bounds what comes, and over tcp notices a peer's death.
+    """A socket of this process that bounds what waits and what comes, and never blocks its owner at close."""
+    socket = context().socket(kind)
+    socket.rcvhwm = high_water_mark  # that for sending, which also holds a SUB's subscriptions, stays 1000
+    set_up(socket, kind, tcp=tcp, linger_ms=LINGER_MS)
+    socket.setsockopt(zmq.IPV6, int(tcp))
+    return socket
+
+
+def set_up(socket: zmq.Socket[Any], kind: int, *, tcp: bool, linger_ms: int) -> None:
+    """Set what all sockets have in common.
 
     There are no heartbeats on ipc: the kernel reports a dead peer at once, and a stopped one may
     still hold leases of shared memory.
     """
-    socket = context().socket(kind)
-    socket.linger = LINGER_MS
-    socket.rcvhwm = high_water_mark  # that for sending, which also holds a SUB's subscriptions, stays 1000
+    socket.linger = linger_ms
     socket.setsockopt(zmq.MAXMSGSIZE, _FRAME_MAX[kind])
     socket.setsockopt(zmq.RECONNECT_IVL, 20)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
     if tcp:
-        socket.setsockopt(zmq.IPV6, 1)
         socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 4 * HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TTL, 4 * HEARTBEAT_MS)
         socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
-    return socket
 
 
 class Frames:
@@ -74,9 +95,6 @@ class Frames:
 
     pyzmq's own `send` spends half of its time on checking arguments that we never pass, and an empty socket
     costs it an exception; `_socket.c` calls libzmq directly, where it can.
-
-    Args:
-        socket: Stays the caller's, who closes this first.
     """
 
     send: Callable[..., Any]

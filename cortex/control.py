@@ -9,8 +9,7 @@ from typing import Any
 import zmq
 
 from cortex.codec import codec_of
-from cortex.context import HEARTBEAT_MS
-from cortex.wire import CONTROL_LIMIT, HEADER_SIZE
+from cortex.context import set_up
 
 HEARTBEAT_NS = 250_000_000
 LEASE_NS = 1_000_000_000
@@ -31,18 +30,13 @@ def control_types(*types: type) -> dict[int, type]:
 def make_control_socket(context: zmq.Context[Any], kind: int, *, tcp: bool) -> zmq.Socket[Any]:
     """A DEALER or ROUTER that bounds what waits and what comes; over tcp it notices that its peer is gone."""
     socket: zmq.Socket[Any] = context.socket(kind, socket_class=zmq.Socket)
-    socket.linger = 200
     socket.set_hwm(QUEUE_MAX)
-    socket.maxmsgsize = CONTROL_LIMIT + HEADER_SIZE
-    socket.setsockopt(zmq.RECONNECT_IVL, 20)
-    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 0 if not tcp else 500)
+    set_up(socket, kind, tcp=tcp, linger_ms=200)
     if tcp:
         socket.ipv6 = kind == zmq.DEALER  # who binds decides by its address
-        socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
-        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 4 * HEARTBEAT_MS)
-        socket.setsockopt(zmq.HEARTBEAT_TTL, 4 * HEARTBEAT_MS)
-        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
         socket.setsockopt(zmq.CONNECT_TIMEOUT, 3000)
+    else:
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 0)
     return socket
 
 

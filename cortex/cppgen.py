@@ -1,29 +1,19 @@
 """C++ structs for message types: what `cortex cpp module:Scan > scan.hpp` writes.
 
-The header has one plain struct for each message and enum, and beside it a `cortex::Codec` with the type's
-schema, fingerprint and the code that reads and writes its body. Offsets are computed here, so that the C++
-compiler sees constants. A header may be included together with others that hold the same types.
+The header has one plain struct for each message and enum, and beside a struct a `cortex::Codec` with the
+type's schema, fingerprint and the table by which its body is read and written. A header may be included
+together with others that hold the same types.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import cortex.messages
-from cortex import records
-from cortex.layout import (
-    ITEM_ALIGNMENT,
-    LARGE_ARRAY_BYTES,
-    fixed_bytes,
-    has_tail,
-    measure,
-    measure_fields,
-    stride_of,
-    values_of,
-)
+from cortex import layout, records
 from cortex.message import is_message
 from cortex.schema import (
     ANY_DTYPE,
@@ -37,6 +27,7 @@ from cortex.schema import (
     fingerprint_of,
     schema_of,
 )
+from cortex.table import Kind, Row, Table
 
 _SCALARS = {
     "bool": "bool",
@@ -86,22 +77,13 @@ def generate(types: Sequence[type | Schema], *, namespace: str | None = None) ->
     for item in types:
         generator.message(item if isinstance(item, Schema) else schema_of(item))
     names = ", ".join(block.name for block in generator.blocks)
+    standard = "array complex cstddef cstdint limits optional stdexcept string string_view utility vector"
     return "\n".join(
         [
             f"// Written by `cortex cpp`; do not edit. Types: {names}.",
             "#pragma once",
             "",
-            "#include <array>",
-            "#include <complex>",
-            "#include <cstddef>",
-            "#include <cstdint>",
-            "#include <limits>",
-            "#include <optional>",
-            "#include <stdexcept>",
-            "#include <string>",
-            "#include <string_view>",
-            "#include <utility>",
-            "#include <vector>",
+            *(f"#include <{header}>" for header in standard.split()),
             "",
             "#include <cortex/codec.hpp>",
             "",
@@ -129,12 +111,11 @@ class _Block:
 
 @dataclass(frozen=True)
 class _Member:
-    """A field of a struct: its C++ name and type, and its place in the block."""
+    """A field of a struct: its C++ name and type."""
 
     name: str
     cpp: str
     field: Field
-    offset: int
 
 
 def write_headers(folder: Path) -> None:
@@ -156,6 +137,7 @@ class _Generator:
 
     def __init__(self, namespace: str | None) -> None:
         self._namespace = namespace
+        self._members: dict[str, list[_Member]] = {}
         self.blocks: list[_Block] = []
 
     def _qualified(self, name: str) -> tuple[str, str, str]:
@@ -184,7 +166,7 @@ class _Generator:
         if isinstance(kind, OptionalType):
             return f"std::optional<{self.cpp(kind.item)}>"
         if isinstance(kind, ListType):
-            return f"std::vector<{self.cpp(kind.item)}>"
+            return f"std::vector<{_ITEMS[kind.item] if kind.item == 'bool' else self.cpp(kind.item)}>"
         return self.message(kind)
 
     def enumeration(self, kind: EnumType) -> str:
@@ -196,28 +178,8 @@ class _Generator:
         members: dict[str, int] = {}
         for member, value in kind.values:
             members[_identifier(member, members)] = value
-        lines = [
-            *_open(namespace),
-            f"enum class {name} : std::int32_t {{",
-            *(f"  {member} = {_int32(value)}," for member, value in members.items()),
-            "};",
-            *_close(namespace),
-            "namespace cortex {",
-            "template <>",
-            f"struct EnumCodec<::{qualified}> {{",
-            f"  static constexpr std::string_view name = {_literal(kind.name)};",
-            "  static constexpr bool known(std::int32_t number) noexcept {",
-            "    switch (number) {",
-            *(f"      case {_int32(number)}:" for number in sorted(set(members.values()))),
-            "        return true;",
-            "      default:",
-            "        return false;",
-            "    }",
-            "  }",
-            "};",
-            "}  // namespace cortex",
-        ]
-        self._add(qualified, key, lines)
+        listed = (f"  {member} = {_int32(value)}," for member, value in members.items())
+        self._add(qualified, key, _within(namespace, [f"enum class {name} : std::int32_t {{", *listed, "};"]))
         return f"::{qualified}"
 
     def message(self, schema: Schema) -> str:
@@ -227,21 +189,16 @@ class _Generator:
         if self._is_known(qualified, key):
             return f"::{qualified}"
         members: list[_Member] = []
-        for item, offset in zip(schema.fields, measure_fields(schema)[0], strict=True):
+        for item in schema.fields:
             taken = [name, *(member.name for member in members)]
-            members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item, offset))
-        lines = [
-            *_open(namespace),
-            *_struct(name, members),
-            *_close(namespace),
-            *self._codec(schema, f"::{qualified}", members),
-        ]
-        self._add(qualified, key, lines)
+            members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item))
+        self._members[f"::{qualified}"] = members
+        lines = _within(namespace, _struct(name, members))
+        self._add(qualified, key, lines + self._codec(schema, f"::{qualified}", members))
         return f"::{qualified}"
 
     def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
-        stamp = next((m for m in members if m.field.name == "stamp_ns" and _is_integer(m.field.type)), None)
-        unused = "" if stamp else "[[maybe_unused]] "
+        stamp = members[schema.stamp_index] if schema.stamp_index >= 0 else None
         stamp_code = f"static_cast<std::int64_t>(message.{stamp.name})" if stamp else "0"
         return [
             "namespace cortex {",
@@ -249,73 +206,71 @@ class _Generator:
             f"struct Codec<{cpp}> {{",
             f"  static constexpr std::string_view name = {_literal(schema.name)};",
             f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
-            "  static constexpr std::string_view schema =",
-            *_string_lines(schema.to_json()),
-            f"  static constexpr std::size_t block = {measure_fields(schema)[1]};",
-            f"  static constexpr bool fixed = {_truth(not has_tail(schema))};",
-            f"  static constexpr bool stamped = {_truth(stamp is not None)};",
+            f"  static constexpr std::string_view schema = {_literal(schema.to_json())};",
+            f"  static constexpr bool fixed = {str(not layout.has_tail(schema)).lower()};",
+            f"  static constexpr bool stamped = {str(stamp is not None).lower()};",
             "",
-            f"  static std::int64_t stamp({unused}const {cpp}& message) noexcept {{",
+            f"  static std::int64_t stamp([[maybe_unused]] const {cpp}& message) noexcept {{",
             f"    return {stamp_code};",
             "  }",
             "",
-            "  template <class Visitor, class Message>",
-            *_fields(schema.name, members),
+            "  static constexpr const char* names[] = {",
+            *(f"      {_literal(member.field.name)}," for member in members),
+            "      nullptr};",
+            "#pragma GCC diagnostic push",
+            '#pragma GCC diagnostic ignored "-Winvalid-offsetof"',
+            "  static constexpr CortexItem items[] = {",
+            *(_row(row) for row in _StructTable(schema, cpp, self).rows),
+            "  };",
+            "#pragma GCC diagnostic pop",
             "};",
             "}  // namespace cortex",
         ]
 
-
-def _fields(name: str, members: list[_Member]) -> Iterator[str]:
-    """The function that hands each field, its place and its shape to a visitor."""
-    unused = "" if members else "[[maybe_unused]] "
-    parameters = ("Visitor& visit", "std::size_t at", "Message& message")
-    yield f"  static void fields({', '.join(unused + each for each in parameters)}) {{"
-    variables: dict[tuple[str, str], str] = {}
-    """By the field whose own they are, or nothing if others share them, and their name."""
-    calls = []
-    for member in members:
-        scope = member.field.name if _holds_list(member.field.type) else ""
-        place = f"at + {member.offset}" if member.offset else "at"
-        shapes = _shapes(member.field.type, f"{name}.{member.field.name}", scope, variables)
-        calls.append(f"    visit({', '.join([place, f'message.{member.name}', *shapes])});")
-    for (_, dimension), variable in variables.items():
-        yield f"    Dimension {variable}{{{_literal(dimension)}}};"
-    yield from calls
-    yield "  }"
+    def members_of(self, cpp: str) -> list[_Member]:
+        """Those of a struct that was made."""
+        return self._members[cpp]
 
 
-def _holds_list(kind: FieldType) -> bool:
-    """Whether dimensions within a field belong to the elements of its lists."""
-    return isinstance(kind, ListType) or (isinstance(kind, OptionalType) and _holds_list(kind.item))
+class _StructTable(Table):
+    """The rows of a struct; what it is bound to is its C++ name."""
+
+    def __init__(self, schema: Schema, cpp: str, generator: _Generator) -> None:
+        self._generator = generator
+        super().__init__(schema, cpp)
+
+    def fields_of(self, schema: Schema, bound: str) -> Iterator[tuple[str, str]]:
+        for member in self._generator.members_of(bound):
+            inner = member.field.type
+            while isinstance(inner, OptionalType | ListType):
+                inner = inner.item
+            of = self._generator.cpp(inner) if isinstance(inner, Schema) else ""
+            yield f"offsetof({bound}, {member.name})", of
+
+    def is_plain(self, kind: ArrayType) -> bool:
+        return kind.is_fixed and not _is_large(kind)
+
+    def object_of(self, kind: FieldType, bound: str) -> str:
+        if isinstance(kind, Schema):
+            return "nullptr"
+        cpp = self._generator.cpp(kind)
+        if isinstance(kind, ArrayType):
+            return f"&detail::array_type<{cpp}>"
+        inner = cpp[cpp.index("<") + 1 : -1]
+        return f"&detail::{'optional' if isinstance(kind, OptionalType) else 'list'}_type<{inner}>"
+
+    def dimension_of(self, size: int | str) -> str:
+        return _literal(size) if isinstance(size, str) else "nullptr"
 
 
-def _shapes(kind: FieldType, where: str, scope: str, variables: dict[tuple[str, str], str]) -> Iterator[str]:
-    """What a visitor has to be told of a field besides its C++ type, from the outside in."""
-    if isinstance(kind, OptionalType):
-        yield f"Held<{measure(kind)[1]}>{{}}"
-        yield from _shapes(kind.item, where, scope, variables)
-    elif isinstance(kind, ListType):
-        alignment = max(ITEM_ALIGNMENT, measure(kind.item)[1])
-        yield f"Elements<{stride_of(kind.item)}, {alignment}, {values_of(kind.item)}>{{}}"
-        yield from _shapes(kind.item, where, scope, variables)
-    elif kind == "bytes":
-        yield "Bytes{}"
-    elif isinstance(kind, ArrayType) and _is_large(kind):
-        yield f"Within<{', '.join(map(str, kind.shape))}>{{}}"
-    elif isinstance(kind, ArrayType) and not kind.is_fixed:
-        extents = [
-            f"{extent}u"
-            if isinstance(extent, int)
-            else variables.setdefault((scope, extent), f"dimension_{len(variables)}")
-            for extent in kind.shape
-        ]
-        yield f"Extents<{len(extents)}>{{{_literal(where)}, {{{{{', '.join(extents)}}}}}}}"
+def _row(row: Row) -> str:
+    kind, *numbers = (int(each) if isinstance(each, bool) else each for each in astuple(row))
+    numbers[7] = numbers[7] or "nullptr"
+    return f"      {{CORTEX_{Kind(kind).name}, {', '.join(map(str, numbers))}}},"
 
 
 def _is_large(kind: ArrayType) -> bool:
-    """Whether an array of a fixed shape is so large that C++ has it as a view."""
-    return kind.is_fixed and fixed_bytes(kind) >= LARGE_ARRAY_BYTES
+    return kind.is_fixed and layout.fixed_bytes(kind) >= layout.LARGE_ARRAY_BYTES
 
 
 def _struct(name: str, members: list[_Member]) -> Iterator[str]:
@@ -330,10 +285,9 @@ def _struct(name: str, members: list[_Member]) -> Iterator[str]:
             notes.append(f"frame {_comment(member.field.frame)}")
         yield f"  {member.cpp} {member.name}{{}};" + (f"  // {', '.join(notes)}" if notes else "")
     equal = " &&\n           ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
-    unused = "" if members else "[[maybe_unused]] "
-    if members:
-        yield ""
-    yield f"  friend bool operator==({unused}const {name}& a, {unused}const {name}& b) {{"
+    yield ""
+    parameters = f"[[maybe_unused]] const {name}& a, [[maybe_unused]] const {name}& b"
+    yield f"  friend bool operator==({parameters}) {{"
     yield f"    return {equal};"
     yield "  }"
     yield f"  friend bool operator!=(const {name}& a, const {name}& b) {{ return !(a == b); }}"
@@ -353,10 +307,6 @@ def _array(kind: ArrayType) -> str:
     return cpp
 
 
-def _is_integer(kind: FieldType) -> bool:
-    return isinstance(kind, str) and "int" in kind
-
-
 def _identifier(name: str, taken: Sequence[str] | dict[str, int] = ()) -> str:
     safe = re.sub(r"[^A-Za-z0-9_]", "_", name)
     if not safe or safe[0].isdigit():
@@ -372,18 +322,10 @@ def _comment(text: str) -> str:
     return plain.replace("??", "? ?")  # a trigraph
 
 
-def _string_lines(text: str) -> Iterator[str]:
-    pieces = [text[start : start + 90] for start in range(0, len(text), 90)]
-    for index, piece in enumerate(pieces):
-        yield f"      {_literal(piece)}{';' if index == len(pieces) - 1 else ''}"
-
-
-def _open(namespace: str) -> list[str]:
-    return [f"namespace {namespace} {{"] if namespace else []
-
-
-def _close(namespace: str) -> list[str]:
-    return [f"}}  // namespace {namespace}"] if namespace else []
+def _within(namespace: str, lines: Iterable[str]) -> list[str]:
+    if not namespace:
+        return [*lines]
+    return [f"namespace {namespace} {{", *lines, f"}}  // namespace {namespace}"]
 
 
 def _literal(text: str) -> str:
@@ -400,7 +342,3 @@ def _literal(text: str) -> str:
 
 def _int32(value: int) -> str:
     return "std::numeric_limits<std::int32_t>::min()" if value == -(2**31) else str(value)
-
-
-def _truth(value: bool) -> str:
-    return "true" if value else "false"

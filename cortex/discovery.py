@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import zmq
 
+from cortex import control, records
 from cortex.clock import ClockEstimate
 from cortex.codec import MalformedMessage
-from cortex.control import (
-    HEARTBEAT_NS,
-    LEASE_NS,
-    STALL_NS,
-    control_types,
-    make_control_socket,
-    try_send,
-)
-from cortex.directory_link import DirectoryLink
 from cortex.host import REGISTRY_SOCKET, runtime_dir
-from cortex.records import (
-    CLOCK_OFFSET_MAX_NS,
-    Alive,
-    Changed,
-    Gone,
-    Heartbeat,
-    Hello,
-    Leave,
-    NodeRecord,
-    Refused,
-    Welcome,
-    check_record,
-)
 from cortex.registry import Registry, ensure_registry, main
 from cortex.security import Keys, apply_client, check_address, host_of
 from cortex.wire import Header, control_frame, parse_control
@@ -45,6 +24,7 @@ __all__ = ["Directory", "Registry", "ensure_registry", "main"]
 logger = logging.getLogger(__name__)
 
 _FRAMES_PER_CALL = 256
+_CONNECT_FIRST_NS = 2_000_000
 _CONNECT_LAST_NS = 50_000_000
 _ANSWER_NS = 300_000_000
 """A `Hello` that was not answered for this long is sent again, then after twice as long, up to a second."""
@@ -58,8 +38,8 @@ _REVIVE_LAST_NS = 10_000_000_000
 class Directory:
     """Knows the other nodes of a domain, and makes this one known to them.
 
-    It belongs to one thread, which polls `socket`, calls `handle` when that is readable, and `tick` at
-    `deadline_ns`. `nodes` may be read from any thread: it is replaced when it changes, never altered.
+    It belongs to one thread, which polls `socket`, calls `handle` when that is readable, and `tick` often.
+    `nodes` may be read from any thread: it is replaced when it changes, never altered.
 
     Args:
         context: For the sockets.
@@ -81,16 +61,14 @@ class Directory:
         context: zmq.Context[Any],
         *,
         domain: int,
-        record: Callable[[], NodeRecord],
+        record: Callable[[], records.NodeRecord],
         registry: str = "auto",
         keys: Keys | None = None,
         insecure: bool = False,
         on_change: Callable[[frozenset[int]], None] | None = None,
     ):
-        self.nodes: Mapping[int, NodeRecord] = {}
-        """The other nodes' records, by node."""
+        self.nodes: Mapping[int, records.NodeRecord] = {}
         self.rejected = 0
-        """Control frames that were malformed."""
         self.clock = ClockEstimate(local=not registry.startswith("tcp://"))
         self._context = context
         self._domain = domain
@@ -107,20 +85,35 @@ class Directory:
         self._changed: set[int] = set()
         self._logged: set[str] = set()
         self._tick_ns = time.monotonic_ns()
-        self._link_types = control_types(Alive, Changed, Gone, Refused, Welcome)
-        self._link: DirectoryLink | None = None
+        self._link_types = control.control_types(
+            records.Alive, records.Changed, records.Gone, records.Refused, records.Welcome
+        )
+        self.socket: zmq.Socket[Any] | None = None
+        """To be polled for input; None without a registry."""
+        self._next_ns = self._heard_ns = self._tick_ns
+        """When to send the next heartbeat or `Hello`; when the registry was heard, or our wait began."""
+        self._wait_ns = _CONNECT_FIRST_NS
+        self._asked = self._welcomed = self._warned = False
+        """Whether a `Hello` has been sent and not answered yet; answered; our impatience said."""
+        self._quiet_ns = 0
+        """Until when an `Alive` is no reason for a further `Hello`."""
+        self._epoch = self._version = 0
+        self._missing: dict[int, int] = {}
+        """Revisions that `Welcome` named and that have not arrived yet, by node."""
+        self._doubted: dict[int, int] = {}
+        """When to drop a node that the registry did not name in its last `Welcome` [ns]."""
+        self._address = f"ipc://{runtime_dir(domain) / REGISTRY_SOCKET}" if registry == "auto" else registry
         if registry != "off":
-            address = f"ipc://{runtime_dir(domain) / REGISTRY_SOCKET}" if registry == "auto" else registry
-            self._link = self._connect(address)
+            self._connect(self._address)
 
-    def _connect(self, address: str) -> DirectoryLink:
+    def _connect(self, address: str) -> None:
         if not address.startswith(("tcp://", "ipc://")):
             raise ValueError(
                 f'registry must be "auto", "off", or a tcp:// or ipc:// address, got {address!r}'
             )
         check_address(address, keys=self._keys, insecure=self._insecure)
         tcp = address.startswith("tcp://")
-        socket = make_control_socket(self._context, zmq.DEALER, tcp=tcp)
+        socket = control.make_control_socket(self._context, zmq.DEALER, tcp=tcp)
         try:
             # Nothing may queue for a registry that is not there: a `send` that fails tells us so at once.
             socket.setsockopt(zmq.IMMEDIATE, 1)
@@ -130,30 +123,14 @@ class Directory:
         except BaseException:
             socket.close(linger=0)
             raise
-        now_ns = time.monotonic_ns()
-        return DirectoryLink(address, socket, next_ns=now_ns, heard_ns=now_ns)
+        self.socket = socket
 
     # What the owner drives
 
     @property
-    def socket(self) -> zmq.Socket[Any] | None:
-        """The socket to poll for input; None without a registry."""
-        return None if self._link is None else self._link.socket
-
-    @property
-    def deadline_ns(self) -> int:
-        """When to call `tick` next, by CLOCK_MONOTONIC [ns]; earlier and later calls do no harm."""
-        times = [self._tick_ns + HEARTBEAT_NS]
-        if self._link is not None:
-            times.append(self._link.next_ns)
-        if self._dirty:
-            times.append(self._announced_ns + _ANNOUNCE_NS)
-        return min(times)
-
-    @property
     def connected(self) -> bool:
         """Whether the registry has told of all nodes; without one there is nothing to wait for."""
-        return self._link is None or (self._link.welcomed and not self._link.missing)
+        return self.socket is None or (self._welcomed and not self._missing)
 
     def announce(self) -> None:
         """Say that this node's record has changed; the next `tick` sends it. Any thread may call this."""
@@ -161,24 +138,23 @@ class Directory:
 
     def handle(self) -> None:
         """Read what has arrived, at most some hundred frames."""
-        link, now_ns = self._link, time.monotonic_ns()
-        if link is None:
-            return
-        for _ in range(_FRAMES_PER_CALL):
+        now_ns = time.monotonic_ns()
+        for _ in range(_FRAMES_PER_CALL if self.socket is not None else 0):
+            assert self.socket is not None
             try:
-                frames = link.socket.recv_multipart(zmq.NOBLOCK)
+                frames = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 break
             try:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
                 message, header = parse_control(frames[0], self._link_types)
-                if isinstance(message, Alive):
+                if isinstance(message, records.Alive):
                     self._read_clock(header, time.monotonic_ns())
-                self._on_message(link, message, now_ns)
+                self._on_message(message, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
-                self._log_once(f"rejected a frame of {link.address}", error)
+                self._log_once(f"rejected a frame of {self._address}", error)
         self._flush()
 
     def tick(self, now_ns: int | None = None) -> None:
@@ -189,59 +165,68 @@ class Directory:
         if self._dirty and now_ns - self._announced_ns >= _ANNOUNCE_NS:
             self._announced_ns = now_ns
             self._own = self._next_record()
-            if self._link is not None and self._link.welcomed:
-                self._say_hello(self._link, now_ns, snapshot=False)
-        if self._link is not None:
-            if now_ns >= self._link.next_ns:
-                self._beat(self._link, now_ns)
-            self._expire(self._link, now_ns)
+            if self._welcomed:
+                self._say_hello(now_ns, snapshot=False)
+        if self.socket is not None and now_ns >= self._next_ns:
+            self._beat(now_ns)
+        self._expire(now_ns)
         self._flush()
 
     def close(self) -> None:
         """Take leave, and close the sockets."""
-        if self._link is not None and not self._link.socket.closed:
-            if self._link.welcomed:
-                try_send(self._link.socket, control_frame(Leave(self._own.node)))
-            self._link.socket.close()
+        if self.socket is not None and not self.socket.closed:
+            if self._welcomed:
+                self._send(records.Leave(self._own.node))
+            self.socket.close()
 
     # Sending
 
-    def _next_record(self) -> NodeRecord:
+    def _next_record(self) -> records.NodeRecord:
         self._dirty = False  # before the record is read: a change that comes now is announced once more
         self._revision += 1
-        return dataclasses.replace(self._record(), revision=self._revision)
+        return replace(self._record(), revision=self._revision)
 
-    def _beat(self, link: DirectoryLink, now_ns: int) -> None:
-        if not link.welcomed:
-            self._say_hello(link, now_ns, snapshot=True)
+    def _send(self, message: Any, sequence: int = 0) -> bool:
+        frame = control_frame(message, sequence)
+        return self.socket is not None and control.try_send(self.socket, frame)
+
+    def _lose(self) -> None:
+        """The connection is gone. What was known through it stays, until its lease says otherwise."""
+        if self._welcomed or self._asked:
+            self._wait_ns = _CONNECT_FIRST_NS
+        self._welcomed = self._asked = False
+
+    def _beat(self, now_ns: int) -> None:
+        if not self._welcomed:
+            self._say_hello(now_ns, snapshot=True)
             return
-        heartbeat = Heartbeat(self._own.node, self._own.revision, 0)
-        if try_send(link.socket, control_frame(heartbeat, time.monotonic_ns())):  # the answer returns it
-            link.next_ns = now_ns + HEARTBEAT_NS
-            self._warn_of_silence(link, now_ns)
+        heartbeat = records.Heartbeat(self._own.node, self._own.revision, 0)
+        if self._send(heartbeat, time.monotonic_ns()):  # the answer returns the time
+            self._next_ns = now_ns + control.HEARTBEAT_NS
+            self._warn_of_silence(now_ns)
         else:
-            link.lose()
-            self._retry(link, now_ns)
+            self._lose()
+            self._retry(now_ns)
 
-    def _say_hello(self, link: DirectoryLink, now_ns: int, *, snapshot: bool) -> None:
+    def _say_hello(self, now_ns: int, *, snapshot: bool) -> None:
         try:
-            frame = control_frame(Hello(snapshot, self._own))
+            is_sent = self._send(records.Hello(snapshot, self._own))
         except ValueError as error:  # larger than any control frame may be
             self._log_once("this node cannot be announced", error)
-            link.next_ns = now_ns + LEASE_NS
+            self._next_ns = now_ns + control.LEASE_NS
             return
-        if not try_send(link.socket, frame):
-            link.lose()
-            self._retry(link, now_ns)
+        if not is_sent:
+            self._lose()
+            self._retry(now_ns)
             return
-        link.wait_ns = min(2 * link.wait_ns, LEASE_NS) if link.asked else _ANSWER_NS
-        link.asked, link.quiet_ns = True, now_ns + _ANSWER_NS
-        link.next_ns = now_ns + (HEARTBEAT_NS if link.welcomed else link.wait_ns)
+        self._wait_ns = min(2 * self._wait_ns, control.LEASE_NS) if self._asked else _ANSWER_NS
+        self._asked, self._quiet_ns = True, now_ns + _ANSWER_NS
+        self._next_ns = now_ns + (control.HEARTBEAT_NS if self._welcomed else self._wait_ns)
 
-    def _retry(self, link: DirectoryLink, now_ns: int) -> None:
-        link.next_ns = now_ns + link.wait_ns
-        link.wait_ns = min(2 * link.wait_ns, _CONNECT_LAST_NS)
-        self._warn_of_silence(link, now_ns)
+    def _retry(self, now_ns: int) -> None:
+        self._next_ns = now_ns + self._wait_ns
+        self._wait_ns = min(2 * self._wait_ns, _CONNECT_LAST_NS)
+        self._warn_of_silence(now_ns)
         if self._revives and now_ns >= self._revive_ns:
             self._revive(now_ns)
 
@@ -255,71 +240,83 @@ class Directory:
         self._revive_ns = now_ns + self._revive_wait_ns
         self._revive_wait_ns = min(2 * self._revive_wait_ns, _REVIVE_LAST_NS)
 
-    def _warn_of_silence(self, link: DirectoryLink, now_ns: int) -> None:
-        if now_ns - link.heard_ns > _SILENCE_NS and not link.warned:
-            link.warned = True
-            keys = " and are its key and ours authorised?" if self._keys and "tcp:" in link.address else ""
-            logger.warning("no answer of the registry at %s; is it running?%s", link.address, keys)
+    def _warn_of_silence(self, now_ns: int) -> None:
+        if now_ns - self._heard_ns > _SILENCE_NS and not self._warned:
+            self._warned = True
+            keys = " and are its key and ours authorised?" if self._keys and "tcp:" in self._address else ""
+            logger.warning("no answer of the registry at %s; is it running?%s", self._address, keys)
 
     # Receiving
 
-    def _on_message(self, link: DirectoryLink, message: Any, now_ns: int) -> None:
-        link.heard_ns, link.warned = now_ns, False
-        if isinstance(message, Refused):
-            self._log_once(f"{link.address} refuses this node", message.reason)
-            link.wait_ns, link.quiet_ns = LEASE_NS, now_ns + LEASE_NS
-            if not link.welcomed:
-                link.next_ns = link.quiet_ns
-        elif isinstance(message, Welcome):
-            self._on_welcome(link, message, now_ns)
-        elif isinstance(message, Alive):
-            self._on_alive(link, message, now_ns)
-        elif isinstance(message, Gone):
-            link.count(message.version)
-            link.missing.pop(message.node, None)
-            link.doubted.pop(message.node, None)
+    def _on_message(self, message: Any, now_ns: int) -> None:
+        self._heard_ns, self._warned = now_ns, False
+        if isinstance(message, records.Refused):
+            self._log_once(f"{self._address} refuses this node", message.reason)
+            self._wait_ns, self._quiet_ns = control.LEASE_NS, now_ns + control.LEASE_NS
+            if not self._welcomed:
+                self._next_ns = self._quiet_ns
+        elif isinstance(message, records.Welcome):
+            self._on_welcome(message, now_ns)
+        elif isinstance(message, records.Alive):
+            self._on_alive(message, now_ns)
+        elif isinstance(message, records.Gone):
+            self._count(message.version)
+            self._missing.pop(message.node, None)
+            self._doubted.pop(message.node, None)
             self._drop(message.node)
         else:
-            self._on_changed(link, message)
+            self._on_changed(message)
+
+    def _count(self, version: int) -> None:
+        """Take note of a change that the registry has numbered."""
+        # Records of a snapshot are older than the `Welcome` before them; a gap shows at the next `Alive`.
+        if self._welcomed and version == self._version + 1:
+            self._version = version
 
     def _read_clock(self, header: Header, now_ns: int) -> None:
-        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < CLOCK_OFFSET_MAX_NS
+        is_told = 0 < header.sequence < now_ns and 0 < header.publish_ns < records.CLOCK_OFFSET_MAX_NS
         if is_told and not self.clock.local:
             self.clock.add(header.sequence, header.publish_ns, now_ns)
 
-    def _on_welcome(self, link: DirectoryLink, welcome: Welcome, now_ns: int) -> None:
+    def _on_welcome(self, welcome: records.Welcome, now_ns: int) -> None:
         if len(welcome.nodes) != len(welcome.revisions):
             raise MalformedMessage("a welcome with lists of different lengths")
-        link.greet(now_ns)
-        if welcome.epoch != link.epoch and not self.clock.local:
+        if not self._welcomed:
+            self._next_ns = now_ns + control.HEARTBEAT_NS
+        self._welcomed, self._asked, self._quiet_ns = True, False, 0
+        if welcome.epoch != self._epoch and not self.clock.local:
             self.clock.forget()
         self._revive_ns, self._revive_wait_ns = 0, _REVIVE_FIRST_NS
-        link.epoch, link.version = welcome.epoch, welcome.version
+        self._epoch, self._version = welcome.epoch, welcome.version
         named = dict(zip(welcome.nodes, welcome.revisions, strict=True))
         named.pop(self._own.node, None)
-        link.missing = {
+        self._missing = {
             node: revision
             for node, revision in named.items()
             if node not in self.nodes or self.nodes[node].revision != revision
         }
         # A registry that was just started does not know everybody yet: one lease of grace.
-        since = {node: link.doubted.get(node, now_ns + LEASE_NS) for node in self.nodes if node not in named}
-        link.doubted = since
+        since = {
+            node: self._doubted.get(node, now_ns + control.LEASE_NS)
+            for node in self.nodes
+            if node not in named
+        }
+        self._doubted = since
 
-    def _on_alive(self, link: DirectoryLink, alive: Alive, now_ns: int) -> None:
-        if not link.welcomed or now_ns < link.quiet_ns:
+    def _on_alive(self, alive: records.Alive, now_ns: int) -> None:
+        if not self._welcomed or now_ns < self._quiet_ns:
             return  # the answer to our last `Hello` is on its way and says more
-        if alive.epoch != link.epoch or alive.version != link.version or link.missing:
-            self._say_hello(link, now_ns, snapshot=True)
+        if alive.epoch != self._epoch or alive.version != self._version or self._missing:
+            self._say_hello(now_ns, snapshot=True)
         elif alive.held != self._own.revision:
-            self._say_hello(link, now_ns, snapshot=False)
+            self._say_hello(now_ns, snapshot=False)
 
-    def _on_changed(self, link: DirectoryLink, changed: Changed) -> None:
+    def _on_changed(self, changed: records.Changed) -> None:
         record = changed.record
-        check_record(record)
-        link.count(changed.version)
-        link.missing.pop(record.node, None)
-        link.doubted.pop(record.node, None)
+        records.check_record(record)
+        self._count(changed.version)
+        self._missing.pop(record.node, None)
+        self._doubted.pop(record.node, None)
         known = self.nodes.get(record.node)
         if record.node != self._own.node and (known is None or known.revision != record.revision):
             self.nodes = {**self.nodes, record.node: record}
@@ -329,15 +326,14 @@ class Directory:
 
     def _forgive_stall(self, stall_ns: int) -> None:
         """If this process was stopped, the others' silence is ours: their leases start where they stood."""
-        link = self._link
-        if stall_ns > STALL_NS and link is not None:
-            link.heard_ns += stall_ns
-            link.doubted = {node: at_ns + stall_ns for node, at_ns in link.doubted.items()}
+        if stall_ns > control.STALL_NS:
+            self._heard_ns += stall_ns
+            self._doubted = {node: at_ns + stall_ns for node, at_ns in self._doubted.items()}
 
-    def _expire(self, link: DirectoryLink, now_ns: int) -> None:
-        if link.welcomed:  # without a registry nobody is removed
-            for node in [node for node, at_ns in link.doubted.items() if now_ns > at_ns]:
-                link.doubted.pop(node)
+    def _expire(self, now_ns: int) -> None:
+        if self._welcomed:  # without a registry nobody is removed
+            for node in [node for node, at_ns in self._doubted.items() if now_ns > at_ns]:
+                self._doubted.pop(node)
                 self._drop(node)
 
     def _drop(self, node: int) -> None:

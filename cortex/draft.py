@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortex.body import Body, Writer, check_shape
 from cortex.layout import DTYPE_CODES, DTYPES, alignment_of, array_dtype
-from cortex.schema import ArrayType, FieldType, ListType, OptionalType, Schema
+from cortex.schema import ArrayType, Schema, nested
 
 _PLACED_MAX = 64
 """Sizes of drafts whose places are kept."""
@@ -19,8 +20,10 @@ RESERVE_BYTES = 4096
 """Room that a draft has for strings, lists and arrays of unknown size."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Place:
+_Items = tuple[tuple[str, Any], ...]
+
+
+class _Place(NamedTuple):
     """Where a variable array of a draft lies."""
 
     offset: int
@@ -73,16 +76,17 @@ class Drafter:
         self._names = tuple(field.name for field in schema.fields)
         arrays = [
             (field.name, field.type, field.offset)
-            for field in body.fields.of[cls]
+            for field in body.fields[cls]
             if isinstance(field.type, ArrayType)
         ]
-        self._fields = body.fields.of[cls]
+        self._fields = body.fields[cls]
         self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
         self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
         self._defaults = {field.name: field for field in dataclasses.fields(cls)}
-        self.is_by_tail = not any(_is_in_block(field.type) for field in schema.fields)
+        self.is_by_tail = not any(isinstance(kind, ArrayType) and kind.is_fixed for kind in nested(schema))
         """Whether all arrays of a message lie behind its block, which is cleared before they are copied."""
-        self._placed: dict[tuple[Any, ...], tuple[dict[str, _Place], int]] = {}
+        self._places = functools.lru_cache(_PLACED_MAX)(self._place)
+        """As `_place`, of items: those used last are kept, as they come again."""
 
     def size(self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None) -> int:
         """Return how much memory a draft needs [bytes]: what is known of the body, and 4 KiB for the rest.
@@ -123,14 +127,13 @@ class Drafter:
             ValueError: A field without default is not set, or the fields that are no views do not fit.
             TypeError: As `Codec.encode` does.
         """
-        buffer, places = draft._Draft__buffer, draft._Draft__places
+        buffer = draft._Draft__buffer
         self._set_defaults(draft)
         end = self._write(draft, None)
         if end > len(buffer):
             raise ValueError(
-                f"{self._schema.name}: the fields {self._unplaced(places)} need {end - len(buffer)} bytes "
-                f"more than the {RESERVE_BYTES} in reserve; give the dimensions of arrays to the loan, or "
-                "publish the message without one"
+                f"{self._schema.name}: fields without a place need {end - len(buffer)} bytes more than the "
+                f"{RESERVE_BYTES} in reserve; give the loan the dimensions of arrays, or publish without it"
             )
         self._write(draft, buffer)
         self.seal(draft)
@@ -170,30 +173,18 @@ class Drafter:
             else:
                 raise ValueError(f"{self._schema.name}.{name} was not set and has no default")
 
-    def _unplaced(self, places: dict[str, _Place]) -> list[str]:
-        fixed = {name for name, _, _ in self._fixed}
-        return [name for name in self._names if name not in places and name not in fixed]
-
     def _places_of(
         self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
     ) -> tuple[dict[str, _Place], int]:
-        """As `_place`, with the end of what is placed; those used last are kept, as they come again."""
-        key = (*(dims or {}).items(), *(dtypes or {}).items())
+        items = tuple((dims or {}).items()), tuple((dtypes or {}).items())
         try:
-            found = self._placed.get(key)
+            return self._places(*items)
         except TypeError:  # not to be hashed, so no dtype: `_place` says so
-            key, found = (), None
-        if found is None:
-            found = self._place(dims, dtypes)
-            if len(self._placed) >= _PLACED_MAX:
-                self._placed.clear()
-            self._placed[key] = found
-        return found
+            return self._place(*items)
 
-    def _place(
-        self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
-    ) -> tuple[dict[str, _Place], int]:
-        dims, dtypes = dims or {}, dtypes or {}
+    def _place(self, known_dims: _Items, known_dtypes: _Items) -> tuple[dict[str, _Place], int]:
+        """Where the arrays lie whose size is known, and where what follows them begins."""
+        dims, dtypes = dict(known_dims), dict(known_dtypes)
         self._check_arguments(dims, dtypes)
         writer = Writer(self._body.fields, self._body.block, None)
         places = {}
@@ -220,15 +211,6 @@ class Drafter:
                 raise ValueError(f"{self._schema.name} has no array {name} of open dtype")
             if np.dtype(dtype) not in DTYPES:
                 raise ValueError(f"{name}: dtype {dtype} is none of {', '.join(DTYPE_CODES)}")
-
-
-def _is_in_block(kind: FieldType) -> bool:
-    """Return whether values of a type have arrays in their block."""
-    if isinstance(kind, Schema):
-        return any(_is_in_block(field.type) for field in kind.fields)
-    if isinstance(kind, OptionalType | ListType):
-        return _is_in_block(kind.item)
-    return isinstance(kind, ArrayType) and kind.is_fixed
 
 
 def _reserve(writer: Writer, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:

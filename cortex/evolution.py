@@ -46,12 +46,7 @@ def _show(field: Field) -> str:
 
 
 class EvolvedCodec:
-    """Reads bodies of a publisher's structure as messages of our type; `is_evolved` must hold.
-
-    Args:
-        theirs: The publisher's structure.
-        ours: Our message class.
-    """
+    """Reads bodies of a publisher's structure as messages of our type; `is_evolved` must hold."""
 
     fixed_size = None
 

@@ -9,7 +9,6 @@ Reference: Prophesee, "EVT 3.0 format".
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +18,6 @@ Buffer = bytes | bytearray | memoryview
 Bytes = NDArray[np.uint8]
 Code = NDArray[np.uint8]
 Words = NDArray[np.uint16]
-Allocate = Callable[[int], Bytes]
-"""Returns so many bytes to write to, or a few more, at an address that is a multiple of 4."""
 
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x8
 _KNOWN = {_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 0x7, 0xA, 0xE, 0xF}
@@ -60,27 +57,18 @@ class Evt3Encoder:
     one time, row and polarity that lie close together become vectors of 12 columns where that is shorter.
     Where time wraps, the last and the first value of its high half are written, so that a decoder notices it
     even after a silence of any length up to an hour.
+
+    Args:
+        begin_us: Time from which on wraps are written [us]; None: that of the first packet.
+        epochs_max: Most wraps that are written for one silence; a longer one sets time anew.
     """
 
     def __init__(self, *, begin_us: int | None = None, epochs_max: int = _EPOCHS_MAX) -> None:
-        """Begin before the first packet.
-
-        Args:
-            begin_us: Time from which on wraps are written [us]; None: that of the first packet.
-            epochs_max: Most wraps that are written for one silence; a longer one sets time anew.
-        """
         self._epochs_max = epochs_max
         self._epoch = None if begin_us is None else begin_us >> _EPOCH_BITS
         self._kept: dict[str, NDArray[Any]] = {}
 
-    def encode(
-        self,
-        events: EventColumns,
-        *,
-        width: int,
-        height: int,
-        end_us: int,
-    ) -> Bytes:
+    def encode(self, events: EventColumns, *, width: int, height: int, end_us: int) -> Bytes:
         """Return a packet, in which time is written before the first event.
 
         Args:
@@ -100,37 +88,26 @@ class Evt3Encoder:
         first, last = int(times[0]) >> _EPOCH_BITS, int(times[-1]) >> _EPOCH_BITS
         since = self._wraps(first - (first if self._epoch is None else self._epoch))
         self._epoch = last
+        words = np.array([_TIME_LOW << 12 | end_us & 0xFFF], np.uint16)
         if len(events.t):
-            places = self._places(events)
-            count = int(places.x[-1]) + 1
-        else:
-            count = 1
-        wraps = np.zeros(0, np.intp)
+            words, at_y = self._words(events)
         if first != last:  # events before which time wraps, as often as it does
             epochs = np.diff(times >> _EPOCH_BITS, prepend=first)
             which = np.flatnonzero(epochs)
             wraps = np.repeat(which, [self._wraps(int(each)) for each in epochs[which]])
-        out = np.empty(count + 1 + 2 * (since + len(wraps)), "<u2")
-        if since:
-            out[: 2 * since] = np.tile(_WRAP, since)
+            words = np.insert(words, np.repeat(at_y[wraps] - 2, 2), np.tile(_WRAP, len(wraps)))
+        out = np.empty(2 * since + 1 + len(words), "<u2")
+        out[: 2 * since] = np.tile(_WRAP, since)
         out[2 * since] = _TIME_HIGH << 12 | int(times[0]) >> 12 & 0xFFF
-        rest = out[2 * since + 1 :]
-        if not len(events.t):
-            rest[0] = _TIME_LOW << 12 | end_us & 0xFFF
-        elif len(wraps):
-            words = np.empty(count, np.uint16)
-            places.write(words)
-            rest[:] = np.insert(words, np.repeat(places.begin(wraps), 2), np.tile(_WRAP, len(wraps)))
-        else:
-            places.write(rest)
+        out[2 * since + 1 :] = words
         return out.view(np.uint8)
 
     def _wraps(self, epochs: int) -> int:
         """Return how often time has wrapped, which a decoder is told; 0 if it was set anew."""
         return epochs if 0 <= epochs <= self._epochs_max else 0
 
-    def _places(self, events: EventColumns) -> _Places:
-        """Find out which words each event needs, and where they are written.
+    def _words(self, events: EventColumns) -> tuple[Words, NDArray[np.intp]]:
+        """Return the words after the first one, and where the row of each event is, or would be.
 
         Large arrays are kept from packet to packet: to get new memory takes longer than what is done here.
         """
@@ -153,25 +130,37 @@ class Evt3Encoder:
         count += np.uint8(1)
         count[new_high] += np.uint8(1)
         if vectors is not None:
-            count[vectors.members] -= np.uint8(1)
-            count[vectors.windows] += np.uint8(1)
-            count[vectors.groups] += np.uint8(1)
+            groups, members, windows, bits = vectors
+            count[members] -= np.uint8(1)
+            count[windows] += np.uint8(1)
+            count[groups] += np.uint8(1)
         at_x = np.cumsum(count, dtype=np.intp, out=self._room("at_x", n, np.intp))
         at_x -= 1
         at_y = np.subtract(at_x, new_row, out=self._room("at_y", n, np.intp))
         if vectors is not None:
-            at_y[vectors.groups] -= 1
+            at_y[groups] -= 1
         low &= np.uint16(0xFFF)
         low |= np.uint16(_TIME_LOW << 12)
-        high = (t_us[new_high] >> 12 & 0xFFF | _TIME_HIGH << 12).astype(np.uint16)
-        return _Places(at_x, at_y, column, y, low, np.flatnonzero(new_low), high, new_high, vectors)
+        out = self._room("out", int(at_x[-1]) + 1, np.uint16)  # what is not to be there is written over
+        out[at_y] = y
+        timed = np.flatnonzero(new_low)
+        out[at_y[timed] - 1] = low[timed]
+        out[at_y[new_high] - 2] = t_us[new_high] >> 12 & 0xFFF | _TIME_HIGH << 12
+        column |= np.uint16(_ADDR_X << 12)
+        out[at_x] = column
+        if vectors is not None:
+            out[at_x[groups] - 1] = column[groups] & 0xFFF | _BASE_X << 12
+            out[at_x[windows]] = bits
+        return out, at_y
 
-    def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> _Vectors | None:
+    def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> tuple[NDArray[np.intp], ...] | None:
         """Find groups of events that are shorter as vectors: neighbours at most 11 columns apart.
 
-        Args:
-            column: Column and polarity of each event.
-            apart: 0 where an event has time and row of the one before.
+        `apart` is 0 where an event has time and row of the one before.
+
+        Returns:
+            First events of groups, whose columns are the bases; all events of groups; first events of
+            vectors; the words of these.
         """
         n = len(column)
         gap = np.subtract(column[1:], column[:-1], out=self._room("gap", n - 1, np.uint16))
@@ -196,7 +185,7 @@ class Evt3Encoder:
         is_window[first] = True
         starts = np.flatnonzero(is_window)
         bits = np.bitwise_or.reduceat(np.uint16(1) << step % np.uint16(12), starts)
-        return _Vectors(begins, members, members[starts], bits | np.uint16(_VECT_12 << 12))
+        return begins, members, members[starts], (bits | np.uint16(_VECT_12 << 12)).astype(np.intp)
 
     def _room(self, name: str, count: int, dtype: Any) -> NDArray[Any]:
         """Return an array that is kept under a name; its content is of the packet before."""
@@ -207,15 +196,14 @@ class Evt3Encoder:
 
 
 class Evt3Decoder:
-    """Decodes the packets of one camera, one after the other; also what sensors of Prophesee write."""
+    """Decodes the packets of one camera, one after the other; also what sensors of Prophesee write.
+
+    Args:
+        start_us: Time of the first event, known to 8 s [us]: 24 bits do not say how often time has wrapped
+            before. None: it has not.
+    """
 
     def __init__(self, *, start_us: int | None = None) -> None:
-        """Begin before the first packet.
-
-        Args:
-            start_us: Time of its first event, known to 8 s [us]: 24 bits do not say how often time has
-                wrapped before. None: it has not.
-        """
         self._start_us = start_us
         self._is_timed = False
         self._high = 0
@@ -276,7 +264,6 @@ class Evt3Decoder:
     def _columns(
         self, code: Code, value: Words, used: set[int]
     ) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
-        """Return the word, the column and the polarity of each event."""
         where = np.flatnonzero(code == _ADDR_X)
         x, polarity = value[where] & 0x7FF, value[where] >> 11
         if not used & {_BASE_X, _VECT_12, _VECT_8}:
@@ -328,54 +315,6 @@ def check_pixels(
         raise EventCodecError(f"polarity is 0 or 1, got {polarity.max()}")
 
 
-class _Vectors(NamedTuple):
-    """Events that become vectors, by their numbers."""
-
-    groups: NDArray[np.intp]
-    """First events of groups: their columns are the bases."""
-    members: NDArray[np.intp]
-    """All events of groups."""
-    windows: NDArray[np.intp]
-    """First events of vectors."""
-    bits: Words
-    """The words of these vectors."""
-
-
-class _Places(NamedTuple):
-    """The words of a packet, after its first one, and where they are."""
-
-    x: NDArray[np.intp]
-    """Of columns, and of vectors; of an event without a word, of the one before."""
-    y: NDArray[np.intp]
-    """Of rows; where none is written, of a word that comes after it."""
-    column: Words
-    """Column and polarity of each event."""
-    row: Words
-    low: Words
-    """Words of the low half of each time."""
-    new_low: NDArray[np.intp]
-    """Events before which one is written."""
-    high: Words
-    """Words of high halves."""
-    new_high: NDArray[np.intp]
-    vectors: _Vectors | None
-
-    def begin(self, events: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the place of the first word of some events that have a high half."""
-        return self.y[events] - 2
-
-    def write(self, out: Words) -> None:
-        """Write all words; what is not to be there is written over."""
-        out[self.y] = self.row
-        out[self.y[self.new_low] - 1] = self.low[self.new_low]
-        out[self.y[self.new_high] - 2] = self.high
-        out[self.x] = self.column | np.uint16(_ADDR_X << 12)
-        if self.vectors is not None:
-            groups = self.vectors.groups
-            out[self.x[groups] - 1] = self.column[groups] & 0xFFF | _BASE_X << 12
-            out[self.x[self.vectors.windows]] = self.vectors.bits
-
-
 def _changes(values: NDArray[Any], out: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Find out which elements differ from the one before; the first does."""
     out[0] = True
@@ -404,7 +343,7 @@ def hold_value(
     *,
     selected: bool = False,
 ) -> tuple[NDArray[np.int64], int]:
-    """Hold a value until the next one.
+    """Hold a value, of all words that set it, until the next one; return it at some words, and the last one.
 
     Args:
         mask: Which words set it.
@@ -412,9 +351,6 @@ def hold_value(
         initial: Value before the first one.
         where: Words at which the value is asked for.
         selected: See `values`.
-
-    Returns:
-        The values there, and the last one.
     """
     set_to = values if selected else values[mask]
     table = np.concatenate([[initial], set_to.astype(np.int64)])

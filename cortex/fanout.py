@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import zmq
 
-from cortex.back_pressure import BackPressure
+from cortex import wire
 from cortex.broadcast import Broadcast, Reader
-from cortex.fast_send import FastSend
 from cortex.large import LargeSender
-from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket, PubSockets
-from cortex.wire import (
-    LARGE,
-    LAST,
-    MESSAGE,
-    NEXT,
-    REST,
-    SLOT,
-    AttachAnswer,
-    AttachKey,
-    answer_frame,
-    message_head,
-)
+from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket
+
+if TYPE_CHECKING:
+    from cortex.publisher import Publisher
 
 READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
@@ -37,54 +28,23 @@ TELL_AGAIN_S = 0.02
 
 
 class Fanout:
-    """Sends frames to all readers, through the ring and sockets. The caller holds the sockets' lock.
+    """Sends frames to all readers, through the ring and sockets. The caller holds the sockets' lock."""
 
-    Args:
-        topic: For what is logged.
-        source: The publisher's number.
-        fingerprint: Of its type.
-        stamped: Whether that has a stamp.
-        fast_send: Sends where this says, if nothing special is to be done.
-        sockets: Tell who has come and gone.
-        back_pressure: Waits for reliable readers.
-        latching: Whether who comes gets the last message.
-        max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
-        expected_bytes: See `Broadcast`.
-    """
-
-    def __init__(
-        self,
-        topic: str,
-        source: int,
-        fingerprint: int,
-        *,
-        stamped: bool,
-        fast_send: FastSend,
-        pub_sockets: PubSockets,
-        back_pressure: BackPressure,
-        latching: bool,
-        max_wait_s: float,
-        expected_bytes: int,
-    ) -> None:
-        self._topic = topic
+    def __init__(self, publisher: Publisher[Any], *, max_wait_s: float, expected_bytes: int) -> None:
+        self.topic, self.source = publisher.topic, publisher.source
+        stamped, fingerprint = publisher.codec.stamp_of is not None, publisher.codec.fingerprint
         self._message_head, self._next_head, self._slot_head, self._large_head = (
-            message_head(kind, source, fingerprint, stamped=stamped) for kind in (MESSAGE, NEXT, SLOT, LARGE)
+            wire.message_head(kind, self.source, fingerprint, stamped=stamped)
+            for kind in (wire.MESSAGE, wire.NEXT, wire.SLOT, wire.LARGE)
         )
-        self._fast_send = fast_send
+        self._fast_send = publisher._fast_send
         self.large = LargeSender()
-        self._pub_sockets = pub_sockets
-        self._back_pressure = back_pressure
-        self.latching = latching
+        self.pub_sockets = publisher._pub_sockets
+        self.back_pressure = publisher._back_pressure
+        self.latching = publisher.latch
         self._max_wait_ms = round(max_wait_s * 1000.0)
         self.readers: dict[bytes, Reader] = {}
-        self.ring = Broadcast(
-            source,
-            back_pressure,
-            self._await_room,
-            self.route,
-            lambda text: pub_sockets.note(f"{topic}: {text}"),
-            expected_bytes,
-        )
+        self.ring = Broadcast(self, expected_bytes)
         self.late: dict[PubSocket, int] = {}
         """Strict sockets on which a reader was too late, and the sequence from which on it may get messages.
 
@@ -92,7 +52,6 @@ class Fanout:
         self.latched = b""
         """The frame that a reader gets when it comes, if any."""
         self.timeouts = 0
-        """Messages that some reliable reader lost."""
         self.skipped = 0
         """Messages that some reader did not get, because too much waited to be sent to it."""
         self.closed = False
@@ -108,15 +67,13 @@ class Fanout:
 
     # Who comes and goes; called by the sockets
 
-    def attach(self, pub_socket: PubSocket, key: bytes, request: AttachKey) -> None:
+    def attach(self, pub_socket: PubSocket, key: bytes, request: wire.AttachKey) -> None:
         """Take a reader in."""
         if key in self.readers or self.closed:
             return
         if len(self.readers) >= READERS_MAX:
             if not self._crowded:
-                self._pub_sockets.note(
-                    f"{self._topic}: has {READERS_MAX} subscribers, further ones are refused"
-                )
+                self.note(f"has {READERS_MAX} subscribers, further ones are refused")
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
@@ -126,14 +83,14 @@ class Fanout:
             self.ring.admit(reader, sequence)
         reader.has_answer = reader.member is not None or not request.confirms_end
         self.route()
-        answer = answer_frame(key, AttachAnswer(sequence, self.latched))
+        answer = wire.answer_frame(key, wire.AttachAnswer(sequence, self.latched))
         if pub_socket.strict:
             if not pub_socket.try_send(answer):
                 pub_socket.send_anyway(answer)
         else:
             pub_socket.send(answer, DONTWAIT)
 
-    def detach(self, pub_socket: PubSocket, request: AttachKey) -> None:
+    def detach(self, pub_socket: PubSocket, request: wire.AttachKey) -> None:
         """Let a reader go."""
         for key, reader in self.readers.items():
             if reader.request.reader == request.reader and reader.pub_socket is pub_socket:
@@ -166,7 +123,7 @@ class Fanout:
         self._lossy_sends = tuple(sends)
         self._strict_sockets = tuple(pub_socket for pub_socket in pub_sockets if pub_socket.strict)
         usual = not (self.latching or self.late or self.ring.has_lost)
-        retries = {pub_socket.send: self._retry_strict(pub_socket) for pub_socket in self._strict_sockets}
+        retries = {each.send: partial(self.send_strict, each) for each in self._strict_sockets}
         self._retries = retries | self.ring.sends
         self._fast_send.sends = (*self._lossy_sends, *self._retries) if usual else ()
         self._fast_send.ring = self.ring.short_cut if usual and not pub_sockets else None
@@ -179,7 +136,7 @@ class Fanout:
     def tick(self, now_ns: int) -> None:
         """Let go of what was sent, and tell readers how many messages there were; called now and then."""
         self.large.prune()
-        if self._back_pressure.is_waiting:
+        if self.back_pressure.is_waiting:
             return
         sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
         if silent_ns > FORGET_NS:
@@ -202,7 +159,7 @@ class Fanout:
             try:
                 pub_socket.send(frame, DONTWAIT)
             except zmq.Again:
-                on_time &= self.send_strict(pub_socket, frame, 0)
+                on_time &= self.send_strict(pub_socket, frame)
         on_time &= self.ring.send(frame)
         if not on_time:
             self.timeouts += 1
@@ -213,22 +170,16 @@ class Fanout:
     ) -> bool:
         """Send a large message as `send` does.
 
-        Args:
-            body: For readers of sockets, and for all if there is no slot; it stays as it is.
-            slot: Where it was written for the readers of the ring; None: nowhere.
-            sequence: The message's number.
-            stamp_ns: Its stamp [ns].
-            publish_ns: When it was published [ns].
-            size: Bytes of its body.
+        Readers of sockets get `body`, which stays as it is, and all if there is no slot.
         """
-        rest = REST.pack(sequence, stamp_ns, publish_ns, size, 0)
+        rest = wire.REST.pack(sequence, stamp_ns, publish_ns, size, 0)
         if self.latching:
             self.latched = self._large_head + rest + body
         on_time = not (self.late or self.ring.has_lost)
         for pub_socket in {r.pub_socket for r in self.readers.values() if r.member is None}:
             on_time &= self._send_body(pub_socket, self._large_head + rest, body)
         if slot is not None:
-            rest = REST.pack(sequence, stamp_ns, publish_ns, size, slot.number)
+            rest = wire.REST.pack(sequence, stamp_ns, publish_ns, size, slot.number)
             on_time &= self.ring.commit(slot, self._slot_head + rest)
         elif self.ring.has_readers:
             on_time &= self.ring.send(self._message_head + rest + body)
@@ -238,13 +189,11 @@ class Fanout:
         return on_time
 
     def _send_body(self, pub_socket: PubSocket, head: bytes, body: memoryview) -> bool:
-        """Send header and body through a socket; False if a reliable reader lost the message."""
-
         def has_room() -> bool:
             return self.large.has_room(pub_socket, body)
 
         may_wait = pub_socket.strict and pub_socket not in self.late
-        if not has_room() and not (may_wait and self._await_room(has_room, self._timeout_s(pub_socket))):
+        if not has_room() and not (may_wait and self.await_room(has_room, self._timeout_s(pub_socket))):
             if may_wait:
                 self._give_up(pub_socket)
             self.skipped += 1
@@ -258,29 +207,25 @@ class Fanout:
         return on_time
 
     def _timeout_s(self, pub_socket: PubSocket) -> float:
-        """How long the readers of a socket may hold us up [s]."""
         readers = (r for r in self.readers.values() if r.pub_socket is pub_socket and r.member is None)
         return max((reader.timeout_s for reader in readers), default=0.0)
 
     def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
         """Send what one of the fast path's `sends` refused, waiting; False if a reliable reader lost it."""
-        self._back_pressure.begin(self._fast_send.sequence)
+        self.back_pressure.begin(self._fast_send.sequence)
         retry = self._retries.get(send)  # None: it has left since
         on_time = retry is None or retry(frame)
         if not on_time:
             self.timeouts += 1
         return on_time
 
-    def _retry_strict(self, pub_socket: PubSocket) -> Callable[[bytes], bool]:
-        return lambda frame: self.send_strict(pub_socket, frame, 0)
-
-    def send_strict(self, pub_socket: PubSocket, frame: bytes, flags: int) -> bool:
+    def send_strict(self, pub_socket: PubSocket, frame: bytes, flags: int = 0) -> bool:
         """Send through a strict socket, waiting for its slowest reader; False if that one lost the frame."""
 
         def send() -> bool:
             return pub_socket.try_send(frame, flags)
 
-        if send() or self._await_room(send, self._timeout_s(pub_socket)):
+        if send() or self.await_room(send, self._timeout_s(pub_socket)):
             return True
         self._give_up(pub_socket)
         pub_socket.send_anyway(frame, flags)
@@ -291,19 +236,21 @@ class Fanout:
         self.late[pub_socket] = self._fast_send.sequence
         self.route()
 
-    def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
+    def await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
         """Try to send until it works, or for so long [s]."""
-        if self._back_pressure.wait_for(send, timeout_s):
+        if self.back_pressure.wait_for(send, timeout_s):
             return True
         if not self.timeouts:
-            self._pub_sockets.note(f"{self._topic}: a reliable subscriber was too late and lost a message")
+            self.note("a reliable subscriber was too late and lost a message")
         return False
 
     # Telling readers how many messages there have been
 
     def _news(self, sequence: int) -> bytes:
         """A frame that says which sequence comes next, or that none does."""
-        return self._next_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, LAST if self.closed else 0)
+        return self._next_head + wire.REST.pack(
+            sequence, 0, time.monotonic_ns(), 0, wire.LAST if self.closed else 0
+        )
 
     def tell(self) -> None:
         """Tell all that have room which sequence comes next, so that they learn of a loss before it."""
@@ -362,9 +309,11 @@ class Fanout:
             pub_socket.send_anyway(self._news(sequence))
         count = sum(reader.pub_socket.strict and self._owes(reader) for reader in self.readers.values())
         if count:
-            self._pub_sockets.note(
-                f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"
-            )
+            self.note(f"{count} reliable subscribers had no time to read everything at the end")
+
+    def note(self, text: str) -> None:
+        """Say that something goes wrong."""
+        self.pub_sockets.note(f"{self.topic}: {text}")
 
     def close(self) -> None:
         """Send no more."""

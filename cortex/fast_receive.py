@@ -42,7 +42,6 @@ class FastReceive:
         self.taken_ns = 0
         """When the last message was taken, on the monotonic clock."""
         self.is_open = False
-        """Whether there is a link to read."""
 
     def open(self, link: Link | None, coder: Any, /) -> None:
         """Read a link from now on; None: every message takes the slow path. The lock is held."""
@@ -75,14 +74,7 @@ def make_fast_receive(
     counters: SubscriberCounters,
     accept: Callable[[Link, bytes], None],
 ) -> FastReceive:
-    """Build the fast path of one subscriber.
-
-    Args:
-        receive_lock: Its lock.
-        queue: What has to be taken before.
-        counters: Their `received` and `latency` are kept.
-        accept: Called with the lock held, a link, and a frame that does not simply follow.
-    """
+    """Build the fast path of one subscriber."""
     if NativeFastReceive is None:
         return FastReceive()
     fast_receive: FastReceive = NativeFastReceive(

@@ -18,7 +18,6 @@ class FastSend:
     large_acquire: Callable[[bool], bool]
     """Takes the lock of large messages, without waiting if called with False."""
     large_release: Callable[[], None]
-    """Gives it back."""
     finish: Callable[[Any, int, int, int], bool]
     """Sends what was written into a slot, where something has changed meanwhile; both locks are held.
 
@@ -28,9 +27,7 @@ class FastSend:
         self.sends: tuple[Callable[..., Any], ...] = ()
         """Take a frame and flags; none: every message takes the slow path."""
         self.sequence = 0
-        """Of the next message."""
         self.bytes = 0
-        """Of all bodies so far."""
         self.refresh_ns = 0
         """When the next message takes the slow path, on the monotonic clock."""
         self.ring: Any = None
@@ -42,11 +39,7 @@ class FastSend:
         return self._slowly(message)
 
     def send_slot(self, message: Any, slot: Any, /) -> bool | None:
-        """Send a message whose large arrays lie in a slot that is being written; the lock is held.
-
-        Returns:
-            As `__call__`; None if it takes the slow path: then its arrays are as they were.
-        """
+        """As a call, of a message that lies in a slot; None: it takes the slow path, unchanged."""
         return None
 
 

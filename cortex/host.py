@@ -38,16 +38,12 @@ def domain_id(domain: int | None = None) -> int:
     Raises:
         ValueError: If it is not an integer from 0 to 232.
     """
-    source = "domain"
+    source, given = "domain", str(domain)
     if domain is None:
-        source = "CORTEX_DOMAIN"
-        text = os.environ.get(source, "0")
-        domain = int(text) if text.isascii() and text.isdigit() else -1
-        shown: object = text
-    else:
-        shown = domain
+        source, given = "CORTEX_DOMAIN", os.environ.get("CORTEX_DOMAIN", "0")
+        domain = int(given) if given.isascii() and given.isdigit() else -1
     if not isinstance(domain, int) or isinstance(domain, bool) or not 0 <= domain <= DOMAIN_MAX:
-        raise ValueError(f"{source} must be an integer from 0 to {DOMAIN_MAX}, got {shown!r}")
+        raise ValueError(f"{source} must be an integer from 0 to {DOMAIN_MAX}, got {given}")
     return domain
 
 
@@ -141,7 +137,8 @@ class FileLock:
 
     def __init__(self, path: Path, descriptor: int):
         self.path = path
-        self._descriptor = descriptor
+        self.descriptor = descriptor
+        """To hand over to a process that is being started; -1 when closed."""
 
     @classmethod
     def acquire(cls, path: Path) -> FileLock | None:
@@ -171,23 +168,18 @@ class FileLock:
         return lock
 
     @property
-    def descriptor(self) -> int:
-        """The file descriptor, to hand over to a process that is being started; -1 when closed."""
-        return self._descriptor
-
-    @property
     def intact(self) -> bool:
         """Whether the file is still there; if somebody has removed it, others can take the lock anew."""
         try:
             current = os.stat(self.path)
         except FileNotFoundError:
             return False
-        held = os.fstat(self._descriptor)
+        held = os.fstat(self.descriptor)
         return (held.st_dev, held.st_ino) == (current.st_dev, current.st_ino)
 
     def close(self, *, remove: bool = False) -> None:
         """Let go of the lock (unless a process it was handed to has it), and remove the file if asked to."""
-        if self._descriptor < 0:
+        if self.descriptor < 0:
             return
         if remove:  # while we hold it: who opens the file later makes a new one
             with contextlib.suppress(FileNotFoundError):
@@ -198,8 +190,8 @@ class FileLock:
         with self._guard:
             if self in self._held:
                 self._held.discard(self)
-                os.close(self._descriptor)
-                self._descriptor = -1
+                os.close(self.descriptor)
+                self.descriptor = -1
 
     @classmethod
     def no_fork(cls) -> threading.Lock:
@@ -209,8 +201,8 @@ class FileLock:
     @classmethod
     def _after_fork_in_child(cls) -> None:
         for lock in cls._held:
-            os.close(lock._descriptor)
-            lock._descriptor = -1
+            os.close(lock.descriptor)
+            lock.descriptor = -1
         cls._held.clear()
         cls._guard.release()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from functools import partial
 from typing import Any
 
 import zmq
@@ -34,7 +35,9 @@ class Intake:
         """To all publishers; always this list."""
         self.queue: deque[Item] = deque()
         """What has been read and not been asked for; always this one."""
-        self.fast_receive = make_fast_receive(receive_lock, self.queue, counters, self._accept_timed)
+        self.fast_receive = make_fast_receive(
+            receive_lock, self.queue, counters, partial(self.accept, timed=True)
+        )
         """The short way past all this."""
         self.drained_ns = 0
         """When the sockets were last read as a whole."""
@@ -190,13 +193,6 @@ class Intake:
             self.fast_receive.exhausted = False
         return bool(left)
 
-    def revive(self, source: int) -> bool:
-        """A publisher that had left is back; False if its connection is gone."""
-        found = [link for link in self.leaving if link.source == source]
-        for link in found:
-            del self.leaving[link]
-        return bool(found)
-
     def end_overdue(self, now_ns: int) -> bool:
         """Close links that have ended or had their time, once a reliable one has all; whether any was."""
         overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns or link.has_ended]
@@ -229,9 +225,6 @@ class Intake:
         if timed:
             self._time(publish_ns, link)
         self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)))
-
-    def _accept_timed(self, link: Link, frame: bytes) -> None:
-        self.accept(link, frame, timed=True)
 
     def _rotated(self) -> list[Link]:
         """The links, a different one first each time, so that no publisher starves another."""

@@ -27,7 +27,6 @@ class LargeSender:
         self._waiting: defaultdict[PubSocket, deque[tuple[zmq.MessageTracker, int]]] = defaultdict(deque)
         """What each socket has still to send, in order, and its bytes."""
         self.waiting_bytes = {False: 0, True: 0}
-        """Bytes that wait, of lossy and of strict sockets."""
         self._free: list[NDArray[np.uint8]] = []
         self._lent: dict[int, int] = {}
         """Where memory lies that is in use, and its bytes: up to four times those of the body in it."""
@@ -61,7 +60,6 @@ class LargeSender:
         self._free.clear()
 
     def _bytes_of(self, body: memoryview) -> int:
-        """What a body takes as long as it waits."""
         return self._lent.get(np.frombuffer(body, np.uint8).ctypes.data, body.nbytes)
 
     def has_room(self, pub_socket: PubSocket, body: memoryview) -> bool:

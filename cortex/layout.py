@@ -16,6 +16,7 @@ from cortex.schema import (
     ListType,
     OptionalType,
     Schema,
+    nested,
 )
 
 ITEM_ALIGNMENT = 8
@@ -27,21 +28,6 @@ BODY_LIMIT = 2**32
 
 VALUES_MAX = 1 << 20
 """Most values that the lists of one body may hold together: each becomes an object of 30 to 100 bytes."""
-
-SCALAR_CODES = {
-    "bool": "B",
-    "int8": "b",
-    "int16": "h",
-    "int32": "i",
-    "int64": "q",
-    "uint8": "B",
-    "uint16": "H",
-    "uint32": "I",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
-"""Codes of the struct module; a bool is a byte, so that a 2 can be told from a 1."""
 
 DTYPES: tuple[np.dtype[Any], ...] = tuple(
     np.dtype(np.dtype(name).newbyteorder("<").str) for name in DTYPE_NAMES
@@ -127,12 +113,9 @@ def values_of(kind: FieldType) -> int:
 
 def has_tail(kind: FieldType) -> bool:
     """Whether bodies of a type differ in size."""
-    if isinstance(kind, str):
-        return kind in ("str", "bytes")
-    if isinstance(kind, ArrayType):
-        return not kind.is_fixed
-    if isinstance(kind, OptionalType):
-        return has_tail(kind.item)
-    if isinstance(kind, Schema):
-        return any(has_tail(field.type) for field in kind.fields)
-    return isinstance(kind, ListType)
+    return any(
+        isinstance(each, ListType)
+        or each in ("str", "bytes")
+        or (isinstance(each, ArrayType) and not each.is_fixed)
+        for each in nested(kind)
+    )

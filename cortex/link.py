@@ -14,30 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import zmq
 
+from cortex import wire
 from cortex.codec import Codec, MalformedMessage, coder_of
 from cortex.compiled import native
 from cortex.context import Frames, new_socket
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
-from cortex.schema import Schema
 from cortex.stats import SubscriberCounters
-from cortex.wire import (
-    ATTACH,
-    BODY_LIMIT,
-    HEADER_SIZE,
-    LARGE,
-    LAST,
-    MESSAGE,
-    NEXT,
-    SLOT,
-    TAIL,
-    AttachKey,
-    attach_key,
-    message_head,
-    parse_answer,
-    prefix,
-    resume_key,
-)
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +30,6 @@ BLOCK_MS = 20
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _warned_of: deque[str] = deque(maxlen=256)
-"""Addresses of nodes that cannot share memory with us."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
@@ -82,7 +64,6 @@ class Info(NamedTuple):
     latency_ns: int
     """From `publish` to now [ns]; between hosts as good as `Node.clock` of both says, but for 1 ms."""
     size: int
-    """Bytes of the body."""
 
 
 class Link:
@@ -113,20 +94,19 @@ class Link:
         self._policy = policy
         stamped = codec.stamp_of is not None
         self._stamped = stamped
-        self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
+        self.message_head = wire.message_head(wire.MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
         self.coder = coder_of(codec, self.message_head)
         """Reads them in C; its `slots` may be a `RingReader`: then frames that name slots of it, too."""
         self._message_prefix = self.message_head[:16]
         self._handlers = {
-            prefix(LARGE, self.source, stamped=stamped): self._on_large,
-            prefix(SLOT, self.source, stamped=stamped): self._on_slot,
-            prefix(NEXT, self.source, stamped=stamped): self._on_next,
-            prefix(ATTACH, self.source, stamped=stamped): self._on_answer,
+            wire.prefix(wire.LARGE, self.source, stamped=stamped): self._on_large,
+            wire.prefix(wire.SLOT, self.source, stamped=stamped): self._on_slot,
+            wire.prefix(wire.NEXT, self.source, stamped=stamped): self._on_next,
+            wire.prefix(wire.ATTACH, self.source, stamped=stamped): self._on_answer,
         }
         large_head, _, next_head = list(self._handlers)[:3]
         self._socket_heads = (self._message_prefix, next_head, large_head)
-        """What comes through the socket while there is no ring."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
         self._begins_again = False
@@ -179,7 +159,7 @@ class Link:
                 )
             except OSError as error:
                 logger.info("%s: no ring: %s", self.record.topic, error)
-        key = AttachKey(
+        key = wire.AttachKey(
             self.source,
             self._reader,
             self._end is not None and shared_memory,
@@ -189,7 +169,7 @@ class Link:
             confirms=True,
             confirms_end=policy.reliable,
         )
-        self._key = attach_key(key, stamped=self._stamped)
+        self._key = wire.attach_key(key, stamped=self._stamped)
         self.socket.subscribe(self._key)
 
     def reject(self, reason: str) -> None:
@@ -209,7 +189,7 @@ class Link:
             return []
         handler = self._handlers.get(frame[:16])
         try:
-            if handler is None or len(frame) < HEADER_SIZE:
+            if handler is None or len(frame) < wire.HEADER_SIZE:
                 raise MalformedMessage(
                     f"a frame of {len(frame)} bytes: not of this publisher, or not of this type"
                 )
@@ -217,8 +197,12 @@ class Link:
         except MalformedMessage as error:
             self.reject(str(error))
             self._drop_parts()
-            if handler is not None and frame[3:4] in (LARGE, SLOT) and len(frame) >= HEADER_SIZE:
-                self.skip(TAIL.unpack_from(frame, 16)[1])
+            if (
+                handler is not None
+                and frame[3:4] in (wire.LARGE, wire.SLOT)
+                and len(frame) >= wire.HEADER_SIZE
+            ):
+                self.skip(wire.TAIL.unpack_from(frame, 16)[1])
             return []
 
     def skip(self, sequence: int) -> None:
@@ -247,7 +231,7 @@ class Link:
 
     def _confirm(self, sequence: int) -> None:
         """Tell the publisher that all below a sequence is accounted for."""
-        key = resume_key(self.source, self._reader, sequence, stamped=self._stamped)
+        key = wire.resume_key(self.source, self._reader, sequence, stamped=self._stamped)
         self.socket.subscribe(key)
         self.socket.unsubscribe(key)
 
@@ -262,12 +246,12 @@ class Link:
     def _check(self, fingerprint: int, size: int) -> None:
         if fingerprint != self.codec.fingerprint:
             raise MalformedMessage(f"fingerprint {fingerprint:016x}, expected {self.codec.fingerprint:016x}")
-        if size > BODY_LIMIT:
-            raise MalformedMessage(f"a body of {size} bytes is over the limit of {BODY_LIMIT}")
+        if size > wire.BODY_LIMIT:
+            raise MalformedMessage(f"a body of {size} bytes is over the limit of {wire.BODY_LIMIT}")
 
     def _on_large(self, frame: bytes) -> list[Item]:
-        fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
-        if len(frame) != HEADER_SIZE or not self.socket.get(zmq.RCVMORE):
+        fingerprint, sequence, stamp_ns, publish_ns, size, _ = wire.TAIL.unpack_from(frame, 16)
+        if len(frame) != wire.HEADER_SIZE or not self.socket.get(zmq.RCVMORE):
             raise MalformedMessage("a large message without its body")
         body = self.socket.recv(zmq.DONTWAIT, copy=False)
         self._drop_parts()
@@ -281,9 +265,9 @@ class Link:
         return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns)]
 
     def _on_slot(self, frame: bytes) -> list[Item]:
-        fingerprint, sequence, stamp_ns, publish_ns, size, slot = TAIL.unpack_from(frame, 16)
+        fingerprint, sequence, stamp_ns, publish_ns, size, slot = wire.TAIL.unpack_from(frame, 16)
         data = None if self._ring is None else self._ring.take_body()
-        if len(frame) != HEADER_SIZE or data is None:
+        if len(frame) != wire.HEADER_SIZE or data is None:
             raise MalformedMessage(f"slot {slot} does not hold message {sequence} of {size} bytes for us")
         self._check(fingerprint, size)
         if not self.advance(sequence):
@@ -291,17 +275,17 @@ class Link:
         return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns))]
 
     def _on_next(self, frame: bytes) -> list[Item]:
-        fingerprint, sequence, _, _, size, options = TAIL.unpack_from(frame, 16)
+        fingerprint, sequence, _, _, size, options = wire.TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
-        if len(frame) != HEADER_SIZE or size:
+        if len(frame) != wire.HEADER_SIZE or size:
             raise MalformedMessage(f"a frame of {len(frame)} bytes that should have no body")
-        self._count_to(sequence, is_last=bool(options & LAST))
+        self._count_to(sequence, is_last=bool(options & wire.LAST))
         return []
 
     def _on_answer(self, frame: bytes) -> list[Item]:
         if frame[: len(self._key)] != self._key:
             return []  # the answer to an earlier attempt
-        answer = parse_answer(frame)
+        answer = wire.parse_answer(frame)
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
@@ -369,15 +353,15 @@ class Link:
         return (self._socket_fd,) if self._end is None else (self._socket_fd, self._end.fd)
 
     def _latched(self, frame: bytes) -> list[Item]:
-        if len(frame) < HEADER_SIZE or frame[:16] not in self._socket_heads:
+        if len(frame) < wire.HEADER_SIZE or frame[:16] not in self._socket_heads:
             raise MalformedMessage("a latched message that is none")
-        fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
+        fingerprint, sequence, stamp_ns, publish_ns, size, _ = wire.TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
-        if len(frame) != HEADER_SIZE + size:
+        if len(frame) != wire.HEADER_SIZE + size:
             raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
         if sequence >= self.expected and not self.advance(sequence):
             return []
-        return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns)]
+        return [Item(self, frame, wire.HEADER_SIZE, size, sequence, stamp_ns, publish_ns)]
 
     def _do_without_shared_memory(self, reason: str, level: int = logging.INFO) -> None:
         logger.log(level, "%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
@@ -430,7 +414,3 @@ class Link:
             time.monotonic_ns() - publish_ns,
             item.size,
         )
-
-    def schema(self) -> Schema:
-        """The structure of this publisher's messages."""
-        return self.codec.schema

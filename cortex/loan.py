@@ -20,11 +20,7 @@ class Loan:
     """
 
     def __init__(
-        self,
-        draft: Any,
-        buffer: np.ndarray,
-        slot: Any,
-        publish: Callable[[Any, np.ndarray, Any, Any], bool],
+        self, draft: Any, buffer: np.ndarray, slot: Any, publish: Callable[[Any, np.ndarray, Any, Any], bool]
     ) -> None:
         self.draft = draft
         self._buffer: np.ndarray | None = buffer

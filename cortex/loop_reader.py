@@ -9,13 +9,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from typing import Any, Generic, TypeVar
+from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cortex.context import Closed
 from cortex.fast_receive import NOTHING, PAUSE_COUNT, PAUSE_NS
-from cortex.intake import Intake
-from cortex.wakeup import Wakeup
+
+if TYPE_CHECKING:
+    from cortex.subscriber import Subscriber
 
 T = TypeVar("T")
 monotonic_ns = time.monotonic_ns
@@ -24,24 +25,11 @@ WAIT_MAX_S = 0.1
 
 
 class LoopReader:
-    """Wakes the tasks of one loop that wait for a subscriber.
+    """Wakes the tasks of one loop that wait for a subscriber."""
 
-    Args:
-        watched: Returns the descriptors to watch, and a number that changes with them.
-        generation: Returns that number alone.
-        on_wake: Called with a descriptor that has become readable.
-    """
-
-    def __init__(
-        self,
-        watched: Callable[[], tuple[int, list[int]]],
-        generation: Callable[[], int],
-        on_wake: Callable[[int], None],
-    ) -> None:
+    def __init__(self, subscriber: Subscriber[Any]) -> None:
         self.loop = asyncio.get_running_loop()
-        self._watched = watched
-        self._current = generation
-        self._on_wake = on_wake
+        self._subscriber = subscriber
         self._generation = -1
         self._wanted: list[int] = []
         self._fds: set[int] = set()
@@ -60,9 +48,9 @@ class LoopReader:
             self._waiters.discard(waiter)
 
     def _watch(self) -> None:
-        if self._current() != self._generation:  # a number may have been closed and given out again
-            self._forget()
-            self._generation, self._wanted = self._watched()
+        if self._subscriber._generation != self._generation:
+            self._forget()  # a number may have been closed and given out again
+            self._generation, self._wanted = self._subscriber._watched()
         if len(self._fds) < len(self._wanted):
             for fd in self._wanted:
                 if fd not in self._fds:
@@ -80,17 +68,21 @@ class LoopReader:
 
     def _on_time(self) -> None:
         self._timer = None
-        for waiter in self._waiters:
-            _resolve(waiter)
+        self._wake_all()
 
     def _wake(self, fd: int) -> None:
-        self._on_wake(fd)
+        if fd == self._subscriber.wakeup.fd:
+            self._subscriber.wakeup.clear()
         if not self._waiters:
             # Nobody waits now: a readable descriptor would spin the loop until somebody reads it.
             self.loop.remove_reader(fd)
             self._fds.discard(fd)
+        self._wake_all()
+
+    def _wake_all(self) -> None:
         for waiter in self._waiters:
-            _resolve(waiter)
+            if not waiter.done():
+                waiter.set_result(None)
 
     def _forget(self) -> None:
         for fd in self._fds:
@@ -105,58 +97,19 @@ class LoopReader:
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None  # a task that goes on to wait needs another
-            for waiter in self._waiters:
-                _resolve(waiter)
+            self._wake_all()
 
         if not self.loop.is_closed():
             self.loop.call_soon_threadsafe(leave)
 
 
-def _resolve(waiter: asyncio.Future[None]) -> None:
-    if not waiter.done():
-        waiter.set_result(None)
-
-
-class Receiver(Generic[T]):
-    """Iterates; unlike a generator it goes on after an exception, such as one publisher's `TypeMismatch`."""
-
-    def __init__(self, receive: Callable[[], T]) -> None:
-        self._receive = receive
-
-    def __iter__(self) -> Iterator[T]:
-        return self
-
-    def __next__(self) -> T:
-        try:
-            return self._receive()
-        except Closed:
-            raise StopIteration from None
-
-
 class AsyncReceiver(AsyncIterator[T]):
-    """Takes the messages of one subscriber on a running loop, until it is closed.
+    """Takes the messages of one subscriber on a running loop, until it is closed."""
 
-    Args:
-        intake: Reads its sockets.
-        wakeup: Wakes those that wait for it.
-        take: Takes the next message if it is there, else `NOTHING`.
-        watched: As of `LoopReader`.
-        generation: As of `LoopReader`.
-    """
-
-    def __init__(
-        self,
-        intake: Intake,
-        wakeup: Wakeup,
-        take: Callable[[], Any],
-        watched: Callable[[], tuple[int, list[int]]],
-        generation: Callable[[], int],
-    ) -> None:
-        self._fast_receive, self._queue = intake.fast_receive, intake.queue
-        self._wakeup = wakeup
-        self._take = take
-        self._watched = watched
-        self._generation = generation
+    def __init__(self, subscriber: Subscriber[T]) -> None:
+        self._subscriber = subscriber
+        self._fast_receive, self._queue = subscriber._fast_receive, subscriber._queue
+        self._take = subscriber._take_now
         self._reader: LoopReader | None = None
 
     async def __anext__(self) -> T:
@@ -170,11 +123,7 @@ class AsyncReceiver(AsyncIterator[T]):
             raise StopAsyncIteration from None
 
     async def receive(self, timeout_s: float | None) -> T:
-        """Take the next message.
-
-        Raises:
-            TimeoutError: None came in time.
-        """
+        """Take the next message, or raise TimeoutError."""
         self._fast_receive.left -= 1
         if self._fast_receive.left >= 0 and monotonic_ns() < self._fast_receive.until_ns:
             message: T = self._take()
@@ -185,12 +134,10 @@ class AsyncReceiver(AsyncIterator[T]):
     async def _wait(self, timeout_s: float | None, *, look: bool) -> T:
         """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
         fast_receive = self._fast_receive
-        reader: LoopReader | None = None
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            if look and (
-                fast_receive.left <= 0 or monotonic_ns() >= fast_receive.until_ns
-            ):  # others want to run, too
+            may_go_on = fast_receive.left > 0 and monotonic_ns() < fast_receive.until_ns
+            if look and not may_go_on:  # others want to run, too
                 await asyncio.sleep(0)
                 fast_receive.left, fast_receive.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
             message: T = self._take() if look else NOTHING
@@ -203,21 +150,12 @@ class AsyncReceiver(AsyncIterator[T]):
             if self._queue or not fast_receive.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
-            if reader is None:  # not before: other tasks of the loop may have made it meanwhile
-                reader = self._reader_of_loop()
+            reader = self._reader
+            if reader is None or reader.loop is not asyncio.get_running_loop():
+                self.stop()
+                reader = self._reader = LoopReader(self._subscriber)
             await reader.wait(min(left_s, WAIT_MAX_S))
             fast_receive.left, fast_receive.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
-
-    def _reader_of_loop(self) -> LoopReader:
-        reader = self._reader
-        if reader is None or reader.loop is not asyncio.get_running_loop():
-            self.stop()
-            reader = self._reader = LoopReader(self._watched, self._generation, self._on_wake)
-        return reader
-
-    def _on_wake(self, fd: int) -> None:
-        if fd == self._wakeup.fd:
-            self._wakeup.clear()
 
     def stop(self) -> None:
         """Leave the loop."""

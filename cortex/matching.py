@@ -15,7 +15,6 @@ from cortex.places import Reach, reach
 from cortex.records import NodeRecord, PublisherRecord
 from cortex.schema import Schema, SchemaError, TypeMismatch, type_from_schema
 from cortex.security import Keys
-from cortex.service import Place
 from cortex.subscriber import Subscriber
 from cortex.topic import is_pattern, matches
 
@@ -23,13 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class Matcher:
-    """Connects what one node has to what others have.
-
-    Args:
-        host: This node's host.
-        keys: CURVE keys for tcp.
-        insecure: Allow plain tcp beyond this host.
-    """
+    """Connects what one node has to what others have."""
 
     def __init__(self, host: str, keys: Keys | None, *, insecure: bool) -> None:
         self._host = host
@@ -37,13 +30,7 @@ class Matcher:
         self._insecure = insecure
 
     def match(self, subscriber: Subscriber[Any], own: NodeRecord, peers: Iterable[NodeRecord]) -> None:
-        """Connect a subscriber to the publishers of its topic, and let go of those that have left.
-
-        Args:
-            subscriber: Of this node.
-            own: Record of this node.
-            peers: Those of the others.
-        """
+        """Connect a subscriber to the publishers of its topic, and let go of those that have left."""
         wanted = {
             publisher.source: (node, publisher)
             for node in (own, *peers)
@@ -51,14 +38,11 @@ class Matcher:
             if matches(subscriber.topic, publisher.topic)
         }
         subscriber.refused &= wanted.keys()
-        present = subscriber.sources()
-        for source in present.keys() - wanted.keys():
+        for source in subscriber.sources().keys() - wanted.keys():
             subscriber.forget(source)
         for source, (node, publisher) in wanted.items():
             offset_ns = 0 if node.host == self._host else node.clock_offset_ns - own.clock_offset_ns
-            if source in present or subscriber.revive(source):
-                subscriber.set_clock(source, offset_ns)
-            else:
+            if not subscriber.keep(source, offset_ns):
                 self._connect(subscriber, node, publisher, offset_ns)
 
     def _connect(
@@ -109,14 +93,8 @@ class Matcher:
 
     def find_service(
         self, name: str, number: int, expected: Schema, records: Iterable[NodeRecord]
-    ) -> Place | None:
+    ) -> Reach | None:
         """Return where a service is offered; None if it is not.
-
-        Args:
-            name: The service's.
-            number: That of its name and types.
-            expected: Structure of the request, to tell if there is one with other types.
-            records: Those of all nodes.
 
         Raises:
             TypeMismatch: There is one of that name, with other types.
@@ -126,8 +104,7 @@ class Matcher:
         for node in records:
             for service in node.services:
                 if service.name == name and service.service == number:
-                    place = self.reach_control(node)
-                    return Place(node.node, place.address, place.local, place.secure)
+                    return self.reach_control(node)
                 if service.name == name:
                     other = service.request_schema
         if other is not None:
@@ -145,6 +122,6 @@ class Matcher:
             ConnectionError: It cannot be reached from here, or has none.
         """
         place = reach(node, self._host, self._keys, insecure=self._insecure)
-        if place is None or not place.address:
+        if place is None or not place.endpoint.control:
             raise ConnectionError(f"node {node.name!r} cannot be {'asked' if place else 'reached from here'}")
         return place

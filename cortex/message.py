@@ -23,38 +23,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, overload
 
 import numpy as np
 
+from cortex import schema
 from cortex.compiled import native
-from cortex.schema import (
-    ANY_DTYPE,
-    ArrayType,
-    EnumType,
-    Field,
-    FieldType,
-    ListType,
-    OptionalType,
-    Schema,
-    SchemaError,
-    Unit,
-    attach_schema,
-)
+from cortex.schema import Unit as Unit
 from cortex.structure import finish_class
-
-__all__ = [
-    "Array",
-    "Float32",
-    "Float64",
-    "Int8",
-    "Int16",
-    "Int32",
-    "Int64",
-    "UInt8",
-    "UInt16",
-    "UInt32",
-    "UInt64",
-    "Unit",
-    "is_message",
-    "message",
-]
 
 _T = TypeVar("_T")
 _HASTENED_FIELDS_MAX = 64
@@ -94,9 +66,9 @@ else:
 
         def __class_getitem__(cls, parameters: Any) -> Any:
             dtype, *shape = parameters if isinstance(parameters, tuple) else (parameters,)
-            return Annotated[np.ndarray, ArrayType(_dtype_name(dtype), tuple(shape))]
+            return Annotated[np.ndarray, schema.ArrayType(_dtype_name(dtype), tuple(shape))]
 
-    def dataclass_transform(**_: Any) -> Callable[[_T], _T]:
+    def dataclass_transform(**_: Any) -> Callable[[_T], _T]:  # noqa: D103
         return lambda decorated: decorated
 
 
@@ -149,19 +121,19 @@ def _make_message(cls: type, name: str | None, scope: Mapping[str, Any]) -> type
     decorated: type[Any] = dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)(cls)
     names = tuple(field.name for field in dataclasses.fields(decorated))
     if "copy" in names:
-        raise SchemaError(f"{cls.__name__}.copy: the name is that of a method of every message")
+        raise schema.SchemaError(f"{cls.__name__}.copy: the name is that of a method of every message")
     fields, bindings = [], []
     for field_name in names:
         where = f"{cls.__name__}.{field_name}"
         try:
             kind, bound, unit = _read_hint(hints[field_name], where)
-            fields.append(Field(field_name, kind, *(unit or ("", ""))))
-        except SchemaError as error:
+            fields.append(schema.Field(field_name, kind, *(unit or ("", ""))))
+        except schema.SchemaError as error:
             if str(error).startswith(where):
                 raise
-            raise SchemaError(f"{where}: {error}") from error
+            raise schema.SchemaError(f"{where}: {error}") from error
         bindings.append(bound)
-    attach_schema(decorated, Schema(name or cls.__name__, tuple(fields)), tuple(bindings))
+    schema.attach_schema(decorated, schema.Schema(name or cls.__name__, tuple(fields)), tuple(bindings))
     finish_class(decorated, names, _plain_init(names))
     if not own_init:
         _hasten(decorated)
@@ -196,41 +168,40 @@ def _resolve_hints(cls: type, scope: Mapping[str, Any]) -> dict[str, Any]:
     try:
         return typing.get_type_hints(cls, localns=dict(scope), include_extras=True)
     except NameError as error:
-        raise SchemaError(
+        raise schema.SchemaError(
             f"{cls.__name__}: an annotation cannot be resolved: {error}. A message cannot contain itself, "
             "and the types of its fields must be defined before it"
         ) from error
 
 
 def _dtype_name(dtype: Any) -> str:
-    if isinstance(dtype, str) and dtype == ANY_DTYPE:
+    if isinstance(dtype, str) and dtype == schema.ANY_DTYPE:
         return dtype
     try:
         resolved = np.dtype(dtype)
     except TypeError as error:
-        raise SchemaError(f"array dtype {dtype!r} is unknown") from error
+        raise schema.SchemaError(f"array dtype {dtype!r} is unknown") from error
     if not resolved.isnative:
-        raise SchemaError(f"array dtype {dtype!r}: the byte order of messages is always little-endian")
+        raise schema.SchemaError(f"array dtype {dtype!r}: the byte order of messages is always little-endian")
     return str(resolved.name)
 
 
-_Reading = tuple[FieldType, Any, "tuple[str, str] | None"]
+_Reading = tuple[schema.FieldType, Any, "tuple[str, str] | None"]
 
 
 def _read_hint(hint: Any, where: str) -> _Reading:
-    """Return the type, the Python class of its enum or message if it has one, and the unit."""
     origin = typing.get_origin(hint)
     if origin is Annotated:
         return _read_annotated(hint, where)
     if origin is Union or origin is types.UnionType:
         items = [item for item in typing.get_args(hint) if item is not types.NoneType]
         if len(items) != 1 or len(typing.get_args(hint)) != 2:
-            raise SchemaError(f"{where}: {hint} is a union; only T | None is allowed")
+            raise schema.SchemaError(f"{where}: {hint} is a union; only T | None is allowed")
         kind, bound, unit = _read_hint(items[0], where)
-        return OptionalType(kind), bound, unit
+        return schema.OptionalType(kind), bound, unit
     if origin is list:
         kind, bound, unit = _read_hint(typing.get_args(hint)[0], where)
-        return ListType(kind), bound, unit
+        return schema.ListType(kind), bound, unit
     plain = {bool: "bool", int: "int64", float: "float64", str: "str", bytes: "bytes"}
     if isinstance(hint, type):
         if hint in plain:
@@ -239,7 +210,7 @@ def _read_hint(hint: Any, where: str) -> _Reading:
             return _read_enum(hint, where), hint, None
         if "__cortex_schema__" in vars(hint):
             return hint.__cortex_schema__, hint, None  # type: ignore[attr-defined]
-    raise SchemaError(
+    raise schema.SchemaError(
         f"{where}: {hint!r} cannot be a field; allowed are bool, int, float, sized numbers such as Int32, "
         "str, bytes, enums of integers, Array[dtype, *shape], message types, list[T] and T | None"
     )
@@ -247,10 +218,10 @@ def _read_hint(hint: Any, where: str) -> _Reading:
 
 def _read_annotated(hint: Any, where: str) -> _Reading:
     base, *metadata = typing.get_args(hint)
-    kinds = [item for item in metadata if isinstance(item, (_Scalar, ArrayType))]
+    kinds = [item for item in metadata if isinstance(item, (_Scalar, schema.ArrayType))]
     units = [(item.unit, item.frame) for item in metadata if isinstance(item, Unit)]
     if len(kinds) > 1:
-        raise SchemaError(f"{where}: more than one type in {hint}")
+        raise schema.SchemaError(f"{where}: more than one type in {hint}")
     if not kinds:
         kind, bound, unit = _read_hint(base, where)
     elif isinstance(kinds[0], _Scalar):
@@ -259,12 +230,12 @@ def _read_annotated(hint: Any, where: str) -> _Reading:
         kind, bound, unit = kinds[0], None, None
     units += [unit] if unit else []
     if len(units) > 1:
-        raise SchemaError(f"{where}: more than one unit: {units}")
+        raise schema.SchemaError(f"{where}: more than one unit: {units}")
     return kind, bound, units[0] if units else None
 
 
-def _read_enum(hint: type[Enum], where: str) -> EnumType:
+def _read_enum(hint: type[Enum], where: str) -> schema.EnumType:
     values = tuple((name, member.value) for name, member in hint.__members__.items())
     if issubclass(hint, Flag) or any(type(value) is not int for _, value in values):
-        raise SchemaError(f"{where}: {hint.__name__} must be an enum (no Flag) of integers")
-    return EnumType(hint.__name__, values)
+        raise schema.SchemaError(f"{where}: {hint.__name__} must be an enum (no Flag) of integers")
+    return schema.EnumType(hint.__name__, values)

@@ -11,37 +11,25 @@ import time
 import weakref
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from cortex.answers import Answers, ask_stats
 from cortex.callbacks import CallbackThread, check_callable
-from cortex.clock import Clock
-from cortex.codec import codec_of
-from cortex.context import LINGER_MS, Closed, context
-from cortex.control_thread import ControlThread
+from cortex.clock import Clock, wall_offset_ns
+from cortex.codec import RawCodec, RawMessage, codec_of
+from cortex.context import LINGER_MS, Closed, Closing, context
+from cortex.control_thread import ControlThread, ask_stats
 from cortex.discovery import Directory
 from cortex.host import domain_id, host_id
-from cortex.liveliness import Liveliness, Watch
 from cortex.matching import Matcher
-from cortex.overview import (
-    TopicInfo,
-    describe_publisher,
-    describe_service,
-    describe_subscriber,
-    publisher_stats,
-    subscriber_stats,
-    topics_of,
-)
-from cortex.places import Places, network
+from cortex.overview import Liveliness, TopicInfo, Watch, topics_of
+from cortex.places import Places, Reach, network
 from cortex.policy import Policy, keep_last
-from cortex.pub_socket import PubSockets
+from cortex.pub_socket import Backoff, PubSockets
 from cortex.publisher import INLINE_MAX, Publisher, close_publishers, usual_max_wait_s
-from cortex.raw import RawCodec, RawMessage
 from cortex.records import NodeRecord, StatsReply
 from cortex.schema import Schema, schema_of
 from cortex.security import Keys
-from cortex.service import Client, Place, Server, Service, service_number
+from cortex.service import Client, Server, Service, service_number
 from cortex.subscriber import Subscriber
 from cortex.topic import check_pattern, check_topic, matches
 
@@ -54,7 +42,7 @@ Reply = TypeVar("Reply")
 _nodes: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
-class Node:
+class Node(Closing):
     """A participant: its publishers, subscribers and services, and the thread that keeps them connected.
 
     Args:
@@ -99,7 +87,7 @@ class Node:
         self._clients: weakref.WeakSet[Client[Any, Any]] = weakref.WeakSet()
         self._callbacks = CallbackThread(name)
         self._server = Server(self._callbacks.submit)
-        self._control = ControlThread(name)
+        self._clock_offset_ns = wall_offset_ns()
         self._closed = False
         self._places = Places(self.domain, self.id, self._pub_sockets, listen, keys=keys, insecure=insecure)
         self._host = host_id()  # once the runtime directory exists: it counts
@@ -118,16 +106,18 @@ class Node:
             self._pub_sockets.close()
             self._places.close()
             raise
-        self._answers = Answers(name, self._server, stats=self._stats, wake=self._control.wake)
-        self._control.start(
+        self._control = ControlThread(
+            name,
             self._places,
             self._directory,
-            self._answers,
+            self._server,
             self._pub_sockets,
-            publishers=lambda: list(self._publishers),
-            subscribers=lambda: list(self._subscribers),
-            on_clock=self._match_all,
+            stats=self._stats,
+            publishers=self._publishers,
+            subscribers=self._subscribers,
+            on_clock=self._set_clock,
         )
+        self._control.start()
         _nodes.add(self)
 
     def publisher(
@@ -222,7 +212,7 @@ class Node:
         )
         with self._lock:
             self._subscribers.append(subscriber)
-            self._match(subscriber)
+            self._matcher.match(subscriber, self._record(), self._directory.nodes.values())
         if callback is not None:
             self._callbacks.add(subscriber)
         self._announce()
@@ -260,8 +250,8 @@ class Node:
         """Call a service."""
         self._check_open()
         number = service_number(check_topic(name), request_type, reply_type)
-        expected = schema_of(request_type)
-        client = Client(name, request_type, reply_type, partial(self._find_service, name, number, expected))
+        find = partial(self._find_service, name, number, schema_of(request_type))
+        client = Client(name, request_type, reply_type, find)
         self._clients.add(client)
         return client
 
@@ -297,7 +287,7 @@ class Node:
     @property
     def rejected(self) -> int:
         """Control frames that made no sense."""
-        return self._answers.rejected
+        return self._control.rejected
 
     def nodes(self) -> list[NodeRecord]:
         """All nodes that are known now, this one included."""
@@ -317,10 +307,7 @@ class Node:
         """
         if node == self.id:
             return self._stats()
-        reply = ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
-        if reply is None:
-            raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
-        return reply
+        return ask_stats(self._matcher.reach_control(self._known()[node]), self.id, timeout_s)
 
     def now_ns(self) -> int:
         """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""
@@ -333,11 +320,10 @@ class Node:
 
     def wait_for_registry(self, timeout_s: float = 5.0) -> bool:
         """Wait until the registry has told of all nodes; False if it has not in time."""
-        deadline_s = time.monotonic() + timeout_s
+        backoff = Backoff(timeout_s)
         while not self._directory.connected:
-            if time.monotonic() >= deadline_s:
+            if not backoff.wait():
                 return False
-            time.sleep(2e-3)
         return True
 
     def stop_waiting(self) -> None:
@@ -374,14 +360,6 @@ class Node:
             publisher.disown()
         for subscriber in self._subscribers:
             subscriber.disown()
-
-    def __enter__(self) -> Node:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         if self._pid != os.getpid():
@@ -426,24 +404,26 @@ class Node:
 
     def _record(self) -> NodeRecord:
         with self._lock:
-            publishers = [describe_publisher(publisher) for publisher in self._publishers]
-            subscribers = [describe_subscriber(subscriber) for subscriber in self._subscribers]
-        services = [describe_service(service) for service in self._server.services()]
-        return NodeRecord(
-            self.id,
-            self.name,
-            self._host,
-            self._pid,
-            0,
-            self._control.clock_offset_ns,
-            self._places.endpoints,
-            publishers,
-            subscribers,
-            services,
-        )
+            return NodeRecord(
+                self.id,
+                self.name,
+                self._host,
+                self._pid,
+                0,
+                self._clock_offset_ns,
+                self._places.endpoints,
+                [publisher.record() for publisher in self._publishers],
+                [subscriber.record() for subscriber in self._subscribers],
+                [service.record() for service in self._server.services()],
+            )
 
     def _known(self) -> dict[int, NodeRecord]:
         return {**self._directory.nodes, self.id: self._record()}
+
+    def _set_clock(self, offset_ns: int) -> None:
+        self._clock_offset_ns = offset_ns
+        self._directory.announce()
+        self._match_all()
 
     def _on_change(self, _: frozenset[int]) -> None:
         self._match_all()
@@ -452,19 +432,16 @@ class Node:
 
     def _match_all(self, topic: str | None = None) -> None:
         with self._lock:
+            own, peers = self._record(), self._directory.nodes.values()
             for subscriber in self._subscribers:
-                if topic is not None and not matches(subscriber.topic, topic):
-                    continue
-                try:
-                    self._match(subscriber)
-                except Exception:  # one that cannot be connected must not take the others along
-                    logger.exception("%s: cannot connect the subscriber of %s", self.name, subscriber.topic)
+                if topic is None or matches(subscriber.topic, topic):
+                    try:
+                        self._matcher.match(subscriber, own, peers)
+                    except Exception:  # one that cannot be connected must not take the others along
+                        what = "%s: cannot connect the subscriber of %s"
+                        logger.exception(what, self.name, subscriber.topic)
 
-    def _match(self, subscriber: Subscriber[Any]) -> None:
-        """Connect a subscriber to the publishers of its topic, and let go of those that have left."""
-        self._matcher.match(subscriber, self._record(), self._directory.nodes.values())
-
-    def _find_service(self, name: str, number: int, expected: Schema) -> Place | None:
+    def _find_service(self, name: str, number: int, expected: Schema) -> Reach | None:
         place = self._matcher.find_service(name, number, expected, self._known().values())
         if place is not None and place.node == self.id and self._callbacks.is_current:
             raise RuntimeError(
@@ -478,8 +455,8 @@ class Node:
             publishers, subscribers = list(self._publishers), list(self._subscribers)
         return StatsReply(
             self.id,
-            [publisher_stats(publisher) for publisher in publishers],
-            [subscriber_stats(subscriber) for subscriber in subscribers],
+            [publisher.stats() for publisher in publishers],
+            [subscriber.stats() for subscriber in subscribers],
             self.rejected + self._directory.rejected + self._server.rejected,
         )
 

@@ -1,24 +1,12 @@
-"""What a node tells of itself, and what the records of all nodes say about their topics."""
+"""What the records of all nodes say: topics, and publishers that come and go."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
-from cortex.publisher import Publisher
-from cortex.records import (
-    NodeRecord,
-    PublisherRecord,
-    PublisherStats,
-    ServiceRecord,
-    SubscriberRecord,
-    SubscriberStats,
-)
-from cortex.schema import schema_of
-from cortex.service import Service
-from cortex.stats import array_of
-from cortex.subscriber import Subscriber
-from cortex.topic import matches
+from cortex.records import NodeRecord
+from cortex.topic import check_pattern, matches
 
 
 class TopicInfo(NamedTuple):
@@ -29,7 +17,6 @@ class TopicInfo(NamedTuple):
     fingerprint: int
     schema: str
     publishers: tuple[str, ...]
-    """Names of the nodes that publish it."""
     subscribers: tuple[str, ...]
 
 
@@ -52,61 +39,42 @@ def topics_of(records: Iterable[NodeRecord]) -> list[TopicInfo]:
     return [found[key] for key in sorted(found)]
 
 
-def describe_publisher(publisher: Publisher[Any]) -> PublisherRecord:
-    """What others must know of a publisher to connect to it."""
-    codec = publisher.codec
-    schema = codec.schema
-    return PublisherRecord(
-        publisher.topic,
-        publisher.source,
-        schema.name,
-        codec.fingerprint,
-        schema.to_json(),
-        publisher.latch,
-    )
+class Liveliness(NamedTuple):
+    """A publisher has come, or is gone."""
+
+    topic: str
+    type_name: str
+    source: int
+    """The publisher's number, as in `Info`."""
+    node: int
+    node_name: str
+    alive: bool
 
 
-def describe_subscriber(subscriber: Subscriber[Any]) -> SubscriberRecord:
-    """What is announced of a subscriber."""
-    codec = subscriber.codec
-    return SubscriberRecord(
-        subscriber.topic,
-        "" if codec is None else codec.schema.name,
-        0 if codec is None else codec.fingerprint,
-        str(subscriber.policy),
-    )
+class Watch:
+    """What one callback has been told; made by `Node.watch`."""
 
+    def __init__(self, pattern: str, callback: Callable[[Liveliness], object]) -> None:
+        self._pattern = check_pattern(pattern)
+        self._callback = callback
+        self._known: dict[int, Liveliness] = {}
+        self.stopped = False
 
-def describe_service(service: Service) -> ServiceRecord:
-    """What others must know of a service to call it."""
-    request, reply = schema_of(service.request_type), schema_of(service.reply_type)
-    return ServiceRecord(service.name, service.number, request.to_json(), reply.to_json())
+    def changes(self, records: Iterable[NodeRecord]) -> list[Liveliness]:
+        """What has changed since the last call: publishers that are gone first."""
+        now = {
+            publisher.source: Liveliness(
+                publisher.topic, publisher.type_name, publisher.source, node.node, node.name, True
+            )
+            for node in records
+            for publisher in node.publishers
+            if matches(self._pattern, publisher.topic)
+        }
+        before, self._known = self._known, now
+        gone = [seen._replace(alive=False) for source, seen in before.items() if source not in now]
+        return gone + [seen for source, seen in now.items() if source not in before]
 
-
-def publisher_stats(publisher: Publisher[Any]) -> PublisherStats:
-    """What a publisher has counted."""
-    counters = publisher.counters
-    return PublisherStats(
-        publisher.topic,
-        publisher.source,
-        publisher.subscriber_count,
-        counters.published,
-        counters.bytes,
-        counters.timeouts,
-        counters.skipped,
-    )
-
-
-def subscriber_stats(subscriber: Subscriber[Any]) -> SubscriberStats:
-    """What a subscriber has counted."""
-    counters = subscriber.counters
-    return SubscriberStats(
-        subscriber.topic,
-        str(subscriber.policy),
-        counters.received,
-        counters.lost,
-        counters.rejected,
-        counters.overtaken,
-        counters.cut_off,
-        array_of(counters.latency),
-    )
+    def tell(self, change: Liveliness) -> None:
+        """Call the callback, unless it was stopped."""
+        if not self.stopped:
+            self._callback(change)

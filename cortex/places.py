@@ -16,7 +16,7 @@ from cortex.context import context, new_socket
 from cortex.host import NodeFiles
 from cortex.pub_socket import PubSockets, open_pub_socket
 from cortex.records import Endpoint, NodeRecord
-from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address, load_keys
+from cortex.security import Authenticator, Keys, apply_client, check_address, load_keys
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
@@ -25,18 +25,12 @@ NETWORK_VARIABLES = ("CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
 """What the environment may say of other hosts."""
 
 
-class Network(NamedTuple):
-    """How a node meets those of other hosts."""
-
-    registry: str
-    listen: str | None
-    keys: Keys | None
-
-
-def network(registry: str | None, listen: str | None, keys: Keys | None) -> Network:
+def network(
+    registry: str | None, listen: str | None, keys: Keys | None
+) -> tuple[str, str | None, Keys | None]:
     """What was given, else what CORTEX_REGISTRY, CORTEX_LISTEN and CORTEX_KEYS (a key directory) say."""
     directory = os.environ.get("CORTEX_KEYS")
-    return Network(
+    return (
         registry or os.environ.get("CORTEX_REGISTRY") or "auto",
         (os.environ.get("CORTEX_LISTEN") if listen is None else listen) or None,
         load_keys(Path(directory).expanduser()) if keys is None and directory else keys,
@@ -44,16 +38,7 @@ def network(registry: str | None, listen: str | None, keys: Keys | None) -> Netw
 
 
 class Places:
-    """The sockets by which a node is reached: two XPUB and a ROUTER on this host, and on tcp if it listens.
-
-    Args:
-        domain: The node's domain.
-        node: The node's number.
-        sockets: Gets the XPUB sockets, and closes them.
-        listen: Address of an interface; None: this host only.
-        keys: For CURVE on tcp.
-        insecure: Allow plain tcp beyond this host.
-    """
+    """The sockets by which a node is reached: two XPUB and a ROUTER here, and on tcp if it listens."""
 
     def __init__(
         self,
@@ -85,40 +70,29 @@ class Places:
         path = self._files.endpoint
         listener = self._listener = make_listener(self._files.path("ring"))
         for role, strict in (("lossy", False), ("strict", True)):
-            pub_sockets.add(open_pub_socket([path(role)], strict=strict, local=True, listener=listener))
-        router = self._router(tcp=False)
-        router.bind(path("control"))
+            pub_sockets.add(open_pub_socket(path(role), strict=strict, local=True, listener=listener))
+        self._router(tcp=False).bind(path("control"))
         self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
 
     def _open_tcp(self, pub_sockets: PubSockets, listen: str, keys: Keys | None) -> None:
         secure: Secure | None = None
         if keys is not None:
             self._authenticator = Authenticator.acquire(context())
-            secure = partial(apply_server, keys=keys)
-        any_port = [f"tcp://{_bracket(listen)}:*"]
-        lossy = open_pub_socket(any_port, strict=False, local=False, secure=secure)
-        pub_sockets.add(lossy)
-        strict = open_pub_socket(any_port, strict=True, local=False, secure=secure)
-        pub_sockets.add(strict)
+            secure = partial(self._authenticator.secure, keys=keys)
+        any_port = f"tcp://{_bracket(listen)}:*"
+        opened = []
+        for strict in (False, True):
+            pub_socket = open_pub_socket(any_port, strict=strict, local=False, secure=secure)
+            pub_sockets.add(pub_socket)
+            opened.append(pub_socket.socket)
         router = self._router(tcp=True)
         if secure is not None:
             secure(router)
-        router.bind(any_port[0])
+        router.bind(any_port)
         seen = listen if listen not in ("0.0.0.0", "::", "*") else _outward_address()
-
-        def reachable(socket: zmq.Socket[bytes]) -> str:
-            port = bytes(socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0").rpartition(":")[2]
-            return f"tcp://{_bracket(seen)}:{port}"
-
-        self.endpoints.append(
-            Endpoint(
-                "tcp",
-                reachable(lossy.socket),
-                reachable(strict.socket),
-                reachable(router),
-                "" if keys is None else keys.public,
-            )
-        )
+        bound = (socket.getsockopt_string(zmq.LAST_ENDPOINT) for socket in (*opened, router))
+        at = [f"tcp://{_bracket(seen)}:{address.rpartition(':')[2]}" for address in bound]
+        self.endpoints.append(Endpoint("tcp", at[0], at[1], at[2], "" if keys is None else keys.public))
 
     def _router(self, *, tcp: bool) -> zmq.Socket[bytes]:
         router = new_socket(zmq.ROUTER, tcp=tcp)
@@ -142,14 +116,10 @@ class Places:
 class Reach(NamedTuple):
     """How to reach a node from here."""
 
+    node: int
     endpoint: Endpoint
     local: bool
     secure: Secure | None
-
-    @property
-    def address(self) -> str:
-        """Its control address."""
-        return self.endpoint.control
 
     def open(self) -> zmq.Socket[bytes]:
         """A DEALER to its control address."""
@@ -158,7 +128,7 @@ class Reach(NamedTuple):
         try:
             if self.secure is not None:
                 self.secure(socket)
-            socket.connect(self.address)
+            socket.connect(self.endpoint.control)
         except BaseException:
             socket.close(0)
             raise
@@ -179,16 +149,15 @@ def reach(node: NodeRecord, host: str, keys: Keys | None, *, insecure: bool = Fa
     """
     for endpoint in node.endpoints:
         if endpoint.transport == "ipc" and node.host == host:
-            return Reach(endpoint, True, None)
+            return Reach(node.node, endpoint, True, None)
     for endpoint in node.endpoints:
         if endpoint.transport == "tcp":
             if not endpoint.server_key:
                 if _may_be_plain(endpoint, insecure=insecure and keys is None):
-                    return Reach(endpoint, False, None)
+                    return Reach(node.node, endpoint, False, None)
             elif keys is not None:
-                return Reach(
-                    endpoint, False, partial(apply_client, keys=keys, server_key=endpoint.server_key)
-                )
+                secure = partial(apply_client, keys=keys, server_key=endpoint.server_key)
+                return Reach(node.node, endpoint, False, secure)
     return None
 
 

@@ -6,17 +6,18 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import zmq
 
 from cortex.context import Frames, new_socket
-from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
+from cortex.wire import parse_attach_key, parse_resume_key
 
 if TYPE_CHECKING:
     from cortex.broadcast import Listener
+    from cortex.fanout import Fanout
 
 logger = logging.getLogger(__name__)
 
@@ -27,22 +28,6 @@ EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 ATTACHED_MAX = 16_384
 LOOK_MAX_NS = 5_000_000
 """A publisher reads who has come and gone for so long at a time; others may send more than it can read."""
-
-
-class Attachable(Protocol):
-    """What the sockets tell a publisher; called under the sockets' lock."""
-
-    def attach(self, pub_socket: PubSocket, key: bytes, request: AttachKey) -> None:
-        """A reader has come."""
-        ...
-
-    def detach(self, pub_socket: PubSocket, request: AttachKey) -> None:
-        """A reader has left or died."""
-        ...
-
-    def resume(self, pub_socket: PubSocket, reader: int, sequence: int) -> None:
-        """A reader has accounted for all below a sequence."""
-        ...
 
 
 @dataclass(eq=False)
@@ -56,9 +41,7 @@ class PubSocket:
     socket: zmq.Socket[bytes]
     strict: bool
     local: bool
-    """Over ipc: readers may share memory."""
     listener: Listener | None = None
-    """Where its readers ask for rings."""
 
     def __post_init__(self) -> None:
         self._frames = Frames(self.socket)
@@ -93,30 +76,21 @@ class PubSocket:
 
 
 def open_pub_socket(
-    addresses: Sequence[str],
+    address: str,
     *,
     strict: bool,
     local: bool,
     listener: Listener | None = None,
     secure: Callable[[zmq.Socket[bytes]], None] | None = None,
 ) -> PubSocket:
-    """Bind an XPUB socket.
-
-    Args:
-        addresses: Where to bind; a tcp address may end in `:*`.
-        strict: Whether full queues hold up the sender.
-        local: Whether the addresses are ipc.
-        listener: Where its readers ask for rings.
-        secure: Sets up CURVE on the socket before it binds.
-    """
+    """Bind an XPUB socket."""
     socket = new_socket(zmq.XPUB, tcp=not local)
     if strict:
         socket.setsockopt(zmq.XPUB_NODROP, 1)
     if secure is not None:
         secure(socket)
     try:
-        for address in addresses:
-            socket.bind(address)
+        socket.bind(address)
     except zmq.ZMQError:
         socket.close(0)
         raise
@@ -129,7 +103,7 @@ class PubSockets:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self._pub_sockets: list[PubSocket] = []
-        self._publishers: dict[int, Attachable] = {}
+        self._publishers: dict[int, Fanout] = {}
         self._attached: dict[bytes, PubSocket] = {}
         self._notes: deque[str] = deque(maxlen=100)
         self._refreshed_ns = 0
@@ -140,7 +114,7 @@ class PubSockets:
         with self.lock:
             self._pub_sockets.append(pub_socket)
 
-    def register(self, source: int, publisher: Attachable) -> None:
+    def register(self, source: int, publisher: Fanout) -> None:
         """Tell a publisher from now on who attaches to its source."""
         with self.lock:
             self._publishers[source] = publisher

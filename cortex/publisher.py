@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import secrets
 import threading
@@ -15,11 +16,12 @@ import numpy as np
 
 from cortex.back_pressure import BackPressure
 from cortex.codec import Codec, coder_of
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.fanout import Fanout
 from cortex.fast_send import FastSend, make_fast_send
 from cortex.loan import Loan
 from cortex.pub_socket import Backoff, PubSockets
+from cortex.records import PublisherRecord, PublisherStats
 from cortex.stats import PublisherCounters
 from cortex.wire import MESSAGE, REST, message_head
 
@@ -43,7 +45,7 @@ def usual_max_wait_s(message_type: type) -> float:
     return COMMAND_MAX_WAIT_S if message_type.__module__ == "cortex.messages.commands" else MAX_WAIT_S
 
 
-class Publisher(Generic[T]):
+class Publisher(Closing, Generic[T]):
     """Sends messages of one type; made by `Node.publisher`. Every method may be called from any thread."""
 
     def __init__(
@@ -76,24 +78,13 @@ class Publisher(Generic[T]):
             retry=lambda frame, send: self._fanout.retry(frame, send),
             limit=inline_max,
         )
-        """Sends small messages if nothing special is to be done."""
         self._fast_send.prepare, self._fast_send.finish = self._prepare, self._finish
         self._large_lock = threading.Lock()
         self._fast_send.large_acquire = self._large_lock.acquire
         self._fast_send.large_release = self._large_lock.release
         self._back_pressure = BackPressure(pub_sockets, self._fast_send, self._check_open)
-        self._fanout = Fanout(
-            topic,
-            self.source,
-            codec.fingerprint,
-            stamped=stamped,
-            fast_send=self._fast_send,
-            pub_sockets=pub_sockets,
-            back_pressure=self._back_pressure,
-            latching=latch,
-            max_wait_s=max_wait_s,
-            expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
-        )
+        large = expected_bytes if expected_bytes > inline_max else 0
+        self._fanout = Fanout(self, max_wait_s=max_wait_s, expected_bytes=large)
         self._on_close = on_close
         self._closing = False
         self._closed = False
@@ -117,7 +108,6 @@ class Publisher(Generic[T]):
         return self._fast_send(message)
 
     def _publish_slowly(self, message: T) -> bool:
-        """Send a message that the fast path cannot."""
         self._lock.acquire()
         try:
             now_ns = monotonic_ns()
@@ -230,7 +220,6 @@ class Publisher(Generic[T]):
             warnings.warn(text, ResourceWarning, stacklevel=2)
 
     def _publish_loan(self, draft: Any, buffer: np.ndarray, slot: Any, message: Any) -> bool:
-        """Send a message that was written on loan; returns and raises as `Loan.publish`."""
         if message is not None:
             in_place = slot is not None and self.codec.drafter.is_by_tail
             sent = self._send_loaned(message, slot) if in_place else None
@@ -284,7 +273,6 @@ class Publisher(Generic[T]):
         return self._fanout.send_large(body.data, slot, sequence, stamp_ns, now_ns, size)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
-        """Send a small message; the lock is held."""
         size = len(body)
         self._fast_send.bytes += size
         sequence = self._fast_send.sequence
@@ -341,6 +329,17 @@ class Publisher(Generic[T]):
                 self._fast_send.sequence, self._fast_send.bytes, fanout.timeouts, fanout.skipped
             )
 
+    def record(self) -> PublisherRecord:
+        """What others must know to connect to it; for the node."""
+        schema = self.codec.schema
+        described = schema.name, schema.fingerprint, schema.to_json()
+        return PublisherRecord(self.topic, self.source, *described, self.latch)
+
+    def stats(self) -> PublisherStats:
+        """What it has counted, as it travels."""
+        counters = dataclasses.asdict(self.counters)
+        return PublisherStats(self.topic, self.source, self.subscriber_count, **counters)
+
     @property
     def subscriber_count(self) -> int:
         """Subscribers that are attached now: what follows reaches them, or they count it as lost."""
@@ -351,12 +350,11 @@ class Publisher(Generic[T]):
 
     def wait_for_subscribers(self, count: int = 1, timeout_s: float = 5.0) -> bool:
         """Wait until so many subscribers are attached; False if they are not in time."""
-        deadline_s = time.monotonic() + timeout_s
+        backoff = Backoff(timeout_s)
         while self.subscriber_count < count:
             self._check_open()
-            if time.monotonic() >= deadline_s:
+            if not backoff.wait():
                 return False
-            time.sleep(0.5e-3)
         return True
 
     def disown(self) -> None:
@@ -408,7 +406,6 @@ class Publisher(Generic[T]):
             return self._fanout.finish(waited_s, linger_s)
 
     def _end(self) -> None:
-        """Let go of everything."""
         with self._lock:
             if not self._pub_sockets.closed:
                 self._fanout.give_up()
@@ -416,12 +413,6 @@ class Publisher(Generic[T]):
         self._pub_sockets.unregister(self.source)
         if self._on_close is not None:
             self._on_close(self)
-
-    def __enter__(self) -> Publisher[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def close_publishers(

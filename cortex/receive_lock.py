@@ -21,7 +21,6 @@ class ReceiveLock:
         self.lock = threading.Lock()
         self._guard = threading.Lock()
         self.waiting = 0
-        """How many want the lock."""
 
     def __enter__(self) -> None:
         if self.lock.acquire(blocking=False):

@@ -33,41 +33,9 @@ from typing import Any
 
 import zmq
 
+from cortex import control, host, records
 from cortex.codec import MalformedMessage
-from cortex.control import (
-    LEASE_NS,
-    NODES_MAX,
-    RECORD_BYTES_MAX,
-    STALL_NS,
-    TOTAL_BYTES_MAX,
-    control_types,
-    make_control_socket,
-    sender_of,
-    watch_process,
-)
-from cortex.host import (
-    REGISTRY_LOCK,
-    REGISTRY_LOG,
-    REGISTRY_SOCKET,
-    FileLock,
-    domain_id,
-    node_lives,
-    runtime_dir,
-    sweep,
-)
-from cortex.records import (
-    Alive,
-    Changed,
-    Gone,
-    Heartbeat,
-    Hello,
-    Leave,
-    NodeRecord,
-    Refused,
-    Welcome,
-    check_record,
-)
-from cortex.security import Authenticator, Keys, apply_server, check_address, keeps_keys, load_keys
+from cortex.security import Authenticator, Keys, check_address, keeps_keys, load_keys
 from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
@@ -102,11 +70,6 @@ class _Entry:
     sender: str
     """Whose node it is; see `sender_of`."""
     process: int
-    """Readable when its process has ended; -1: not known."""
-
-
-def _differs(record: NodeRecord, entry: _Entry, route: Route) -> bool:
-    return route == entry.route and record.revision != entry.revision
 
 
 class Registry:
@@ -135,9 +98,9 @@ class Registry:
         keys: Keys | None = None,
         insecure: bool = False,
         linger_s: float | None = None,
-        lock: FileLock | None = None,
-        nodes_max: int = NODES_MAX,
-        record_bytes_max: int = RECORD_BYTES_MAX,
+        lock: host.FileLock | None = None,
+        nodes_max: int = control.NODES_MAX,
+        record_bytes_max: int = control.RECORD_BYTES_MAX,
         stalled_s: float = STALLED_S,
     ):
         if listen is not None:
@@ -147,12 +110,11 @@ class Registry:
         self.epoch = secrets.randbits(64) or 1
         self.version = 0
         self.rejected = 0
-        """Frames that were malformed."""
         self.refused = 0
         """Records that were over a limit."""
         self.address: str | None = None
         """The tcp address that it listens on, with its port."""
-        self._directory = runtime_dir(domain)
+        self._directory = host.runtime_dir(domain)
         self._limits = (nodes_max, record_bytes_max)
         self._stalled_ns = int(stalled_s * 1e9)
         self._linger_ns = None if linger_s is None else int(linger_s * 1e9)
@@ -164,8 +126,8 @@ class Registry:
         self._sender = ""
         self._poller = zmq.Poller()
         self._stopping = False
-        path = self._directory / REGISTRY_LOCK
-        taken = lock or FileLock.acquire(path)
+        path = self._directory / host.REGISTRY_LOCK
+        taken = lock or host.FileLock.acquire(path)
         if taken is None:
             raise RegistryRunning(_who_serves(path, domain))
         self._lock = taken
@@ -175,11 +137,11 @@ class Registry:
         self._authenticator: Authenticator | None = None
         self._sockets: list[zmq.Socket[Any]] = []
         self._handlers: dict[type, Callable[[Any, int, Route, int], None]] = {
-            Hello: self._on_hello,
-            Heartbeat: self._on_heartbeat,
-            Leave: self._on_leave,
+            records.Hello: self._on_hello,
+            records.Heartbeat: self._on_heartbeat,
+            records.Leave: self._on_leave,
         }
-        self._types = control_types(*self._handlers)
+        self._types = control.control_types(*self._handlers)
         try:
             self._bind(listen, keys)
         except BaseException:
@@ -187,16 +149,16 @@ class Registry:
             raise
 
     def _bind(self, listen: str | None, keys: Keys | None) -> None:
-        local = make_control_socket(self._context, zmq.ROUTER, tcp=False)
+        local = control.make_control_socket(self._context, zmq.ROUTER, tcp=False)
         self._sockets.append(local)
-        local.bind(f"ipc://{self._directory / REGISTRY_SOCKET}")
+        local.bind(f"ipc://{self._directory / host.REGISTRY_SOCKET}")
         if listen is not None:
-            remote = make_control_socket(self._context, zmq.ROUTER, tcp=True)
+            remote = control.make_control_socket(self._context, zmq.ROUTER, tcp=True)
             self._sockets.append(remote)
             remote.ipv6 = "[" in listen  # else the address would read [::ffff:127.0.0.1]
             if keys is not None:
                 self._authenticator = Authenticator.acquire(self._context)
-                apply_server(remote, keys)
+                self._authenticator.secure(remote, keys)
             remote.bind(listen)
             self.address = str(remote.getsockopt_string(zmq.LAST_ENDPOINT))
 
@@ -211,14 +173,14 @@ class Registry:
 
     def run(self) -> None:
         """Serve until `stop`, or until the last node has been gone for `linger_s`."""
-        sweep(self._directory)
+        host.sweep(self._directory)
         for socket in self._sockets:
             self._poller.register(socket, zmq.POLLIN)
         turn_ns = busy_ns = time.monotonic_ns()
         while not self._stopping:
             ready = dict(self._poller.poll(_POLL_MS))
             before_ns, turn_ns = turn_ns, time.monotonic_ns()
-            if turn_ns - before_ns > STALL_NS:
+            if turn_ns - before_ns > control.STALL_NS:
                 for entry in self._entries.values():
                     entry.seen_ns += turn_ns - before_ns
                 busy_ns += turn_ns - before_ns
@@ -246,7 +208,7 @@ class Registry:
         self._context.term()  # from here on nothing of ours can touch the path, which the next registry makes
         if self._lock.intact:
             with contextlib.suppress(FileNotFoundError):
-                os.unlink(self._directory / REGISTRY_SOCKET)
+                os.unlink(self._directory / host.REGISTRY_SOCKET)
         self._lock.close()
 
     def _drain(self, socket: zmq.Socket[Any], now_ns: int) -> None:
@@ -260,7 +222,7 @@ class Registry:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
                 message, header = parse_control(frames[0].bytes, self._types)
-                self._sequence, self._sender = header.sequence, sender_of(frames[0])
+                self._sequence, self._sender = header.sequence, control.sender_of(frames[0])
                 self._handlers[type(message)](message, len(frames[0]), route, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
@@ -271,18 +233,19 @@ class Registry:
             self._logged.add(key)
             logger.warning(text, *arguments)
 
-    def _on_hello(self, hello: Hello, size: int, route: Route, now_ns: int) -> None:
+    def _on_hello(self, hello: records.Hello, size: int, route: Route, now_ns: int) -> None:
         record = hello.record
-        check_record(record)
+        records.check_record(record)
         entry = self._entries.get(record.node)
         reason = self._reason_to_refuse(record, size, route, entry)
         if reason:
             self.refused += 1
             self._log_once((route, reason), "refused node %s: %s", record.name[:200], reason)
-            self._reply(route, Refused(record.node, reason))
+            self._reply(route, records.Refused(record.node, reason))
             return
         # What comes on one connection is in order; what comes on another may be older than what we have.
-        if entry is None or record.revision > entry.revision or _differs(record, entry, route):
+        is_next = entry is not None and entry.route == route and record.revision != entry.revision
+        if entry is None or record.revision > entry.revision or is_next:
             self._store(record, route, now_ns, entry)
         else:
             self._routes.pop(entry.route, None)  # it has connected anew
@@ -290,13 +253,15 @@ class Registry:
             self._routes[route] = record.node
         entries = self._entries.values()
         nodes, revisions = [e.node for e in entries], [e.revision for e in entries]
-        self._reply(route, Welcome(self.epoch, self.version, nodes, revisions))
+        self._reply(route, records.Welcome(self.epoch, self.version, nodes, revisions))
         if hello.snapshot:
             for other in entries:
                 if other.node != record.node:
                     self._send(route, other.frame)
 
-    def _reason_to_refuse(self, record: NodeRecord, size: int, route: Route, entry: _Entry | None) -> str:
+    def _reason_to_refuse(
+        self, record: records.NodeRecord, size: int, route: Route, entry: _Entry | None
+    ) -> str:
         nodes_max, record_bytes_max = self._limits
         if size > record_bytes_max:
             return f"its record has {size} bytes, {record_bytes_max} are allowed"
@@ -308,12 +273,12 @@ class Registry:
             return "its addresses have another key than it came with"
         if entry is None and len(self._entries) >= nodes_max:
             return f"there are {nodes_max} nodes already"
-        if self._bytes - (len(entry.frame) if entry else 0) + size > TOTAL_BYTES_MAX:
-            return f"all records together would exceed {TOTAL_BYTES_MAX} bytes"
+        if self._bytes - (len(entry.frame) if entry else 0) + size > control.TOTAL_BYTES_MAX:
+            return f"all records together would exceed {control.TOTAL_BYTES_MAX} bytes"
         return ""
 
-    def _store(self, record: NodeRecord, route: Route, now_ns: int, old: _Entry | None) -> None:
-        process = watch_process(self._sender)
+    def _store(self, record: records.NodeRecord, route: Route, now_ns: int, old: _Entry | None) -> None:
+        process = control.watch_process(self._sender)
         if process >= 0:
             self._poller.register(process, zmq.POLLIN)
         if old is not None:
@@ -321,7 +286,7 @@ class Registry:
         else:
             logger.info("node %s (%016x) has come", record.name[:200], record.node)
         self.version += 1
-        frame = control_frame(Changed(self.version, record))
+        frame = control_frame(records.Changed(self.version, record))
         name = record.name[:200]
         self._entries[record.node] = _Entry(
             record.node, record.revision, name, frame, route, now_ns, self._sender, process
@@ -330,15 +295,15 @@ class Registry:
         self._bytes += len(frame)
         self._tell(frame, except_node=record.node)
 
-    def _on_heartbeat(self, heartbeat: Heartbeat, size: int, route: Route, now_ns: int) -> None:
+    def _on_heartbeat(self, heartbeat: records.Heartbeat, size: int, route: Route, now_ns: int) -> None:
         entry = self._entries.get(heartbeat.node)
         held = 0
         if entry is not None and entry.route == route:
             entry.seen_ns, held = now_ns, entry.revision
-        alive = Alive(self.epoch, self.version, held)
+        alive = records.Alive(self.epoch, self.version, held)
         self._send(route, control_frame(alive, self._sequence, told_ns=time.time_ns()))
 
-    def _on_leave(self, leave: Leave, size: int, route: Route, now_ns: int) -> None:
+    def _on_leave(self, leave: records.Leave, size: int, route: Route, now_ns: int) -> None:
         entry = self._entries.get(leave.node)
         if entry is not None and entry.route == route:
             self._remove(entry, "left")
@@ -349,21 +314,21 @@ class Registry:
             entry
             for entry in self._entries.values()
             if entry.process not in ready
-            and (silent_ns := now_ns - entry.seen_ns) > LEASE_NS
-            and (silent_ns > self._stalled_ns or not node_lives(self._directory, entry.node))
+            and (silent_ns := now_ns - entry.seen_ns) > control.LEASE_NS
+            and (silent_ns > self._stalled_ns or not host.node_lives(self._directory, entry.node))
         ]
         for entry in ended:
             self._remove(entry, "its process has ended")
         for entry in expired:
             self._remove(entry, "its lease has run out")
         if ended or expired:
-            sweep(self._directory)
+            host.sweep(self._directory)
 
     def _remove(self, entry: _Entry, reason: str) -> None:
         self._forget(entry)
         self.version += 1
         logger.info("node %s (%016x) is gone: %s", entry.name, entry.node, reason)
-        self._tell(control_frame(Gone(self.version, entry.node, reason)), except_node=entry.node)
+        self._tell(control_frame(records.Gone(self.version, entry.node, reason)), except_node=entry.node)
 
     def _forget(self, entry: _Entry) -> None:
         if entry.process >= 0:
@@ -388,19 +353,9 @@ class Registry:
 
 
 def _who_serves(lock: Path, domain: int) -> str:
-    """Say which registry holds the lock of a domain, and how to be rid of it."""
     process = lock.read_text(encoding="ascii", errors="replace").strip()
     if not process:
         return f"a registry that is just being started serves domain {domain}: try again"
-    try:
-        embedded = b"--embedded" in Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
-    except OSError:
-        embedded = False
-    if embedded:
-        return (
-            f"a registry started by a node (process {process}) serves domain {domain}; "
-            f"stop the nodes, or `kill {process}`"
-        )
     return f"another registry (process {process}) serves domain {domain}; to replace it, `kill {process}`"
 
 
@@ -414,14 +369,14 @@ def ensure_registry(domain: int, *, linger_s: float = LINGER_S) -> bool:
     Raises:
         OSError: If no process can be started.
     """
-    directory = runtime_dir(domain)
-    lock = FileLock.acquire(directory / REGISTRY_LOCK)
+    directory = host.runtime_dir(domain)
+    lock = host.FileLock.acquire(directory / host.REGISTRY_LOCK)
     if lock is None:
         return False
     try:
         arguments = ["-m", "cortex.discovery", "--domain", str(domain), "--embedded"]
         arguments += ["--linger", str(linger_s), "--lock", str(lock.descriptor)]
-        _spawn([sys.executable, *arguments], lock.descriptor, directory / REGISTRY_LOG)
+        _spawn([sys.executable, *arguments], lock.descriptor, directory / host.REGISTRY_LOG)
     finally:
         lock.close()
     return True
@@ -434,7 +389,7 @@ def _spawn(command: list[str], descriptor: int, log: Path) -> None:
     environment["OPENBLAS_NUM_THREADS"] = "1"  # numpy would start threads that a registry has no use for
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
     # `Popen` waits until nobody else has the end of a pipe; a process forked meanwhile would keep it.
-    with FileLock.no_fork(), open(os.open(log, flags, 0o600), "ab") as output:
+    with host.FileLock.no_fork(), open(os.open(log, flags, 0o600), "ab") as output:
         if output.tell() > _LOG_BYTES_MAX:
             output.truncate(0)
         detacher = subprocess.Popen(
@@ -458,13 +413,14 @@ def _spawn(command: list[str], descriptor: int, log: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a registry; the exit code is 1 if another one serves the domain."""
     parser = argparse.ArgumentParser(prog="cortex discovery", description="Run the registry of a domain.")
-    parser.add_argument("--domain", type=int, help="0 to 232; default: CORTEX_DOMAIN, else 0")
-    parser.add_argument("--listen", help="also serve other hosts, e.g. tcp://0.0.0.0:7460")
-    parser.add_argument("--keys", type=Path, help="key directory, for CURVE on tcp")
-    parser.add_argument("--insecure", action="store_true", help="allow plain tcp beyond this host")
-    parser.add_argument("--embedded", action="store_true", help="end after the last node has left")
-    parser.add_argument("--linger", type=float, default=LINGER_S, help="how long after, in seconds")
-    parser.add_argument("--lock", type=int, help=argparse.SUPPRESS)
+    add = parser.add_argument
+    add("--domain", type=int, help="0 to 232; default: CORTEX_DOMAIN, else 0")
+    add("--listen", help="also serve other hosts, e.g. tcp://0.0.0.0:7460")
+    add("--keys", type=Path, help="key directory, for CURVE on tcp")
+    add("--insecure", action="store_true", help="allow plain tcp beyond this host")
+    add("--embedded", action="store_true", help="end after the last node has left")
+    add("--linger", type=float, default=LINGER_S, help="how long after, in seconds")
+    add("--lock", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     level = logging.WARNING if options.embedded else logging.INFO
     handler = logging.StreamHandler()
@@ -473,10 +429,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     handler.setFormatter(dated if options.embedded else logging.Formatter("cortex discovery: %(message)s"))
     logging.basicConfig(level=level, handlers=[handler])
     try:
-        domain = domain_id(options.domain)
+        domain = host.domain_id(options.domain)
         lock = None
         if options.lock is not None:
-            lock = FileLock.adopt(runtime_dir(domain) / REGISTRY_LOCK, options.lock)
+            lock = host.FileLock.adopt(host.runtime_dir(domain) / host.REGISTRY_LOCK, options.lock)
         registry = Registry(
             domain,
             listen=options.listen,

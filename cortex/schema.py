@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -18,37 +19,14 @@ import numpy as np
 
 from cortex.structure import make_class
 
-SCALAR_SIZES: Mapping[str, int] = {
-    "bool": 1,
-    "int8": 1,
-    "int16": 2,
-    "int32": 4,
-    "int64": 8,
-    "uint8": 1,
-    "uint16": 2,
-    "uint32": 4,
-    "uint64": 8,
-    "float32": 4,
-    "float64": 8,
-}
+_INTEGERS = (f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+_SCALARS = ("bool", *_INTEGERS, "float32", "float64")
+SCALAR_CODES = dict(zip(_SCALARS, "BbhiqBHIQfd", strict=True))
+"""Scalar types, and their codes of the struct module; a bool is a byte, so that a 2 can be told from a 1."""
+SCALAR_SIZES = {name: struct.calcsize(code) for name, code in SCALAR_CODES.items()}
 """Scalar types and their size [bytes]."""
 
-DTYPE_NAMES = (
-    "bool",
-    "int8",
-    "int16",
-    "int32",
-    "int64",
-    "uint8",
-    "uint16",
-    "uint32",
-    "uint64",
-    "float16",
-    "float32",
-    "float64",
-    "complex64",
-    "complex128",
-)
+DTYPE_NAMES = (*_SCALARS[:9], "float16", *_SCALARS[9:], "complex64", "complex128")
 """Types of array items; the index is the code on the wire."""
 
 ANY_DTYPE = "any"
@@ -215,6 +193,12 @@ class Schema:
         return len(self.fields) + sum(_count_nodes(field.type) for field in self.fields)
 
     @cached_property
+    def stamp_index(self) -> int:
+        """Which field is the stamp: the integer `stamp_ns`; -1 if there is none."""
+        kinds = [str(field.type) if field.name == "stamp_ns" else "" for field in self.fields]
+        return next((k for k, kind in enumerate(kinds) if kind.startswith(("int", "uint"))), -1)
+
+    @cached_property
     def fingerprint(self) -> int:
         """64 bits that identify the structure."""
         return fingerprint_of(self._text.encode())
@@ -265,6 +249,16 @@ class TypeMismatch(TypeError):
 def fingerprint_of(data: bytes) -> int:
     """Return the 64-bit fingerprint of some bytes."""
     return int.from_bytes(blake2b(data, digest_size=8).digest(), "little")
+
+
+def nested(kind: FieldType) -> Iterator[FieldType]:
+    """Yield a type, and all that it consists of."""
+    yield kind
+    if isinstance(kind, (OptionalType, ListType)):
+        yield from nested(kind.item)
+    elif isinstance(kind, Schema):
+        for field in kind.fields:
+            yield from nested(field.type)
 
 
 def schema_of(message_type: type) -> Schema:

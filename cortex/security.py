@@ -7,6 +7,7 @@ Lines that start with `#` are comments. Our own key is always authorised, so hos
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ipaddress
 import logging
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import zmq
-from zmq.utils import z85
+from zmq.auth.thread import ThreadAuthenticator
 
 if TYPE_CHECKING:
     from cortex.records import NodeRecord
@@ -30,7 +31,6 @@ SECRET_FILE, PUBLIC_FILE, AUTHORIZED_FILE = "key.secret", "key.public", "authori
 
 _KEY_LENGTH = 40
 _Z85 = frozenset("0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#")
-_ZAP_ADDRESS = "inproc://zeromq.zap.01"
 _LOGGED_MAX = 256
 
 
@@ -194,139 +194,78 @@ def apply_client(socket: zmq.Socket[Any], keys: Keys, server_key: str) -> None:
     socket.curve_serverkey = server_key.encode()
 
 
-def apply_server(socket: zmq.Socket[Any], keys: Keys) -> None:
-    """Make a socket, before it binds, accept authorised CURVE clients only.
+class Authenticator(ThreadAuthenticator):
+    """The one place of a context where CURVE clients are let in or refused, on a thread of its own.
 
-    Raises:
-        RuntimeError: If its context has no `Authenticator`: the socket would refuse everybody.
-    """
-    domain = Authenticator.of(socket.context).domain_of(keys)
-    socket.curve_secretkey = keys.secret.encode()
-    socket.curve_publickey = keys.public.encode()
-    socket.curve_server = True
-    socket.zap_domain = domain.encode()
-    # Without this, libzmq lets everybody in when no authenticator answers.
-    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-
-
-class Authenticator:
-    """The one place of a context where CURVE clients are let in or refused (ZAP, ZeroMQ RFC 27).
-
-    `acquire` and `release` count users; the thread ends with the last one, or when the context is terminated.
-    All methods may be called from any thread.
+    `acquire` and `release` count users; after the last one sockets that are bound refuse new clients.
     """
 
     _running: ClassVar[dict[int, Authenticator]] = {}
     _lock: ClassVar[threading.Lock] = threading.Lock()
 
     def __init__(self, context: zmq.Context[Any]):
-        self._users = 0
-        self._domains: dict[str, Keys] = {}
+        super().__init__(context, log=logger)
+        self._keys: dict[str, Keys] = {}
         self._logged: set[bytes] = set()
-        zap: zmq.Socket[Any] = context.socket(zmq.REP, socket_class=zmq.Socket)
-        zap.linger = 0
-        try:
-            _bind_zap(zap)
-        except zmq.ZMQError:
-            zap.close()
-            raise
-        stopped, self._stop = os.pipe()
-        self._thread = threading.Thread(target=self._run, args=(zap, stopped), name="cortex-zap", daemon=True)
-        self._thread.start()
+        self._users = 0
+        self._pid = os.getpid()
 
     @classmethod
     def acquire(cls, context: zmq.Context[Any]) -> Authenticator:
-        """Return the context's authenticator, started if need be; give it back with `release`."""
+        """Return the context's authenticator, started if need be."""
         with cls._lock:
             found = cls._running.get(context.underlying)
-            if found is None or not found._thread.is_alive():
+            if found is None or not found.is_alive():
                 found = cls._running[context.underlying] = cls(context)
+                found.start()
+                atexit.register(found.stop)
             found._users += 1
             return found
 
-    @classmethod
-    def of(cls, context: zmq.Context[Any]) -> Authenticator:
-        """Return the context's running authenticator.
-
-        Raises:
-            RuntimeError: If there is none.
-        """
-        with cls._lock:
-            found = cls._running.get(context.underlying)
-        if found is None:
-            raise RuntimeError("a CURVE server needs Authenticator.acquire(context) first")
-        return found
-
     def release(self) -> None:
-        """Give it back. Sockets that are bound refuse new clients once the last user has done so."""
+        """Give it back, before its context is terminated."""
         with self._lock:
             self._users -= 1
-            if self._users > 0:
-                return
-            for context, running in list(self._running.items()):
-                if running is self:
-                    del self._running[context]
-            with contextlib.suppress(BrokenPipeError):  # the context may be gone, and the thread with it
-                os.write(self._stop, b"\0")
-            self._thread.join(timeout=5.0)
-            os.close(self._stop)
+            if self._users == 0:
+                self._running.pop(self.context.underlying, None)
+                atexit.unregister(self.stop)
+                self.stop()
 
-    def domain_of(self, keys: Keys) -> str:
-        """Return the ZAP domain in which these keys decide."""
+    def start(self) -> None:
+        """Start, once the reaper of libzmq has let go of the address of ZAP after a release."""
+        deadline_s = time.monotonic() + 2.0
+        while True:
+            try:
+                return super().start()
+            except zmq.ZMQError as error:
+                if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline_s:
+                    raise
+                super().stop()
+                time.sleep(0.001)
+
+    def stop(self) -> None:
+        """Stop; a forked child leaves alone what is its parent's."""
+        if self._pid == os.getpid():
+            super().stop()
+
+    def secure(self, socket: zmq.Socket[Any], keys: Keys) -> None:
+        """Make a socket of the context, before it binds, accept authorised CURVE clients only."""
         with self._lock:
-            for domain, known in self._domains.items():
-                if known == keys:
-                    return domain
-            domain = f"cortex.{len(self._domains)}"
-            self._domains[domain] = keys
-            return domain
+            known = next((domain for domain, each in self._keys.items() if each == keys), "")
+            domain = known or f"cortex.{len(self._keys)}"
+            self._keys[domain] = keys
+            self.configure_curve_callback(domain, self)
+        socket.curve_secretkey = keys.secret.encode()
+        socket.curve_publickey = keys.public.encode()
+        socket.curve_server = True
+        socket.zap_domain = domain.encode()
+        # Without this, libzmq lets everybody in when no authenticator answers.
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
-    def _run(self, zap: zmq.Socket[Any], stopped: int) -> None:
-        poller = zmq.Poller()
-        poller.register(zap, zmq.POLLIN)
-        poller.register(stopped, zmq.POLLIN)
-        try:
-            while True:
-                ready = dict(poller.poll())
-                if stopped in ready:
-                    return
-                if zap in ready:
-                    zap.send_multipart(self._decide(zap.recv_multipart()))
-        except zmq.ContextTerminated:
-            pass
-        finally:
-            zap.close()
-            os.close(stopped)
-
-    def _decide(self, request: list[bytes]) -> list[bytes]:
-        version, number, domain, address, _, mechanism, *credentials = request + [b""] * (6 - len(request))
-        allowed = False
-        if (
-            version == b"1.0"
-            and mechanism == b"CURVE"
-            and len(credentials) == 1
-            and len(credentials[0]) == 32
-        ):
-            key = z85.encode(credentials[0])
-            with self._lock:
-                keys = self._domains.get(domain.decode("ascii", "replace"))
-            allowed = keys is not None and keys.allows(key.decode())
-            if not allowed and key not in self._logged and len(self._logged) < _LOGGED_MAX:
-                self._logged.add(key)
-                logger.warning("refused key %s of %s: it is not authorised", key.decode(), address.decode())
-            if allowed:
-                return [b"1.0", number, b"200", b"OK", key, b""]
-        return [b"1.0", number, b"400", b"not authorised", b"", b""]
-
-
-def _bind_zap(socket: zmq.Socket[Any]) -> None:
-    """Bind the address of ZAP, which the reaper of libzmq may still hold for a moment after a release."""
-    deadline = time.monotonic() + 2.0
-    while True:
-        try:
-            socket.bind(_ZAP_ADDRESS)
-            return
-        except zmq.ZMQError as error:
-            if error.errno != zmq.EADDRINUSE or time.monotonic() > deadline:
-                raise
-            time.sleep(0.001)
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Decide about a client's key; called by the thread."""
+        allowed = self._keys[domain].allows(key.decode())
+        if not allowed and key not in self._logged and len(self._logged) < _LOGGED_MAX:
+            self._logged.add(key)
+            logger.warning("refused key %s: it is not authorised", key.decode())
+        return allowed

@@ -12,21 +12,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import zmq
 
+from cortex import wire
 from cortex.codec import MalformedMessage, codec_of
-from cortex.context import Closed, new_socket
-from cortex.records import ServiceError
+from cortex.context import Closed, Closing
+from cortex.places import Reach
+from cortex.records import ServiceError, ServiceRecord
 from cortex.schema import fingerprint_of, schema_of
-from cortex.wire import (
-    CONTROL_LIMIT,
-    ERROR,
-    HEADER_SIZE,
-    REPLY,
-    REQUEST,
-    Header,
-    check_body,
-    pack_header,
-    unpack_header,
-)
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +54,11 @@ class Service(NamedTuple):
     request_type: type
     reply_type: type
     handler: Callable[[Any], Any]
+
+    def record(self) -> ServiceRecord:
+        """What others must know to call it."""
+        request, reply = schema_of(self.request_type), schema_of(self.reply_type)
+        return ServiceRecord(self.name, self.number, request.to_json(), reply.to_json())
 
 
 class Server:
@@ -102,10 +98,10 @@ class Server:
         Raises:
             MalformedMessage: It is not a request.
         """
-        header = unpack_header(frame)
-        if header.kind != REQUEST:
-            raise MalformedMessage(f"kind {header.kind!r} where {REQUEST!r} was expected")
-        check_body(header, len(frame))
+        header = wire.unpack_header(frame)
+        if header.kind != wire.REQUEST:
+            raise MalformedMessage(f"kind {header.kind!r} where {wire.REQUEST!r} was expected")
+        wire.check_body(header, len(frame))
         deadline_ns = time.monotonic_ns() + max(header.publish_ns, 0)
         if header.stamp_ns is not None:  # of this host's clock: it also counts the time before we ran
             deadline_ns = min(deadline_ns, header.stamp_ns)
@@ -125,56 +121,47 @@ class Server:
     def _serve(
         self,
         service: Service,
-        header: Header,
+        header: wire.Header,
         frame: bytes,
         deadline_ns: int,
         reply: Callable[[bytes], None],
     ) -> None:
         with self._lock:
             self._pending -= 1
-        if time.monotonic_ns() > deadline_ns:
-            reply(_error(header, "late", "the request waited until its deadline"))
-            return
-        try:
-            request = codec_of(service.request_type).decode(frame, HEADER_SIZE, header.body_size)
-        except MalformedMessage as error:
-            reply(_error(header, "malformed", str(error)))
-            return
-        try:
-            answer = service.handler(request)
-            if type(answer) is not service.reply_type:
-                raise TypeError(
-                    f"the handler of {service.name} must return {service.reply_type.__name__}, "
-                    f"it returned {type(answer).__name__}"
-                )
-            body = codec_of(service.reply_type).encode(answer, CONTROL_LIMIT)
-            if body is None:
-                raise ValueError(f"the reply of {service.name} is over the limit of {CONTROL_LIMIT} bytes")
-        except Exception as error:
-            logger.exception("the handler of %s raised", service.name)
-            reply(_error(header, "failed", f"{type(error).__name__}: {error}"[:2000]))
-            return
-        fingerprint = schema_of(service.reply_type).fingerprint
-        reply(pack_header(header._replace(kind=REPLY, fingerprint=fingerprint, body_size=len(body))) + body)
+        reply(_serve(service, header, frame, deadline_ns))
 
 
-def _error(header: Header, kind: str, text: str) -> bytes:
-    codec = codec_of(ServiceError)
-    body = codec.encode(ServiceError(kind, text), CONTROL_LIMIT)
-    assert body is not None
-    return pack_header(header._replace(kind=ERROR, fingerprint=codec.fingerprint, body_size=len(body))) + body
+def _serve(service: Service, header: wire.Header, frame: bytes, deadline_ns: int) -> bytes:
+    """Answer a request; nothing that a handler raises gets out."""
+    if time.monotonic_ns() > deadline_ns:
+        return _error(header, "late", "the request waited until its deadline")
+    try:
+        request = codec_of(service.request_type).decode(frame, wire.HEADER_SIZE, header.body_size)
+    except MalformedMessage as error:
+        return _error(header, "malformed", str(error))
+    try:
+        answer = service.handler(request)
+        if type(answer) is not service.reply_type:
+            wanted, got = service.reply_type.__name__, type(answer).__name__
+            raise TypeError(f"the handler of {service.name} must return {wanted}, it returned {got}")
+        return _answer(header, wire.REPLY, answer)
+    except Exception as error:
+        logger.exception("the handler of %s raised", service.name)
+        return _error(header, "failed", f"{type(error).__name__}: {error}"[:2000])
 
 
-class Place(NamedTuple):
-    """Where a service is offered."""
-
-    node: int
-    address: str
-    local: bool
-    secure: Callable[[zmq.Socket[bytes]], None] | None
+def _answer(header: wire.Header, kind: bytes, message: Any) -> bytes:
+    codec = codec_of(type(message))
+    body = codec.encode(message, wire.CONTROL_LIMIT)
+    header = header._replace(kind=kind, fingerprint=codec.fingerprint, body_size=len(body))
+    return wire.pack_header(header) + body
 
 
-class Client(Generic[Request, Reply]):
+def _error(header: wire.Header, kind: str, text: str) -> bytes:
+    return _answer(header, wire.ERROR, ServiceError(kind, text))
+
+
+class Client(Closing, Generic[Request, Reply]):
     """Calls a service; made by `Node.client`. Calls from several threads follow one another."""
 
     def __init__(
@@ -182,7 +169,7 @@ class Client(Generic[Request, Reply]):
         name: str,
         request_type: type[Request],
         reply_type: type[Reply],
-        find: Callable[[], Place | None],
+        find: Callable[[], Reach | None],
     ) -> None:
         self.name = name
         self._request_type, self._reply_type = request_type, reply_type
@@ -190,7 +177,7 @@ class Client(Generic[Request, Reply]):
         self._find = find
         self._lock = threading.Lock()
         self._socket: zmq.Socket[bytes] | None = None
-        self._place: Place | None = None
+        self._place: Reach | None = None
         self._source = secrets.randbits(64) or 1
         self._calls = 0
         self._closed = False
@@ -213,9 +200,7 @@ class Client(Generic[Request, Reply]):
         self._check_open()
         if type(request) is not self._request_type:
             raise TypeError(f"{self.name} takes {self._request_type.__name__}, got {type(request).__name__}")
-        body = codec_of(self._request_type).encode(request, CONTROL_LIMIT)
-        if body is None:
-            raise ValueError(f"the request to {self.name} is over the limit of {CONTROL_LIMIT} bytes")
+        body = codec_of(self._request_type).encode(request, wire.CONTROL_LIMIT)
         deadline_s = time.monotonic() + timeout_s
         if not self._lock.acquire(timeout=max(timeout_s, 0.0)):
             self._check_open()
@@ -224,8 +209,8 @@ class Client(Generic[Request, Reply]):
             self._check_open()
             place = self._connect(deadline_s, timeout_s)
             self._calls += 1
-            header = Header(
-                REQUEST,
+            header = wire.Header(
+                wire.REQUEST,
                 self._source,
                 schema_of(self._request_type).fingerprint,
                 self._calls,
@@ -234,7 +219,7 @@ class Client(Generic[Request, Reply]):
                 len(body),
                 self._number,
             )
-            return self._exchange(place, pack_header(header) + body, deadline_s, timeout_s)
+            return self._exchange(place, wire.pack_header(header) + body, deadline_s, timeout_s)
         finally:
             self._lock.release()
 
@@ -253,27 +238,20 @@ class Client(Generic[Request, Reply]):
         if self._closed:
             raise Closed(f"the client of {self.name} was closed")
 
-    def _connect(self, deadline_s: float, timeout_s: float) -> Place:
+    def _connect(self, deadline_s: float, timeout_s: float) -> Reach:
         while (place := self._find()) is None:
             if time.monotonic() >= deadline_s:
                 raise ServiceUnavailable(f"nobody offers {self.name} (waited {timeout_s} s)")
             time.sleep(2e-3)
             self._check_open()
-        if self._socket is None or place != self._place:
+        if (
+            self._socket is None or self._place is None or place[:3] != self._place[:3]
+        ):  # not how it is secured
             self._disconnect()
-            socket = new_socket(zmq.DEALER, tcp=not place.local)
-            socket.linger = 0
-            try:
-                if place.secure is not None:
-                    place.secure(socket)
-                socket.connect(place.address)
-            except BaseException:
-                socket.close(0)
-                raise
-            self._socket, self._place = socket, place
+            self._socket, self._place = place.open(), place
         return place
 
-    def _exchange(self, place: Place, frame: bytes, deadline_s: float, timeout_s: float) -> Reply:
+    def _exchange(self, place: Reach, frame: bytes, deadline_s: float, timeout_s: float) -> Reply:
         socket = self._socket
         assert socket is not None
         socket.send(frame, zmq.DONTWAIT)
@@ -301,19 +279,19 @@ class Client(Generic[Request, Reply]):
         if len(parts) != 1:
             raise MalformedMessage(f"a reply of {len(parts)} frames")
         frame = parts[0]
-        header = unpack_header(frame)
-        check_body(header, len(frame))
+        header = wire.unpack_header(frame)
+        wire.check_body(header, len(frame))
         if header.source != self._source or header.sequence != self._calls:
             return None  # the answer to a call that was given up
-        if header.kind == REPLY:
+        if header.kind == wire.REPLY:
             codec = codec_of(self._reply_type)
             if header.fingerprint != codec.fingerprint:
                 raise MalformedMessage(f"type {header.fingerprint:016x}")
-            reply: Reply = codec.decode(frame, HEADER_SIZE, header.body_size)
+            reply: Reply = codec.decode(frame, wire.HEADER_SIZE, header.body_size)
             return reply
-        if header.kind != ERROR:
+        if header.kind != wire.ERROR:
             raise MalformedMessage(f"kind {header.kind!r}")
-        error = codec_of(ServiceError).decode(frame, HEADER_SIZE, header.body_size)
+        error = codec_of(ServiceError).decode(frame, wire.HEADER_SIZE, header.body_size)
         if error.kind == "late":
             raise ServiceTimeout(f"{self.name}: {error.text}")
         if error.kind in _UNAVAILABLE:
@@ -334,9 +312,3 @@ class Client(Generic[Request, Reply]):
         self._closed = True
         with self._lock:
             self._disconnect()
-
-    def __enter__(self) -> Client[Request, Reply]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

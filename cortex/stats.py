@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 BUCKETS = 40
 """Bucket k counts latencies in [2^(k-1), 2^k) ns; bucket 0 those below 1 ns, the last all over 9 minutes."""
 
@@ -16,7 +14,6 @@ class SubscriberCounters:
     """What one subscriber has seen since it began."""
 
     received: int = 0
-    """Messages handed to the user."""
     lost: int = 0
     """Messages that were published and never arrived: gaps in the sequence."""
     overtaken: int = 0
@@ -38,7 +35,6 @@ class PublisherCounters:
     published: int = 0
     """Messages that `publish` was called with."""
     bytes: int = 0
-    """Bytes of their bodies."""
     timeouts: int = 0
     """Messages that at least one reliable subscriber lost, because it held up the publisher for too long."""
     skipped: int = 0
@@ -64,8 +60,3 @@ def quantile_ns(histogram: Sequence[int], fraction: float) -> float:
             return low + (2.0**bucket - low) * (rank - below) / count
         below += count
     return 2.0 ** (len(histogram) - 1)
-
-
-def array_of(histogram: Sequence[int]) -> np.ndarray:
-    """A histogram as it travels."""
-    return np.array(histogram, np.uint64)

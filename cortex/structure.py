@@ -53,11 +53,6 @@ def finish_class(cls: type, names: tuple[str, ...], shell_init: Callable[..., No
 
     The shell, `__cortex_shell__`, is a subclass of the same layout that may be written to. Filling a shell
     and then changing its class is several times faster than `object.__setattr__` for each field.
-
-    Args:
-        cls: The class.
-        names: Its fields in order.
-        shell_init: Sets all fields, given in order; runs on the shell.
     """
     methods: dict[str, Any] = {"__eq__": _equal, "__hash__": None, "__repr__": _show}
     for name, method in methods.items():
@@ -89,9 +84,9 @@ def is_tensor(value: Any) -> bool:
     return torch is not None and isinstance(value, torch.Tensor)
 
 
-def copy_message(self: _T) -> _T:
+def copy_message(self: Any) -> Any:
     """Return a deep copy of a message that owns its arrays; they are writable and row-major."""
-    return new_message(type(self), [_copy_value(getattr(self, name)) for name in _names_of(self)])
+    return new_message(type(self), [_copy_value(getattr(self, name)) for name in self.__cortex_names__])
 
 
 def _copy_value(value: Any) -> Any:
@@ -104,15 +99,10 @@ def _copy_value(value: Any) -> Any:
     return copy_message(value) if hasattr(value, "__cortex_names__") else value
 
 
-def _equal(self: Any, other: object) -> Any:
+def _equal(self: Any, other: Any) -> Any:
     if type(other) is not type(self):
         return NotImplemented
-    return all(_same(getattr(self, name), getattr(other, name)) for name in _names_of(self))
-
-
-def _names_of(message: Any) -> tuple[str, ...]:
-    names: tuple[str, ...] = message.__cortex_names__
-    return names
+    return all(_same(getattr(self, name), getattr(other, name)) for name in self.__cortex_names__)
 
 
 def _same(left: Any, right: Any) -> bool:

@@ -7,24 +7,26 @@ tasks get a turn after a millisecond. `cortex bench receive` prints what each co
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import select
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from cortex.codec import Codec, MalformedMessage
-from cortex.context import Closed
+from cortex.context import Closed, Closing
 from cortex.fast_receive import NOTHING
 from cortex.intake import DRAIN_MAX, Intake
 from cortex.link import BLOCK_MS, Info, Item, Link
-from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver, Receiver
+from cortex.loop_reader import WAIT_MAX_S, AsyncReceiver
 from cortex.policy import Policy
 from cortex.receive_lock import ReceiveLock
+from cortex.records import SubscriberRecord, SubscriberStats
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
 from cortex.wakeup import Wakeup
@@ -33,6 +35,7 @@ logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
@@ -45,7 +48,19 @@ LEAVING_NS = 2_000_000_000
 """How long the connection to a publisher that has left is kept, for what is still on its way."""
 
 
-class Subscriber(Generic[T]):
+def watch(
+    subscribers: Iterable[Subscriber[Any]], *more: int
+) -> tuple[select.poll, dict[int, Subscriber[Any]]]:
+    """What to wait with for some subscribers, or for `more` descriptors; and whose each descriptor is."""
+    poll, owners = select.poll(), {}
+    for subscriber in subscribers:
+        owners.update(dict.fromkeys((subscriber.wakeup.fd, *subscriber.fds()), subscriber))
+    for fd in (*more, *owners):
+        poll.register(fd, select.POLLIN)
+    return poll, owners
+
+
+class Subscriber(Closing, Generic[T]):
     """Receives the messages of a topic; made by `Node.subscriber`. Methods may be called from any thread."""
 
     def __init__(
@@ -121,8 +136,7 @@ class Subscriber(Generic[T]):
                 self._intake.receive_one()  # descriptors show what comes after a look in vain
             if self._closed or self._queue:
                 return True
-            poll = self._poll or self._new_poll()
-            self._poll = None  # one thread at a time may use it
+            poll = self._take_poll()
         until_ns = monotonic_ns() + round(spin_s * 1e9)
         while not (found := poll.poll(0)) and monotonic_ns() < until_ns:
             os.sched_yield()
@@ -135,24 +149,27 @@ class Subscriber(Generic[T]):
 
     def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
         """Take the next message, and what is known of it; see `recv`."""
-        pair: tuple[T, Info] = self._receive(
-            timeout_s, lambda item: (self._decode(item), item.link.info(item))
-        )
-        return pair
+        return self._receive(timeout_s, lambda item: (self._decode(item), item.link.info(item)))
 
     def recv_raw(self, timeout_s: float | None = None) -> tuple[Info, bytes | np.ndarray, Schema]:
         """Take the next message as the bytes of its body, with its structure; see `recv`."""
 
         def raw(item: Item) -> tuple[Info, bytes | np.ndarray, Schema]:
             body = item.buffer[item.offset : item.offset + item.size]
-            return item.link.info(item), body, item.link.schema()
+            return item.link.info(item), body, item.link.codec.schema
 
-        found: tuple[Info, bytes | np.ndarray, Schema] = self._receive(timeout_s, raw)
-        return found
+        return self._receive(timeout_s, raw)
 
     def __iter__(self) -> Iterator[T]:
         """Messages as they come, until the subscriber is closed. An error ends it not: iterate again."""
-        return Receiver(self.recv)
+        return self
+
+    def __next__(self) -> T:
+        """Take the next message, as `recv` without a timeout."""
+        try:
+            return self.recv()
+        except Closed:
+            raise StopIteration from None
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
@@ -173,9 +190,7 @@ class Subscriber(Generic[T]):
     def _receiver_of_loops(self) -> AsyncReceiver[T]:
         """What serves asyncio, made when wanted: it refers back to us, which delays our end."""
         if self._async_receiver is None:
-            self._async_receiver = AsyncReceiver(
-                self._intake, self.wakeup, self._take_now, self._watched, lambda: self._generation
-            )
+            self._async_receiver = AsyncReceiver(self)
         return self._async_receiver
 
     def _take_now(self) -> Any:
@@ -193,16 +208,15 @@ class Subscriber(Generic[T]):
 
     def _nothing_came(self, timeout_s: float | None) -> TimeoutError:
         """What to raise when no message came in time: if all publishers have another type, that is why."""
+        text = f"{self.topic}: no message within {timeout_s} s"
         if self._mismatch is not None and self.refused and not self._links:
-            error = TimeoutError(
-                f"{self.topic}: no message within {timeout_s} s, because of its type. {self._mismatch}"
-            )
+            error = TimeoutError(f"{text}, because of its type. {self._mismatch}")
             error.__cause__ = self._mismatch
             return error
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
-        return TimeoutError(f"{self.topic}: no message within {timeout_s} s{others}")
+        return TimeoutError(text + others)
 
-    def _receive(self, timeout_s: float | None, use: Callable[[Item], Any]) -> Any:
+    def _receive(self, timeout_s: float | None, use: Callable[[Item], R]) -> R:
         if self.callback is not None:
             raise RuntimeError(f"{self.topic}: the messages of this subscriber go to its callback")
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
@@ -210,7 +224,7 @@ class Subscriber(Generic[T]):
         while True:
             item = self._take(block=left_s >= BLOCK_S)
             if item is not None:
-                result = self._open(item, use)
+                result: R = self._open(item, use)
                 if result is not NOTHING:
                     return result
             if deadline_s is not None:
@@ -223,11 +237,7 @@ class Subscriber(Generic[T]):
                     left_s = deadline_s - time.monotonic()
 
     def _take(self, *, block: bool = False) -> Item | None:
-        """The next item, or None if nothing is there.
-
-        Args:
-            block: Wait up to `BLOCK_S` for a message if there is one socket only.
-        """
+        """The next item if there is one; with `block` and one socket it is waited for up to `BLOCK_S`."""
         with self._lock:
             queue = self._queue
             if self._closed:
@@ -267,19 +277,19 @@ class Subscriber(Generic[T]):
         with self._receive_lock:
             if self._closed or not self._fast_receive.exhausted:
                 return
-            poll = self._poll or self._new_poll()
-            self._poll = None  # one thread at a time may use it
+            poll = self._take_poll()
         for fd, _ in poll.poll(timeout_s * 1000.0):
             if fd == self.wakeup.fd:
                 self.wakeup.clear()
                 return
         self._poll = poll
 
-    def _new_poll(self) -> select.poll:
-        poll = select.poll()
-        poll.register(self.wakeup.fd, select.POLLIN)
-        for link in self._links:
-            for fd in link.fds:
+    def _take_poll(self) -> select.poll:
+        """What to wait with; one thread at a time may use it."""
+        poll, self._poll = self._poll, None
+        if poll is None:
+            poll = select.poll()
+            for fd in (self.wakeup.fd, *(fd for link in self._links for fd in link.fds)):
                 poll.register(fd, select.POLLIN)
         return poll
 
@@ -360,6 +370,19 @@ class Subscriber(Generic[T]):
             if not self._closed and arrived:
                 self.wakeup.set()
 
+    def record(self) -> SubscriberRecord:
+        """What the others are told of it; for the node."""
+        name, fingerprint = (
+            ("", 0) if self.codec is None else (self.codec.schema.name, self.codec.fingerprint)
+        )
+        return SubscriberRecord(self.topic, name, fingerprint, str(self.policy))
+
+    def stats(self) -> SubscriberStats:
+        """What it has counted, as it travels."""
+        counters = dataclasses.asdict(self.counters)
+        latency = np.array(counters.pop("latency"), np.uint64)
+        return SubscriberStats(self.topic, str(self.policy), latency_counts=latency, **counters)
+
     def wait_for_publisher(self, timeout_s: float = 5.0) -> bool:
         """Wait until a publisher has taken this subscriber in; False if none has in time."""
         deadline_s = time.monotonic() + timeout_s
@@ -403,18 +426,21 @@ class Subscriber(Generic[T]):
         with self._receive_lock:
             return {link.source: link.expected for link in self._links if link not in self._leaving}
 
-    def revive(self, source: int) -> bool:
-        """A publisher that had left is back: keep its connection; False if there is none. For the node."""
-        with self._receive_lock:
-            return self._intake.revive(source)
+    def keep(self, source: int, clock_offset_ns: int) -> bool:
+        """Keep the connection to a publisher that is there, or back; False if there is none. For the node.
 
-    def set_clock(self, source: int, offset_ns: int) -> None:
-        """The clock of a publisher's host has moved beside ours; for the node."""
+        Args:
+            source: The publisher's number.
+            clock_offset_ns: What to add to its clock to read it on ours [ns].
+        """
         with self._receive_lock:
-            for link in self._links:
-                if link.source == source and link.clock_offset_ns != offset_ns:
-                    link.clock_offset_ns = offset_ns
+            found = [link for link in self._links if link.source == source]
+            for link in found:
+                self._leaving.pop(link, None)
+                if link.clock_offset_ns != clock_offset_ns:
+                    link.clock_offset_ns = clock_offset_ns
                     self._open_fast_receive()
+            return bool(found)
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node.
@@ -484,9 +510,3 @@ class Subscriber(Generic[T]):
         self.wakeup.set()
         if self._on_close is not None:
             self._on_close(self)
-
-    def __enter__(self) -> Subscriber[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -22,7 +22,6 @@ LAST = 1
 BODY_LIMIT = 1 << 30
 CONTROL_LIMIT = 16 << 20
 
-_HEADER = struct.Struct("<3sBBBHQQQqqQQ")
 _PREFIX = struct.Struct("<3sBBBHQ")
 TAIL = struct.Struct("<QQqqQQ")
 """What follows the prefix: fingerprint, sequence, stamp_ns, publish_ns, body length, aux."""
@@ -59,20 +58,9 @@ def message_head(kind: bytes, source: int, fingerprint: int, *, stamped: bool) -
 
 def pack_header(header: Header) -> bytes:
     """The 64 bytes of a header."""
-    return _HEADER.pack(
-        b"CTX",
-        header.kind[0],
-        VERSION,
-        0 if header.stamp_ns is None else FLAG_STAMP,
-        HEADER_SIZE,
-        header.source,
-        header.fingerprint,
-        header.sequence,
-        header.stamp_ns or 0,
-        header.publish_ns,
-        header.body_size,
-        header.aux,
-    )
+    stamp_ns, *times_and_sizes = header[4:]
+    tail = TAIL.pack(header.fingerprint, header.sequence, stamp_ns or 0, *times_and_sizes)
+    return prefix(header.kind, header.source, stamped=stamp_ns is not None) + tail
 
 
 def unpack_header(frame: bytes | memoryview) -> Header:
@@ -83,32 +71,20 @@ def unpack_header(frame: bytes | memoryview) -> Header:
     """
     if len(frame) < HEADER_SIZE:
         raise MalformedMessage(f"a frame of {len(frame)} bytes is shorter than a header of {HEADER_SIZE}")
-    magic, kind, version, flags, size, source, fingerprint, sequence, stamp, publish, body, aux = (
-        _HEADER.unpack_from(frame)
-    )
+    magic, kind, version, flags, size, source = _PREFIX.unpack_from(frame)
     if magic != b"CTX" or version != VERSION or size != HEADER_SIZE or flags & ~FLAG_STAMP:
         raise MalformedMessage(
             f"not a frame of Cortex {VERSION}: magic {magic!r}, version {version}, flags {flags}, "
             f"header of {size} bytes"
         )
-    return Header(
-        bytes((kind,)),
-        source,
-        fingerprint,
-        sequence,
-        stamp if flags & FLAG_STAMP else None,
-        publish,
-        body,
-        aux,
-    )
+    fingerprint, sequence, stamp_ns, *rest = TAIL.unpack_from(frame, PREFIX_SIZE)
+    return Header(bytes((kind,)), source, fingerprint, sequence, stamp_ns if flags else None, *rest)
 
 
 def control_frame(message: Any, sequence: int = 0, *, source: int = 0, told_ns: int = 0) -> bytes:
     """One control message as a frame of kind `C`; `told_ns` is the time that an `Alive` tells."""
     codec = codec_of(type(message))
     body = codec.encode(message, CONTROL_LIMIT)
-    if body is None:
-        raise ValueError(f"a control message of {codec.size(message)} bytes exceeds {CONTROL_LIMIT}")
     header = Header(CONTROL, source, codec.fingerprint, sequence, None, told_ns, len(body), 0)
     return pack_header(header) + body
 
@@ -187,16 +163,9 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
         return None
     source = int.from_bytes(data[8:16], "little")
     reader, options = _KEY.unpack_from(data, PREFIX_SIZE)
-    return AttachKey(
-        source,
-        reader,
-        bool(options & 1),
-        bool(options & 2),
-        (options >> 8) & 0xFF,
-        options >> 32,
-        bool(options & 4),
-        bool(options & 8),
-    )
+    shared_memory, strict, confirms, confirms_end = (bool(options >> bit & 1) for bit in range(4))
+    limits = (options >> 8) & 0xFF, options >> 32
+    return AttachKey(source, reader, shared_memory, strict, *limits, confirms, confirms_end)
 
 
 def resume_key(source: int, reader: int, sequence: int, *, stamped: bool) -> bytes:

@@ -20,6 +20,7 @@ import neurosim_core as ns
 from neurosim_core import cli
 from neurosim_core.config import SimulationConfig
 from neurosim_core.lazy import homes_of
+from neurosim_core.settings import OfKind, documentation
 
 ROOT = Path(__file__).resolve().parents[1]
 BESIDE = ("cortex/README.md", "cortex/WIRE.md", "cortex_ros2_bridge/README.md")
@@ -93,12 +94,12 @@ def settings_page() -> str:
         for name, field in model.model_fields.items():
             if name == "kind":
                 continue
-            inner = [m for m in models_of(field.annotation) if m not in seen]
+            inner = [m for m in models_of(field.rebuild_annotation()) if m not in seen]
             named = get_origin(field.annotation) is dict
             for choice in inner:
                 seen.add(choice)
                 waiting.append((".".join(filter(None, (place, name, "NAME" if named else ""))), choice))
-            meaning = " ".join((field.description or "").split())
+            meaning = " ".join(documentation(model).get(name, "").split())
             lines.append(f"| `{name}` | {default_of(field)} | {cell(meaning)} |")
     return "\n".join(lines) + "\n"
 
@@ -108,7 +109,9 @@ def models_of(annotation: Any) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     elif get_origin(annotation) is Annotated:
-        yield from models_of(get_args(annotation)[0])
+        kinds = [mark for mark in get_args(annotation)[1:] if isinstance(mark, OfKind)]
+        for choice in kinds[0].choices() if kinds else get_args(annotation)[:1]:
+            yield from models_of(choice)
     elif get_origin(annotation) in (Union, types.UnionType, dict, tuple, list):
         for part in get_args(annotation):
             yield from models_of(part)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import neurosim_core as ns
-from neurosim_core.bench.rotorpy_peer import make_rotorpy_vehicle
+from neurosim_core.bench.dynamics_oracle import make_rotorpy_vehicle
 
 _NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 

@@ -25,9 +25,7 @@ from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
 from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
-from neurosim_core.overrides import add_set_option, read_settings, set_options
-from neurosim_core.scene.reader import SceneReader
-from neurosim_core.settings_file import scene_settings
+from neurosim_core.overrides import add_settings, load_settings, settings_of
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -41,13 +39,14 @@ _PIPED_COLUMNS = 120
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
-    gc.set_threshold(10_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
+    gc.set_threshold(100_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not faulthandler.is_enabled():
         with contextlib.suppress(ValueError, OSError, RuntimeError):  # standard error may be no file
             faulthandler.enable()  # a crash of native code says where it was
     if not sys.stdout.isatty():
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")  # it would look through all that is installed
     began_s = time.perf_counter()
     arguments = _parser().parse_args(argv)
     if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
@@ -128,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_run(commands: _Commands) -> None:
     run = commands.add_parser("run", help="fly, record, and draw a picture of it")
-    _add_settings(run)
+    add_settings(run)
     _add_print_config(run)
     run.add_argument(
         "--out", type=Path, metavar="DIR", help="where to leave the flight (default: ./flight, flight-2, ...)"
@@ -140,14 +139,14 @@ def _add_run(commands: _Commands) -> None:
 
 def _add_serve(commands: _Commands) -> None:
     serve = commands.add_parser("serve", help="simulate for controllers in other processes, over Cortex")
-    _add_settings(serve)
+    add_settings(serve)
     _add_live(serve)
     serve.set_defaults(command=_serve)
 
 
 def _add_fly(commands: _Commands) -> None:
     fly = commands.add_parser("fly", help="the controller that follows the path, as a process of its own")
-    _add_settings(fly)
+    add_settings(fly)
     fly.add_argument("--vehicle", metavar="NAME", help="fly only this one (default: all)")
     fly.add_argument(
         "--mode",
@@ -174,7 +173,7 @@ def _add_fly(commands: _Commands) -> None:
 
 def _add_up(commands: _Commands) -> None:
     up = commands.add_parser("up", help="simulator, controller and viewer together; Ctrl-C ends all")
-    _add_settings(up)
+    add_settings(up)
     _add_live(up)
     up.add_argument(
         "--viewer",
@@ -280,17 +279,6 @@ def _add_gallery(commands: _Commands) -> None:
     gallery.set_defaults(command=_gallery)
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    """What decides about a run."""
-    parser.add_argument(
-        "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
-    )
-    parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
-    parser.add_argument("--seed", type=int, help="seed of the sensor noise")
-    parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
-    add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
-
-
 def _add_print_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
@@ -310,58 +298,13 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace a flight that is already there")
 
 
-def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Settings of the command line, by dotted key.
-
-    Raises:
-        ValueError: One is not KEY=VALUE.
-    """
-    overrides = read_settings(arguments.settings)
-    for key, value in (
-        ("duration_s", arguments.duration),
-        ("seed", arguments.seed),
-        ("device", arguments.device),
-    ):
-        if value is not None:
-            overrides[key] = value
-    return overrides
-
-
-def _options(arguments: argparse.Namespace) -> dict[str, str]:
-    """What the command line calls the keys that it gives a value, for error messages."""
-    names = {
-        "duration_s": "duration",
-        "seed": "seed",
-        "device": "device",
-        "live.real_time_factor": "factor",
-    }
-    given = {key: f"--{name}" for key, name in names.items() if getattr(arguments, name, None) is not None}
-    return set_options(read_settings(arguments.settings)) | given
-
-
-def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """As `_overrides`, with what `_add_live` added."""
-    overrides = _overrides(arguments)
-    if arguments.lockstep:
-        overrides["live.mode"] = "lockstep"
-    if arguments.factor is not None:
-        overrides["live.real_time_factor"] = arguments.factor
-    if arguments.duration is not None:
-        overrides["live.run_on"] = False
-    return overrides
-
-
-def _load(arguments: argparse.Namespace, overrides: dict[str, Any]) -> SimulationConfig:
-    from neurosim_core.config import load_config
-
-    return load_config(arguments.config, overrides=overrides, options=_options(arguments))
-
-
 def _run(arguments: argparse.Namespace) -> int:
-    overrides = _overrides(arguments)
+    from neurosim_core.scene.reader import SceneReader
+    from neurosim_core.settings_file import unchecked_settings
+
     if arguments.print_config:
-        return _print_config(_load(arguments, overrides))
-    with SceneReader(scene_settings(arguments.config, overrides)) as reader:
+        return _print_config(load_settings(arguments))
+    with SceneReader(unchecked_settings(arguments.config, settings_of(arguments))) as reader:
         from rich.console import Console
 
         with (
@@ -371,7 +314,7 @@ def _run(arguments: argparse.Namespace) -> int:
             from neurosim_core.warp_start import start_warp
 
             aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
-            config = _load(arguments, overrides)
+            config = load_settings(arguments)
             from neurosim_core.flight import fly, new_folder
         folder = new_folder(arguments.out, overwrite=arguments.overwrite)
         report = fly(
@@ -392,7 +335,7 @@ def _print_config(config: SimulationConfig) -> int:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    config = _load(arguments, _live_overrides(arguments))
+    config = load_settings(arguments)
     if arguments.print_config:
         return _print_config(config)
     from neurosim_core.live.serve import serve
@@ -402,19 +345,18 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 def _fly(arguments: argparse.Namespace) -> int:
     if arguments.policy is not None:
-        return learn.fly_policy(arguments, _overrides(arguments))
+        return learn.fly_policy(arguments, settings_of(arguments))
     if arguments.save is not None:
         raise ValueError("--save goes with --policy; `neurosim serve --record DIR` records other flights")
     from neurosim_core.live.controller import fly
 
-    overrides = _overrides(arguments)
-    config = _load(arguments, overrides) if arguments.config is not None or overrides else None
+    config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
     with handle_signals(signal.default_int_handler):
         return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
 def _up(arguments: argparse.Namespace) -> int:
-    config = _load(arguments, _live_overrides(arguments))
+    config = load_settings(arguments)
     if arguments.print_config:
         return _print_config(config)
     from neurosim_core.live.up import up

@@ -20,12 +20,7 @@ _SHOWN_MAX = 80
 
 
 def explain(model: type[BaseModel], error: ValidationError) -> list[str]:
-    """Return one line for each error: path of the key, what is allowed, and the value.
-
-    Args:
-        model: What was to be made.
-        error: Why it could not be.
-    """
+    """Return one line for each error: path of the key, what is allowed, and the value."""
     items: list[Mapping[str, Any]] = [*error.errors()]
     # a list of which an item is wrong is also said to be too short, and one that is too short to lack items
     items = list(_of_choices(model, items))
@@ -49,11 +44,8 @@ def describe_errors(
 ) -> str:
     """Return the text of an error: each error by the name that the user gave its key.
 
-    Args:
-        origin: What the settings are from.
-        errors: Lines that begin with a dotted key.
-        options: Names of keys that were given otherwise.
-        given: What is in the settings without these.
+    `errors`: lines that begin with a dotted key. `options`: names of keys that were given otherwise. `given`:
+    what is in the settings without these.
     """
     lines = dict.fromkeys(_by_option(line, options, given) for line in errors)
     elsewhere = any(line in errors for line in lines)

@@ -32,12 +32,7 @@ def _port(text: str) -> int:
 
 
 def _docs(arguments: argparse.Namespace) -> int:
-    """Build the site or serve it; a warning is an error.
-
-    Raises:
-        FileNotFoundError: The package lies outside of a checkout, which has the documents.
-        ImportError: The generator is not installed.
-    """
+    """Build the site or serve it; a warning is an error."""
     if not (ROOT / "mkdocs.yml").is_file():
         raise FileNotFoundError(f"no documents beside {ROOT / 'neurosim_core'}: they are in a checkout")
     if importlib.util.find_spec("mkdocstrings") is None or importlib.util.find_spec("material") is None:

@@ -21,8 +21,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.flight_report import FlightReport, print_plan, print_report
-from neurosim_core.io import is_event_file
-from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
@@ -33,23 +31,14 @@ from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.rollout import run_model, warm_flight
 from neurosim_core.sim.state import make_state
 from neurosim_core.sinks import SinkConfig, Sinks
-from neurosim_core.view.film import SUFFIXES as FILMS
-from neurosim_core.view.film import save_film
-from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
-from neurosim_core.view.rerun_shapes import scene_shapes
 from neurosim_core.warp_start import has_kernels
 
 
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
     """Return the folder for a new flight; `fly` makes it once there is something to put in it.
 
-    Args:
-        out: Where the user wants it; None: ./flight, or ./flight-2, ... if there is one already.
-        overwrite: Replace a flight that is already in `out`.
-
-    Raises:
-        FileExistsError: `out` holds a flight and may not be overwritten.
+    `out`: where the user wants it; None: ./flight, or ./flight-2, ... if there is one already. `overwrite`:
+    replace a flight that is already in `out`.
     """
     if out is None:
         names = (Path("flight" if number == 1 else f"flight-{number}") for number in itertools.count(1))
@@ -108,6 +97,7 @@ def fly(
             highlight=False,
         )
     with _new_folder(folder), console.status("preparing") as status:
+        settings = to_yaml(config, comments=True)  # while another process reads the scene
         model = make_model(
             config,
             scene=scene,
@@ -118,7 +108,7 @@ def fly(
         state = make_state(model)
         packets = run_model(model, state)
         first = next(packets, None)  # builds all kernels; there is none without sensors
-        (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
+        (folder / "config.yaml").write_text(settings, encoding="utf-8")
     report.setup_s = time.perf_counter() - began_s
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
@@ -173,14 +163,14 @@ def fly(
 def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     """Return the Rerun file of a flight; write it from the recording if there is none, or to `save` if given.
 
-    Args:
-        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
-        save: Write here.
-
-    Raises:
-        FileNotFoundError: There is no flight.
-        ImportError: Rerun or h5py is not installed.
+    `flight`: the folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
     """
+    from neurosim_core.io import is_event_file
+    from neurosim_core.io.transfer import as_recording
+    from neurosim_core.view.rerun_log import RerunLogger
+    from neurosim_core.view.rerun_sdk import open_rerun
+    from neurosim_core.view.rerun_shapes import scene_shapes
+
     recorded = flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
     # events.raw and events.csv may be different events: each has a Rerun file of its own
     is_flight = recorded.suffix in (".h5", ".rrd")
@@ -219,9 +209,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
 def header_of(model: Model, config: SimulationConfig | None = None) -> RecordingHeader:
     """Return what goes with the packets of a flight.
 
-    Args:
-        model: What is flown.
-        config: Settings that hold in place of those of the model.
+    `config`: settings that hold in place of those of the model.
     """
     config = model.config if config is None else config
     stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
@@ -240,16 +228,12 @@ def header_of(model: Model, config: SimulationConfig | None = None) -> Recording
 def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]:
     """Give what takes the packets of a flight, and write them to a file at the end.
 
-    Args:
-        file: A recording (.h5), or a film of it (.webp, .gif).
-        model: What is flown.
-
-    Raises:
-        ValueError: The file is neither, or a film has nothing to show.
-        OSError: The file cannot be written.
+    `file`: a recording (.h5), or a film of it (.webp, .gif).
     """
-    if file.suffix not in (".h5", *FILMS):
-        raise ValueError(f"a flight is saved to a file that ends in .h5, {' or '.join(FILMS)}, got {file}")
+    from neurosim_core.view.film import SUFFIXES, save_film
+
+    if file.suffix not in (".h5", *SUFFIXES):
+        raise ValueError(f"a flight is saved to a file that ends in .h5, {' or '.join(SUFFIXES)}, got {file}")
     with tempfile.TemporaryDirectory() as folder:
         recording = file if file.suffix == ".h5" else Path(folder) / "flight.h5"
         with RecordingWriter(recording, header_of(model)) as writer:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from typing import Any
 
 
 def install_hint(extra: str) -> str:
     """Return the command that installs the libraries of an extra of pyproject.toml."""
     return f"pip install -e '.[{extra}]' in the folder of Neurosim"
+
+
+def need(what: str, extra: str, *modules: str) -> Any:
+    """Import modules of optional libraries, and return the first; `what` needs them, as the error says."""
+    try:
+        found = [importlib.import_module(module) for module in modules]
+    except ImportError as error:
+        raise ImportError(f"{what}: {install_hint(extra)}") from error
+    return found[0]
 
 
 def check_cortex() -> None:

@@ -13,8 +13,7 @@ from typing import Any
 def homes_of(file: str) -> dict[str, tuple[str, str]]:
     """Return module and name there of each name that a package imports under `if TYPE_CHECKING:`.
 
-    Args:
-        file: `__file__` of the package.
+    `file`: `__file__` of the package.
     """
     tree = ast.parse(Path(file).read_text(encoding="utf-8"))
     (block,) = (

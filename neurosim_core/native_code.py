@@ -15,11 +15,9 @@ _INCLUDE = re.compile(r'^#include "([^"]+)"$', re.MULTILINE)
 def read_native(module_file: str, name: str, **constants: bool | int) -> str:
     """Return the body of a native function.
 
-    Args:
-        module_file: `__file__` of the module that declares the function.
-        name: Name of the file in `native/` beside it, without `.cuh`. A line `#include "other.cuh"` stands
-            for the text of another file of that folder.
-        constants: Compile-time constants that the body uses, declared before it.
+    `module_file`: `__file__` of the module that declares the function. `name`: name of the file in `native/`
+    beside it, without `.cuh`. A line `#include "other.cuh"` stands for the text of another file of that
+    folder. `constants`: compile-time constants that the body uses, declared before it.
     """
     folder = Path(module_file).parent / "native"
 

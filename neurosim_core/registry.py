@@ -12,7 +12,6 @@ In a script, importing or defining the class before the settings are loaded is e
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import logging
 import pkgutil
 import sys
@@ -123,9 +122,11 @@ def load_plugins() -> None:
     if _loaded:
         return
     _loaded = True
+    from importlib.metadata import entry_points  # which is slow to import, and few runs need
+
     for module in (module for seam in SEAMS for module in _own_modules(seam).values()):
         importlib.import_module(module)
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
         before = {seam: dict(table) for seam, table in _tables.items()}
         try:
             entry.load()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,11 @@ def nest(key: str, value: Any) -> dict[str, Any]:
     return dict(nested)
 
 
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the groups that dotted keys make together."""
+    return functools.reduce(merge, (nest(key, value) for key, value in settings.items()), {})
+
+
 def merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
     """Return `base` with the keys of `patch`; a group of another kind replaces the one it meets."""
     if "kind" in patch and patch["kind"] != base.get("kind"):
@@ -87,8 +93,8 @@ def beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     return raw
 
 
-def scene_settings(source: Path | None, overrides: Mapping[str, Any]) -> Any:
-    """Return what a file and the keys that win over it say of the scene; arguments as for `load_config`.
+def unchecked_settings(source: Path | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file and the keys that win over it say; arguments as for `load_config`.
 
     Raises:
         ConfigError: The file cannot be read, or is not YAML.
@@ -98,7 +104,7 @@ def scene_settings(source: Path | None, overrides: Mapping[str, Any]) -> Any:
         raw = merge(raw, nest(key, value))
     if source is not None:
         raw = beside(raw, source.resolve().parent)
-    return raw.get("scene", {})
+    return raw
 
 
 def _in_one_line(error: yaml.YAMLError) -> str:

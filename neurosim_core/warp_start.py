@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
 import functools
 import hashlib
 import os
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
 _NO_CUDA = ("NVIDIA CUDA driver", "no CUDA-capable device")
 """What Warp writes where there is no driver, and where there is no device."""
+_COMPILE_S = 120.0
+"""After this a process that compiles kernels is no longer waited for."""
 _owner: int | None = None
 """Process that was the first to compute."""
 
@@ -23,9 +29,6 @@ def start_warp() -> None:
     The line about a CUDA driver or device that is missing, or hidden by CUDA_VISIBLE_DEVICES, is written by
     native code straight to the standard error stream: the stream is held back while Warp starts, and what
     else was written to it is written again.
-
-    Raises:
-        RuntimeError: This process was forked from one that had computed.
     """
     started = _owner is not None
     refuse_forked_process()
@@ -44,12 +47,45 @@ def start_warp() -> None:
         held.seek(0)
         lines = held.read().decode(errors="replace").splitlines(keepends=True)
     sys.stderr.write("".join(line for line in lines if not any(known in line for known in _NO_CUDA)))
-    wp._src.context.runtime.get_clang_pch_dir = _header_folder  # type: ignore[attr-defined]
+    context: Any = wp._src.context
+    context.runtime.get_clang_pch_dir = _header_folder
+    context.Module._compile = _compile_once(context.Module._compile)
 
 
 def has_kernels() -> bool:
     """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
     return any(Path(str(wp.config.kernel_cache_dir)).glob("wp_neurosim_core.*"))
+
+
+def _compile_once(compile_module: Callable[..., bool]) -> Callable[..., bool]:
+    """Return a function that compiles a module; while another process does so, it waits for that instead.
+
+    Simulators, tests or ranks of a training that start at once on a new machine need the same kernels.
+    """
+
+    @functools.wraps(compile_module)
+    def compile_or_wait(module: Any, device: Any, folder: Any, *arguments: Any, **options: Any) -> bool:
+        if Path(str(folder)).is_dir():  # it is there, maybe in a cache that is not ours to write
+            return compile_module(module, device, folder, *arguments, **options)
+        locks = Path(str(wp.config.kernel_cache_dir), "locks")
+        locks.mkdir(parents=True, exist_ok=True)
+        with open(locks / Path(str(folder)).name, "a") as lock:
+            _await_lock(lock.fileno())  # it is free when the file is closed, or the process ends
+            return compile_module(module, device, folder, *arguments, **options)
+
+    return compile_or_wait
+
+
+def _await_lock(file: int) -> None:
+    """Lock a file; give up where there are no locks, or the process that has it seems to be stopped."""
+    deadline_s = time.monotonic() + _COMPILE_S
+    while time.monotonic() < deadline_s:
+        try:
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.01)
+        except OSError:  # of a file system without locks
+            return
 
 
 def _header_folder() -> str:
@@ -72,11 +108,7 @@ def _header_version() -> str:
 
 
 def refuse_forked_process() -> None:
-    """Refuse to compute in a process that was forked after Warp had started: it would wait forever.
-
-    Raises:
-        RuntimeError: It was; threads and CUDA contexts of the parent do not exist in it.
-    """
+    """Refuse to compute in a process that was forked after Warp had started: it would wait forever."""
     global _owner
     if _owner is None:
         _owner = os.getpid()

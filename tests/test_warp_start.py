@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
+import shutil
 import subprocess
 import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import warp as wp
 
+from neurosim_core import warp_start
 from neurosim_core.warp_start import has_kernels, start_warp
 
 
@@ -67,3 +72,34 @@ def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch
     thread.join()
     assert first
     assert headers() == first
+
+
+def test_who_needs_the_same_kernels_waits_for_who_compiles_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    folder = tmp_path / "wp_module_0123"
+
+    def compile_module(module, device, folder):
+        if folder.exists():
+            return False
+        time.sleep(0.05)  # long enough for all others to begin
+        folder.mkdir()
+        return True
+
+    compile_or_wait = warp_start._compile_once(compile_module)
+    with ThreadPoolExecutor(4) as pool:
+        compiled = list(pool.map(lambda _: compile_or_wait(None, "cpu", folder), range(4)))
+    assert sorted(compiled) == [False, False, False, True]
+    shutil.rmtree(tmp_path / "locks")
+    assert not compile_or_wait(None, "cpu", folder)
+    assert not (tmp_path / "locks").exists()  # what is compiled may lie in a cache that is not to be written
+
+
+def test_a_process_that_stands_still_holds_up_nobody_for_ever(tmp_path, monkeypatch):
+    """It has the lock of what it compiles."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(warp_start, "_COMPILE_S", 0.05)
+    (tmp_path / "locks").mkdir()
+    compile_or_wait = warp_start._compile_once(lambda module, device, folder: True)
+    with open(tmp_path / "locks" / "wp_module_0123", "a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert compile_or_wait(None, "cpu", tmp_path / "wp_module_0123")

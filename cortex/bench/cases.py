@@ -104,7 +104,7 @@ def _raw(frames: int, kind: Kind = "flood", **options: Any) -> Contestant:
 
 
 _ROS = (Contestant("Cyclone DDS", "Cyclone DDS"), Contestant("rclpy", "rclpy"))
-_COPIES = (Contestant("copy, private", kind="copy"), Contestant(_RING, "", {"ring": True}, "copy"))
+_COPY = Contestant(_RING, kind="copy")
 _PING = _cortex(kind="roundtrip")
 
 
@@ -163,9 +163,9 @@ CASES: tuple[Case, ...] = (
     Case("medium", "39 kB through shared memory, callback", FLOATS["39k"],
          (_cortex(), _raw(1), _raw(2), *_ROS), (_over(2.0, _RAW1, _RAW2),)),
     Case("large", "0.9 MB through shared memory, callback", FLOATS["900k"],
-         (_cortex(), _raw(1), _raw(2), *_COPIES), (_over(3.0, _RAW1, _RAW2), _over(0.7, _RING))),
+         (_cortex(), _raw(1), _raw(2), _COPY), (_over(3.0, _RAW1, _RAW2), _over(0.7, _RING))),
     Case("huge", "23.7 MB through shared memory, as a view, callback", FLOATS["23.7M"],
-         (_cortex(), _raw(2), *_COPIES),
+         (_cortex(), _raw(2), _COPY),
          (_over(0.85, _RING), _over(1.8, _RAW2)), bound=1.0),
     Case("consume", "23.7 MB, the subscriber copies every byte out", FLOATS["23.7M"],
          (_cortex(consume=True), _raw(2, consume=True)), (_over(1.0, _RAW2),)),

@@ -33,16 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; return the exit status (2: wrong arguments)."""
     parser = argparse.ArgumentParser("cortex bench", description="Cortex beside its peers on this machine.")
     add = parser.add_argument
-    add(
-        "case",
-        nargs="*",
-        help="cases to run, all by default; `tcp` stands for every `tcp-…`; a wrong name lists them",
-    )
+    cases = "cases to run, all by default; `tcp` stands for every `tcp-…`; a wrong name lists them"
+    add("case", nargs="*", help=cases)
     add("--repeats", type=int, default=9, help="repetitions of each contestant (9)")
     add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
-    add(
-        "--against", type=Path, metavar="CHECKOUT", help="measure Cortex of this checkout (built) beside ours"
-    )
+    against = "measure Cortex of this checkout (built) beside ours"
+    add("--against", type=Path, metavar="CHECKOUT", help=against)
     add("--quick", action="store_true", help="tiny runs: shows that it works, measures nothing")
     add("--csv", type=Path, metavar="FILE", help="write every figure there, too")
     options = parser.parse_args(arguments)
@@ -57,19 +53,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> list[CaseResult]:
-    """Run the cases, each printed when it is over."""
     cases = choose(options.case)
     if options.against is not None:
         cases = [case.beside(str(options.against.resolve())) for case in cases]
-    if options.repeats < 1 or not 0.0 < options.seconds <= 600.0:  # also refuses nan
-        raise ValueError(
-            f"wants repeats >= 1 and 0 < seconds <= 600, got {options.repeats}, {options.seconds}"
-        )
-    settings = Settings(
-        repeats=min(options.repeats, _QUICK_REPEATS) if options.quick else options.repeats,
-        seconds=min(options.seconds, _QUICK_SECONDS) if options.quick else options.seconds,
-        count_max=_QUICK_COUNT if options.quick else 0,
-    )
+    repeats, seconds = options.repeats, options.seconds
+    if repeats < 1 or not 0.0 < seconds <= 600.0:  # also refuses nan
+        raise ValueError(f"wants repeats >= 1 and 0 < seconds <= 600, got {repeats}, {seconds}")
+    settings = Settings(repeats, seconds)
+    if options.quick:
+        settings = Settings(min(repeats, _QUICK_REPEATS), min(seconds, _QUICK_SECONDS), _QUICK_COUNT)
     results: list[CaseResult] = []
     with ExitStack() as stack:
         _make_place(stack, options.against)

@@ -24,7 +24,6 @@ from cortex.bench import roles
 from cortex.bench.cases import METRICS, Bar, Case, Contestant
 from cortex.bench.peers import Job, missing
 from cortex.bench.processes import Child, ChildFailed
-from cortex.bench.tally import make_payloads
 
 _SHM = Path("/dev/shm")
 _GRACE_S = 120.0
@@ -96,9 +95,8 @@ class Verdict(NamedTuple):
     @property
     def is_open(self) -> bool:
         """Whether the bar lies between the quartiles: more repetitions might give another verdict."""
-        return bool(
-            self.measured and not self.note and self.measured.low < self.bar.bound < self.measured.high
-        )
+        found = None if self.note else self.measured
+        return found is not None and found.low < self.bar.bound < found.high
 
 
 def judge(bar: Bar, results: dict[str, list[Report]]) -> Verdict:
@@ -145,13 +143,12 @@ def run_case(case: Case, settings: Settings) -> CaseResult:
 
 
 def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str, Any]:
-    """Do one repetition in a directory of its own; a failure becomes the report's ``error``."""
     runs: dict[str, Callable[..., dict[str, Any]]] = {
         "flood": partial(_flood, subscribers=case.subscribers),
         "roundtrip": _round_trips,
         "copy": _copies,
-        "publisher dies": _publisher_dies,
-        "reader dies": _reader_dies,
+        "publisher dies": partial(_dies, reader_dies=False),
+        "reader dies": partial(_dies, reader_dies=True),
     }
     with tempfile.TemporaryDirectory(dir=os.environ["CORTEX_BENCH_DIR"], prefix="r") as folder:
         job = Job(
@@ -200,29 +197,23 @@ def _round_trips(job: Job, child: Callable[..., Child]) -> Any:
         return report
 
 
-def _publisher_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
+def _dies(job: Job, child: Callable[..., Child], *, reader_dies: bool) -> dict[str, float]:
+    """Kill one side under load; how long the other takes to know."""
     job = replace(job, seconds=_GRACE_S)
-    with child(roles.publish, job) as publisher, child(roles.await_death, job) as reader:
+    sender, receiver = (
+        (roles.publish_until_freed, roles.stop_reading) if reader_dies else (roles.publish, roles.await_death)
+    )
+    with child(sender, job) as publisher, child(receiver, job) as reader:
         reader.expect([publisher])
         publisher.tell("go")
         time.sleep(_LOADED_S)
-        killed_ns = publisher.kill()
-        return {"known_ms": (reader.expect() - killed_ns) / 1e6}
-
-
-def _reader_dies(job: Job, child: Callable[..., Child]) -> dict[str, float]:
-    with child(roles.publish_until_freed, job) as publisher, child(roles.stop_reading, job) as reader:
-        reader.expect([publisher])
-        publisher.tell("go")
-        time.sleep(_LOADED_S)
-        killed_ns = reader.kill()
-        return {"known_ms": (publisher.expect() - killed_ns) / 1e6}
+        killed, other = (reader, publisher) if reader_dies else (publisher, reader)
+        killed_ns = killed.kill()
+        return {"known_ms": (other.expect() - killed_ns) / 1e6}
 
 
 def _copies(job: Job, child: Callable[..., Child]) -> Any:
-    """Copy into a private array, or into a ring."""
-    ring = roles.make_ring(job) if job.options else [np.zeros(job.floats, np.float32)]
-    with child(roles.copy, (job.seconds, list(make_payloads(job.floats)), ring)) as copier:
+    with child(roles.copy, job) as copier:
         copier.expect()
         copier.tell("go")
         return copier.expect()

@@ -26,7 +26,6 @@ class Sample:
 
 
 _NODES: list[Node] = []
-"""This process's node, once it is made."""
 
 
 def _node(job: Job, *, listens: bool) -> Node:

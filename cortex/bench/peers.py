@@ -42,9 +42,7 @@ class Job:
     """One repetition of one contestant, as its processes see it."""
 
     peer: str
-    """Key of `cortex.bench.peers.PEERS`."""
     floats: int
-    """Items of the float32 payload."""
     seconds: float = 0.5
     """How long to publish [s], if ``count`` is 0."""
     count: int = 0
@@ -52,9 +50,7 @@ class Job:
     options: Mapping[str, Any] = field(default_factory=dict)
     """What the peer wants to know besides: policy, way of receiving, and so on."""
     folder: Path = Path()
-    """Private directory of this repetition."""
     port: int = 0
-    """A free port."""
 
     @property
     def payload_bytes(self) -> int:
@@ -81,7 +77,6 @@ class Peer(NamedTuple):
     """Hands each message of a topic to the handler until that raises `Finished`, in the way of receiving that
     the last argument names, if there are several."""
     needs: str = ""
-    """A module that has to be importable."""
     close: Callable[[], object] = lambda: None
     """Lets what was sent last arrive."""
 

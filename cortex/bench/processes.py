@@ -21,7 +21,6 @@ _FORK = multiprocessing.get_context("fork")
 _PR_SET_PDEATHSIG = 1
 
 Role = Callable[[Any, Any], None]
-"""What a child does, given its end of the pipe and its job."""
 
 
 class ChildFailed(RuntimeError):
@@ -29,13 +28,7 @@ class ChildFailed(RuntimeError):
 
 
 class Child:
-    """A forked process that runs ``role(pipe, job)``; leaving the `with` block ends it and all it started.
-
-    Args:
-        role: Runs in the child.
-        job: Its second argument.
-        deadline_s: From now; later a wait for it fails.
-    """
+    """A forked process that runs ``role(pipe, job)``; leaving the `with` block ends it and all it started."""
 
     def __init__(self, role: Role, job: Any, *, deadline_s: float) -> None:
         self._deadline = time.monotonic() + deadline_s
@@ -54,9 +47,6 @@ class Child:
 
     def expect(self, beside: Sequence[Child] = ()) -> Any:
         """Return the child's next report.
-
-        Args:
-            beside: Children whose failure ends the wait as well.
 
         Raises:
             ChildFailed: The child, or one beside it, failed or died, or the deadline passed.
@@ -93,6 +83,7 @@ class Child:
         self._process.join(2.0 if kind is None else 0.0)
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
+        self._process.kill()  # it may have no group of its own yet
         self._process.join()
         self._pipe.close()
 

@@ -27,9 +27,8 @@ def print_header() -> None:
         except importlib.metadata.PackageNotFoundError:
             versions.append(f"{name} not installed")
     load = " ".join(f"{value:.2f}" for value in os.getloadavg())
-    system = f"{platform.system()} {platform.release()}"
     print(f"cortex bench, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}")
-    print(f"{os.cpu_count()} cores, {_processor()}, {system}, load {load}")
+    print(f"{os.cpu_count()} cores, {_processor()}, {platform.system()} {platform.release()}, load {load}")
     print(", ".join(versions))
 
 
@@ -37,15 +36,11 @@ def print_case(result: CaseResult) -> None:
     """Print what each contestant of a case did."""
     case = result.case
     print(f"{case.name}: {case.title}; payload {4 * case.floats:,} B")
-    rows = [
-        (
-            name,
-            *(_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics),
-            faults_of(reports),
-        )
-        for name, reports in result.reports.items()
-    ]
-    for line in table(("", *(METRICS[metric].text for metric in case.metrics), "<"), rows, indent="  "):
+    rows = []
+    for name, reports in result.reports.items():
+        cells = (_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics)
+        rows.append((name, *cells, faults_of(reports)))
+    for line in table(("", *(METRICS[metric].text for metric in case.metrics), "<"), rows):
         print(line)
     print(flush=True)
 
@@ -61,10 +56,8 @@ def print_summary(results: list[CaseResult], *, judged: bool) -> None:
     if words:
         for line in table(("case", "<what", "measured", "<bar", "<verdict"), rows):
             print(line)
-    counts = {
-        word: sum(w.startswith(word) for w in words)
-        for word in ("met", "missed", "not measured", "not judged")
-    }
+    known = ("met", "missed", "not measured", "not judged")
+    counts = {word: sum(each.startswith(word) for each in words) for word in known}
     print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
 
 

@@ -12,16 +12,7 @@ from typing import Any
 import numpy as np
 
 from cortex.bench.peers import PATIENCE_S, PONG_FLOATS, Job, Peer, Send, peer_of
-from cortex.bench.tally import (
-    END,
-    WARM,
-    Finished,
-    Floats,
-    Handler,
-    Tally,
-    make_payloads,
-    resident_kb,
-)
+from cortex.bench.tally import END, WARM, Finished, Floats, Handler, Tally, make_payloads, resident_kb
 
 _WARM_PINGS = 20
 _WARM_S = 0.005
@@ -164,29 +155,23 @@ def await_death(pipe: Any, job: Job) -> None:
     peer.receive(job, "flood", tally.handler(), "callback")
 
 
-def copy(pipe: Any, job: tuple[float, list[Floats], list[Floats]]) -> None:
-    """Copy arrays in turn into others, again and again for some seconds, once told to go."""
-    seconds, sources, targets = job
-    for k in range(max(len(sources), len(targets))):  # touches every page before the clock starts
-        np.copyto(targets[k % len(targets)], sources[k % len(sources)])
+def copy(pipe: Any, job: Job) -> None:
+    """Copy payloads in turn into the slots of a ring, again and again for the job's time, once told to go."""
+    stride = -(-job.payload_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    memory = np.frombuffer(mmap.mmap(-1, stride * job.slots), np.float32)
+    memory[:] = 0.0  # touches every page before the clock starts
+    sources = make_payloads(job.floats)
+    targets = [memory[k * stride // 4 :][: job.floats] for k in range(job.slots)]
     pipe.send("ready")
     pipe.recv()
     copied = 0
     begin = now = time.perf_counter()
-    while now - begin < seconds:
-        for _ in range(max(1, min(64, 250_000 // len(sources[0])))):
+    while now - begin < job.seconds:
+        for _ in range(max(1, min(64, 250_000 // job.floats))):
             np.copyto(targets[copied % len(targets)], sources[copied % len(sources)])
             copied += 1
         now = time.perf_counter()
     pipe.send({"rate": copied / (now - begin), "sent": copied, "received": copied})
-
-
-def make_ring(job: Job) -> list[Floats]:
-    """Return the slots of a mapping that forked children share, each at the start of a page, all touched."""
-    stride = -(-job.payload_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
-    memory = np.frombuffer(mmap.mmap(-1, stride * job.slots), np.float32)
-    memory[:] = 0.0
-    return [memory[k * stride // 4 :][: job.floats] for k in range(job.slots)]
 
 
 def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> None:
@@ -195,7 +180,6 @@ def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> Non
 
 
 def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> tuple[int, int]:
-    """Send the payloads in turn; return how many, and by how much memory grew after the first tenth [kB]."""
     pairs = max(1, min(32, 500_000 // job.payload_bytes))
     sent = settled_kb = 0
     begin = time.perf_counter()

@@ -52,16 +52,11 @@ class Tally:
         self._connected = connected
         self._is_connected = False
         self._marks: list[tuple[int, float]] = []
-        """Messages received and the time, at the first check and at the last."""
         self._settle_at = settle_at
         self._settled_kb = 0
 
     def handler(self, *, consume: bool = False) -> Handler:
-        """Return the function to call with each message's sequence and payload.
-
-        Args:
-            consume: It also copies every byte of the payload out.
-        """
+        """Return the function to call with each message's sequence and payload."""
         expected = 0
         mask = self._mask
         check = self._check

@@ -11,9 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import zmq
 
@@ -28,7 +28,6 @@ from cortex.security import PUBLIC_FILE, default_directory, load_keys
 _FILES_MIN = 1024
 _EXCHANGE_S = 20.0
 _CLOCK_S = 18.0
-"""Longest wait for an estimate of the drift of the clock [s]."""
 
 
 class Fault(Exception):
@@ -161,28 +160,25 @@ def _check_exchange() -> str:
     from cortex.node import Node
     from cortex.policy import reliable
 
-    with tempfile.TemporaryDirectory(prefix="cortex-doctor-") as directory:
-        root = str(Path(__file__).resolve().parents[2])
-        path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-        before = {name: os.environ.pop(name, None) for name in _ENVIRONMENT}
-        os.environ.update(CORTEX_RUNTIME_DIR=directory, CORTEX_DOMAIN="0")
-        command = [sys.executable, "-c", "from cortex.commands.doctor import publish; publish()"]
-        try:
-            with (
-                Node("doctor") as node,
-                node.subscriber("/doctor", Sample, policy=reliable()) as subscriber,
-                subprocess.Popen(
-                    command, env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.PIPE
-                ) as child,
-            ):
-                try:
-                    sizes = [len(each.data) for each in _receive(subscriber)]
-                    carriers = subscriber.carriers
-                finally:
-                    child.kill()
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+    before = {name: os.environ.pop(name, None) for name in _ENVIRONMENT}
+    command = [sys.executable, "-c", "from cortex.commands.doctor import publish; publish()"]
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))))
+    try:
+        with tempfile.TemporaryDirectory(prefix="cortex-doctor-") as directory, ExitStack() as stack:
+            os.environ.update(CORTEX_RUNTIME_DIR=directory, CORTEX_DOMAIN="0")
+            node = stack.enter_context(Node("doctor"))
+            subscriber = stack.enter_context(node.subscriber("/doctor", Sample, policy=reliable()))
+            environment = {**os.environ, "PYTHONPATH": path}
+            child = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE)
+            stack.enter_context(child)
+            stack.callback(child.kill)
+            sizes = [len(subscriber.recv(_EXCHANGE_S).data) for _ in _SIZES]
+            carriers = subscriber.carriers
+    except TimeoutError:
+        raise Fault(f"nothing came of another process within {_EXCHANGE_S:.0f} s") from None
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
     if sizes != _SIZES:
         raise Fault(f"messages of {_SIZES} bytes were sent, {sizes} have come")
     if sys.platform == "linux" and not any("shared memory" in carrier for carrier in carriers):
@@ -192,14 +188,6 @@ def _check_exchange() -> str:
 
 _ENVIRONMENT = ("CORTEX_RUNTIME_DIR", "CORTEX_DOMAIN", *NETWORK_VARIABLES)
 _SIZES = [10, 1_000_000]
-
-
-def _receive(subscriber: Any) -> Iterator[Sample]:
-    for _ in _SIZES:
-        try:
-            yield subscriber.recv(_EXCHANGE_S)
-        except TimeoutError:
-            raise Fault(f"nothing came of another process within {_EXCHANGE_S:.0f} s") from None
 
 
 def publish() -> None:

@@ -49,12 +49,9 @@ def record(options: argparse.Namespace) -> int:
     _report(options.output, stats)
     if stats.written:
         return 0
-    hint(f"cortex record: nothing was recorded: no message of {_any_of(options.topic)} has come")
+    topics = " or ".join(options.topic) or "any topic"
+    hint(f"cortex record: nothing was recorded: no message of {topics} has come")
     return 1
-
-
-def _any_of(topics: list[str]) -> str:
-    return " or ".join(topics) if topics else "any topic"
 
 
 def _wait_for_end(
@@ -116,10 +113,6 @@ def play(options: argparse.Namespace) -> int:
             open_node(options) as node,
             Player(node, log, topics=options.topic or None, remap=remap) as player,
         ):
-            if options.paused:
-                player.pause()
-                threading.Thread(target=_toggle_on_enter, args=(player,), daemon=True).start()
-                hint("paused; Enter goes on and pauses again")
             progress = threading.Thread(target=_show_progress, args=(player, log), daemon=True)
             progress.start()
             status = 0
@@ -132,12 +125,11 @@ def play(options: argparse.Namespace) -> int:
             finally:
                 player.stop()
                 progress.join(1.0)
-            hint(f"{number_of(player.published, 'message')} played" + _lateness(player, options.rate))
+            late = (
+                f"; the latest was {seconds(player.late_ns * 1e-9)} late" if options.rate < math.inf else ""
+            )
+            hint(f"{number_of(player.published, 'message')} played{late}")
     return status
-
-
-def _lateness(player: Player, rate: float) -> str:
-    return f"; the latest was {seconds(player.late_ns * 1e-9)} late" if rate != math.inf else ""
 
 
 def _describe(log: Log) -> None:
@@ -158,17 +150,11 @@ def _split(pair: str) -> tuple[str, str]:
     return old, new
 
 
-def _toggle_on_enter(player: Player) -> None:
-    for _ in sys.stdin:
-        (player.resume if player.paused else player.pause)()
-
-
 def _show_progress(player: Player, log: Log) -> None:
     if not sys.stderr.isatty():
         return
     while not player.wait_stopped(_TICK_S):
-        state = "  paused" if player.paused else ""
         played = number_of(player.published, "message")
-        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {played}{state}"
+        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {played}"
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
     print("\r\x1b[K", end="", file=sys.stderr, flush=True)

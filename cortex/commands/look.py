@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from cortex.commands.session import CommandError, hint, look_around, say_empty
-from cortex.commands.text import bytes_of, entries, is_terminal, number_of, plain, rate, seconds, table
+from cortex.commands.text import bytes_of, number_of, plain, rate, seconds, table
 from cortex.node import Node
 from cortex.overview import TopicInfo
 from cortex.records import NodeRecord, PublisherStats, StatsReply, SubscriberStats
@@ -84,29 +86,11 @@ def show_info(options: argparse.Namespace) -> int:
     if node is None:
         return 1
     with node:
-        before: _Counts | None = None
-        live = not options.once
-        if options.once:  # rates take two looks
-            before = _Counts(node, topic)
-            if before.publishers or before.subscribers:
-                time.sleep(_PERIOD_S)
-        while True:
-            infos = [info for info in node.topics() if info.topic == topic]
-            if not infos and (before is None or options.once):
-                others = sorted({info.topic for info in node.topics()})
-                raise CommandError(
-                    f"there is no topic {topic}; "
-                    + (f"there are {', '.join(others)}" if others else "there is none")
-                )
-            counts = _Counts(node, topic)
-            lines = list(_info_lines(topic, infos, counts, before))
-            print((_CLEAR if live and is_terminal() else "") + "\n".join(lines), flush=True)
-            if not live:
-                return 0
-            if not is_terminal():
-                print()
-            before = counts
-            time.sleep(_PERIOD_S)
+        if topic not in {info.topic for info in node.topics()}:
+            others = sorted({info.topic for info in node.topics()})
+            there = f"there are {', '.join(others)}" if others else "there is none"
+            raise CommandError(f"there is no topic {topic}; {there}")
+        return _show_live(node, options, _info_lines, topic)
 
 
 def show_top(options: argparse.Namespace) -> int:
@@ -115,92 +99,74 @@ def show_top(options: argparse.Namespace) -> int:
     if node is None:
         return 0
     with node:
-        before = _Counts(node)
-        while True:
-            time.sleep(_PERIOD_S)
-            counts = _Counts(node)
-            live = not options.once and is_terminal()
-            print((_CLEAR if live else "") + "\n".join(_top_lines(counts, before)), flush=True)
-            if options.once:
-                return 0
-            before = counts
+        return _show_live(node, options, _top_lines)
 
 
-def _top_lines(counts: _Counts, before: _Counts) -> Iterator[str]:
-    elapsed_s = counts.at_s - before.at_s
-    earlier = {stats.source: stats for _, stats in before.publishers}
-    last = {(record.node, index): stats for record, index, stats in before.subscribers}
-    by_topic: dict[str, dict[str, int]] = {}
-    delays: dict[str, np.ndarray] = {}
-    losses = ("lost", "overtaken", "rejected", "cut_off", "timeouts")
-    names = ("publishers", "published", "bytes", "subscribers", *losses)
+def _show_live(
+    node: Node,
+    options: argparse.Namespace,
+    lines: Callable[[Node, _Counts], Iterator[str]],
+    topic: str | None = None,
+) -> int:
+    """Print what was counted in each second, again and again unless `--once`."""
+    live = not options.once and sys.stdout.isatty()
+    counts = _Counts(node, topic)
+    while True:
+        time.sleep(_PERIOD_S)
+        counts = _Counts(node, topic, counts)
+        print((_CLEAR if live else "") + "\n".join(lines(node, counts)), flush=True)
+        if options.once:
+            return 0
+        if not live:
+            print()
 
-    def add(topic: str, **values: int) -> None:
-        row = by_topic.setdefault(topic, dict.fromkeys(names, 0))
-        for name, value in values.items():
-            row[name] += value
 
-    for _, pub in counts.publishers:
-        was = earlier.get(pub.source)
-        published, size = (pub.published - was.published, pub.bytes - was.bytes) if was else (0, 0)
-        add(pub.topic, publishers=1, published=published, bytes=size, timeouts=pub.timeouts)
-    for record, index, sub in counts.subscribers:
-        add(sub.topic, subscribers=1, **{name: getattr(sub, name) for name in losses[:-1]})
-        old = last.get((record.node, index))
-        if old is not None and old.topic == sub.topic:
-            delays[sub.topic] = delays.get(sub.topic, 0) + (sub.latency_counts - old.latency_counts)
-    rows = []
-    for topic, row in sorted(by_topic.items()):
-        latency = delays[topic].tolist() if topic in delays else [0]
-        rows.append(
-            (
-                plain(topic),
-                str(row["publishers"]),
-                rate(row["published"] / elapsed_s),
-                f"{bytes_of(row['bytes'] / elapsed_s)}/s",
-                str(row["subscribers"]),
-                *(f"{row[name]:,}" for name in losses),
-                seconds(quantile_ns(latency, 0.5) * 1e-9),
-                seconds(quantile_ns(latency, 0.99) * 1e-9),
-            )
-        )
-    lost = [name.replace("_", " ") for name in losses]
-    head = ("topic", "publishers", "rate", "bandwidth", "subscribers", *lost, "delay p50", "p99")
-    yield from table(head, rows) if rows else ("nothing is published or subscribed",)
-    for name in counts.silent:
-        yield f"node {plain(name)} did not answer"
+_Publishers = dict[int, tuple[NodeRecord, PublisherStats, PublisherStats | None]]
+_Subscribers = dict[tuple[int, int], tuple[NodeRecord, SubscriberStats, SubscriberStats | None]]
+"""By node and number in it: a node counts its subscribers in the order in which it announces them."""
 
 
 class _Counts:
-    """What the nodes of a topic, or of all, have counted at one moment."""
+    """What the nodes of a topic, or of all, have counted at one moment, and at an earlier one."""
 
-    def __init__(self, node: Node, topic: str | None = None) -> None:
+    def __init__(self, node: Node, topic: str | None = None, before: _Counts | None = None) -> None:
         from concurrent.futures import ThreadPoolExecutor
 
-        self.at_s = time.monotonic()
+        self.topic = topic
         self.silent: list[str] = []
-        self.publishers: list[tuple[NodeRecord, PublisherStats]] = []
-        self.subscribers: list[tuple[NodeRecord, int, SubscriberStats]] = []
-        others = [record for record in node.nodes() if record.node != node.id]
-        concerned = [record for record in others if topic is None or _is_on(record, topic)]
+        self.publishers: _Publishers = {}
+        self.subscribers: _Subscribers = {}
+        self.at_s = time.monotonic()
+        self._elapsed_s = self.at_s - before.at_s if before is not None else math.nan
+        records = [record for record in node.nodes() if record.node != node.id and _is_on(record, topic)]
         with ThreadPoolExecutor(_ASKED_AT_ONCE) as pool:
-            replies = list(pool.map(lambda record: _ask(node, record), concerned))
-        for record, reply in zip(concerned, replies, strict=True):
+            replies = list(pool.map(lambda record: _ask(node, record), records))
+        pubs, subs = (before.publishers, before.subscribers) if before is not None else ({}, {})
+        for record, reply in zip(records, replies, strict=True):
             if reply is None:
                 self.silent.append(record.name)
                 continue
-            every = topic is None
-            self.publishers += [
-                (record, stats) for stats in reply.publishers if every or stats.topic == topic
-            ]
-            own = [stats for stats in reply.subscribers if every or stats.topic == topic]
-            self.subscribers += [(record, index, stats) for index, stats in enumerate(own)]
+            for pub in reply.publishers:
+                if topic in (None, pub.topic):
+                    was = pubs[pub.source][1] if pub.source in pubs else None
+                    self.publishers[pub.source] = record, pub, was
+            for key, sub in (((record.node, index), sub) for index, sub in enumerate(reply.subscribers)):
+                if topic in (None, sub.topic):
+                    had = subs[key][1] if key in subs and subs[key][1].topic == sub.topic else None
+                    self.subscribers[key] = record, sub, had
+
+    def per_s(self, name: str, now: Any, before: Any) -> float:
+        """How much a count has grown in a second; nan if it is not known."""
+        return math.nan if before is None else (getattr(now, name) - getattr(before, name)) / self._elapsed_s
+
+    def silence(self) -> Iterator[str]:
+        """Say which nodes have not answered."""
+        return (f"node {plain(name)} did not answer" for name in self.silent)
 
 
-def _is_on(record: NodeRecord, topic: str) -> bool:
-    return any(p.topic == topic for p in record.publishers) or any(
-        s.topic == topic for s in record.subscribers
-    )
+def _is_on(record: NodeRecord, topic: str | None) -> bool:
+    topics = {publisher.topic for publisher in record.publishers}
+    return topic is None or topic in topics | {subscriber.topic for subscriber in record.subscribers}
 
 
 def _ask(node: Node, record: NodeRecord) -> StatsReply | None:
@@ -210,15 +176,49 @@ def _ask(node: Node, record: NodeRecord) -> StatsReply | None:
         return None
 
 
-def _info_lines(topic: str, infos: list[TopicInfo], counts: _Counts, before: _Counts | None) -> Iterator[str]:
-    yield topic
+def _delays(latency_counts: Any) -> Iterator[str]:
+    return (seconds(quantile_ns(latency_counts, fraction) * 1e-9) for fraction in (0.5, 0.99))
+
+
+def _top_lines(node: Node, counts: _Counts) -> Iterator[str]:
+    losses = ("lost", "overtaken", "rejected", "cut_off")
+    topics = {stats.topic for _, stats, _ in counts.publishers.values()}
+    topics |= {stats.topic for _, stats, _ in counts.subscribers.values()}
+    rows = []
+    for topic in sorted(topics):
+        pubs = [each for each in counts.publishers.values() if each[1].topic == topic]
+        subs = [each for each in counts.subscribers.values() if each[1].topic == topic]
+        sums = [
+            float(np.nansum([counts.per_s(name, *each[1:]) for each in pubs]))
+            for name in ("published", "bytes")
+        ]
+        latency = sum((now.latency_counts - old.latency_counts for _, now, old in subs if old), np.zeros(1))
+        rows.append(
+            (
+                plain(topic),
+                str(len(pubs)),
+                rate(sums[0]),
+                f"{bytes_of(sums[1])}/s",
+                str(len(subs)),
+                *(f"{sum(getattr(stats, name) for _, stats, _ in subs):,}" for name in losses),
+                f"{sum(stats.timeouts for _, stats, _ in pubs):,}",
+                *_delays(latency),
+            )
+        )
+    lost = [name.replace("_", " ") for name in losses]
+    head = ("topic", "publishers", "rate", "bandwidth", "subscribers", *lost, "timeouts", "delay p50", "p99")
+    yield from table(head, rows) if rows else ("nothing is published or subscribed",)
+    yield from counts.silence()
+
+
+def _info_lines(node: Node, counts: _Counts) -> Iterator[str]:
+    infos = [info for info in node.topics() if info.topic == counts.topic]
+    told = bool(_with_several_types(infos))
+    yield from (str(counts.topic), "")
+    yield from _publisher_table(counts, told)
     yield ""
-    told = topic in _with_several_types(infos)
-    yield from _publisher_table(counts, before, told)
-    yield ""
-    yield from _subscriber_table(counts, before, told)
-    for name in counts.silent:
-        yield f"node {plain(name)} did not answer"
+    yield from _subscriber_table(counts, told)
+    yield from counts.silence()
     for info in infos:
         yield ""
         if not info.schema:
@@ -230,60 +230,40 @@ def _info_lines(topic: str, infos: list[TopicInfo], counts: _Counts, before: _Co
             yield f"{plain(info.type_name)}: unreadable schema: {error}"
 
 
-def _publisher_table(counts: _Counts, before: _Counts | None, told: bool) -> Iterator[str]:
-    last = {stats.source: stats for _, stats in before.publishers} if before is not None else {}
-    elapsed_s = counts.at_s - before.at_s if before is not None else math.nan
+def _publisher_table(counts: _Counts, told: bool) -> Iterator[str]:
     rows = []
-    for record, stats in counts.publishers:
+    for record, stats, before in counts.publishers.values():
         facts = [plain(record.name)]
         for publisher in record.publishers:
             if publisher.source == stats.source:
                 facts += [_type(publisher.type_name, publisher.fingerprint, told=True)] if told else []
                 facts += ["latched"] if publisher.latch else []
-        earlier = last.get(stats.source)
-        cells = (
-            f"{stats.published:,}",
-            rate((stats.published - earlier.published) / elapsed_s if earlier else math.nan),
-            f"{bytes_of((stats.bytes - earlier.bytes) / elapsed_s)}/s" if earlier else "-",
-            str(stats.subscribers),
-            f"{stats.timeouts:,}",
-            f"{stats.skipped:,}",
-        )
-        rows.append(("  ".join(facts), cells))
-    head = ("published", "rate", "bandwidth", "subscribers", "timeouts", "skipped")
-    yield from entries("publishers", head, rows) if rows else ("no publisher",)
+        bandwidth = f"{bytes_of(counts.per_s('bytes', stats, before))}/s" if before else "-"
+        rates = (rate(counts.per_s("published", stats, before)), bandwidth)
+        numbers = (stats.subscribers, stats.timeouts, stats.skipped)
+        rows.append(("  ".join(facts), f"{stats.published:,}", *rates, *(f"{each:,}" for each in numbers)))
+    head = ("publishers", "published", "rate", "bandwidth", "subscribers", "timeouts", "skipped")
+    yield from table(head, rows, folded=True) if rows else ("no publisher",)
 
 
-def _subscriber_table(counts: _Counts, before: _Counts | None, told: bool) -> Iterator[str]:
-    last = {(record.node, index): stats for record, index, stats in before.subscribers} if before else {}
-    elapsed_s = counts.at_s - before.at_s if before is not None else math.nan
+def _subscriber_table(counts: _Counts, told: bool) -> Iterator[str]:
     rows = []
-    for record, index, stats in counts.subscribers:
+    for (_, index), (record, stats, before) in counts.subscribers.items():
         facts = [plain(record.name)]
-        # A node counts its subscribers in the order in which it announces them.
-        announced = [subscriber for subscriber in record.subscribers if subscriber.topic == stats.topic]
-        if told and index < len(announced):
-            facts.append(_type(announced[index].type_name, announced[index].fingerprint, told=True))
+        announced = record.subscribers[index : index + 1]
+        if told and announced and announced[0].topic == stats.topic:
+            facts.append(_type(announced[0].type_name, announced[0].fingerprint, told=True))
         facts.append(plain(stats.policy))
-        earlier = last.get((record.node, index))
-        latency = stats.latency_counts.tolist()
-        cells = (
-            f"{stats.received:,}",
-            rate((stats.received - earlier.received) / elapsed_s if earlier else math.nan),
-            f"{stats.lost:,}",
-            f"{stats.overtaken:,}",
-            f"{stats.rejected:,}",
-            f"{stats.cut_off:,}",
-            seconds(quantile_ns(latency, 0.5) * 1e-9),
-            seconds(quantile_ns(latency, 0.99) * 1e-9),
-        )
-        rows.append(("  ".join(facts), cells))
-    head = ("received", "rate", "lost", "overtaken", "rejected", "cut off", "delay p50", "p99")
-    yield from entries("subscribers", head, rows) if rows else ("no subscriber",)
+        losses = (stats.lost, stats.overtaken, stats.rejected, stats.cut_off)
+        cells = (rate(counts.per_s("received", stats, before)), *(f"{each:,}" for each in losses))
+        delays = _delays(stats.latency_counts.tolist())
+        rows.append(("  ".join(facts), f"{stats.received:,}", *cells, *delays))
+    losses_head = ("lost", "overtaken", "rejected", "cut off")
+    head = ("subscribers", "received", "rate", *losses_head, "delay p50", "p99")
+    yield from table(head, rows, folded=True) if rows else ("no subscriber",)
 
 
 def _with_several_types(infos: list[TopicInfo]) -> set[str]:
-    """The topics that have several types; subscribers of any type have none."""
     types: dict[str, set[int]] = {}
     for info in infos:
         if info.fingerprint:

@@ -14,7 +14,6 @@ import numpy as np
 from cortex.schema import ArrayType, Field, FieldType, ListType, OptionalType, Schema
 
 WIDTH_UNKNOWN = 120
-"""Columns to use where there is no terminal."""
 _LIST_ITEMS_MAX = 8
 _DETAIL_DIGITS = 6
 
@@ -22,11 +21,6 @@ _DETAIL_DIGITS = 6
 def terminal_width() -> int:
     """Columns of the terminal."""
     return shutil.get_terminal_size((WIDTH_UNKNOWN, 24)).columns
-
-
-def is_terminal() -> bool:
-    """Whether the standard output is a terminal, so that a line may be drawn over another."""
-    return sys.stdout.isatty()
 
 
 def seconds(value_s: float) -> str:
@@ -57,7 +51,6 @@ def rate(value_hz: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Four digits, or all of those before the point."""
     if value == round(value) and abs(value) < 10.0:
         return f"{value:.0f}"
     return f"{value:,.0f}" if abs(value) >= 999.95 else f"{value:#.4g}"
@@ -78,38 +71,24 @@ def shorten(text: str, width: int) -> str:
     return text if len(text) <= width else text[: max(0, width - 1)] + "…"
 
 
-def table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = ""
-) -> Iterator[str]:
-    """Lines of a table with aligned columns; those after the first `left` are aligned to the right.
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, folded: bool = False) -> Iterator[str]:
+    """Lines of a table with aligned columns, the first to the left and the others to the right.
 
     A head that begins with "<" is that of a further column aligned to the left. Nothing is cut: in a table
-    that is too wide for the terminal the first column of each row has a line of its own.
+    that is `folded`, or too wide for the terminal, the first column of each row has a line of its own.
     """
-    align_left = [i < left or title.startswith("<") for i, title in enumerate(head)]
     shown = [tuple(title.lstrip("<") for title in head), *rows]
     widths = [max(len(row[i]) for row in shown) for i in range(len(head))]
-    folded = len(indent) + sum(widths) + 2 * (len(widths) - 1) > terminal_width()
+    if sum(widths) + 2 * (len(widths) - 1) > terminal_width():
+        folded = True
     for row in shown:
         cells = [
-            cell.ljust(width) if to_left else cell.rjust(width)
-            for cell, width, to_left in zip(row, widths, align_left, strict=True)
+            cell.ljust(width) if title.startswith("<") else cell.rjust(width)
+            for cell, width, title in zip(row[1:], widths[1:], head[1:], strict=True)
         ]
         if folded:
-            yield (indent + row[0]).rstrip()
-            cells[0] = ""
-        yield (indent + "  ".join(cells)).rstrip()
-
-
-def entries(title: str, head: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
-    """Lines of a table in which each row has a line for what it is about, and below its aligned numbers."""
-    yield title
-    below = [tuple(head), *(tuple(cells) for _, cells in rows)]
-    widths = [max(len(cells[i]) for cells in below) for i in range(len(head))]
-    for index, cells in enumerate(below):
-        if index:
-            yield rows[index - 1][0]
-        yield "  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
+            yield row[0]
+        yield "  ".join(["" if folded else row[0].ljust(widths[0]), *cells]).rstrip()
 
 
 def message_lines(schema: Schema, message: Any, *, arrays: str = "short") -> Iterator[str]:
@@ -129,72 +108,57 @@ def message_lines(schema: Schema, message: Any, *, arrays: str = "short") -> Ite
 def _field_lines(
     field: Field, kind: FieldType, value: Any, name: str, indent: str, arrays: str
 ) -> Iterator[str]:
-    suffix = f"  {plain(field.unit)}" if field.unit else ""
-    if isinstance(kind, OptionalType):
-        if value is None:
-            yield f"{indent}{name}: none"
-            return
+    start, unit = f"{indent}{name}: ", f"  {plain(field.unit)}" if field.unit else ""
+    if isinstance(kind, OptionalType) and value is not None:
         kind = kind.item
     if isinstance(kind, Schema):
-        yield f"{indent}{name}:"
+        yield start.rstrip()
         for inner in kind.fields:
-            yield from _field_lines(
-                inner, inner.type, getattr(value, inner.name), inner.name, indent + "  ", arrays
-            )
+            of_inner = getattr(value, inner.name), inner.name, indent + "  ", arrays
+            yield from _field_lines(inner, inner.type, *of_inner)
     elif isinstance(kind, ListType):
-        yield from _list_lines(field, kind, value, f"{indent}{name}: ", indent, arrays)
+        yield from _list_lines(field, kind, value, start, unit, arrays)
     elif isinstance(kind, ArrayType):
-        yield from _array_lines(value, f"{indent}{name}: ", suffix, arrays)
+        yield from _array_lines(value, start, unit, arrays)
     else:
-        yield f"{indent}{name}: {_scalar(value, arrays)}{suffix}"
+        yield f"{start}{_scalar(value, arrays)}{unit if value is not None else ''}"
 
 
 def _list_lines(
-    field: Field, kind: ListType, value: Sequence[Any], start: str, indent: str, arrays: str
+    field: Field, kind: ListType, value: Sequence[Any], start: str, unit: str, arrays: str
 ) -> Iterator[str]:
     inner = kind.item.item if isinstance(kind.item, OptionalType) else kind.item
     shown = value if arrays == "full" else value[:_LIST_ITEMS_MAX]
     more = f" … {len(value)} in all" if len(shown) < len(value) else ""
     if isinstance(inner, (Schema, ArrayType, ListType)) and value:
+        indent = " " * (len(start) - len(start.lstrip()) + 2)
         yield start.rstrip()
         for index, item in enumerate(shown):
-            yield from _field_lines(field, kind.item, item, f"- {index}", indent + "  ", arrays)
-        if more:
-            yield f"{indent} {more}"
+            yield from _field_lines(field, kind.item, item, f"- {index}", indent, arrays)
+        yield from (indent + more for _ in more[:1])
     else:
-        unit = f"  {plain(field.unit)}" if field.unit else ""
         yield f"{start}[{', '.join(_scalar(item, arrays) for item in shown)}{more}]{unit}"
 
 
-def _array_lines(value: np.ndarray, start: str, suffix: str, arrays: str) -> Iterator[str]:
-    head = f"{value.dtype}[{', '.join(map(str, value.shape))}]"
-    if arrays == "none" or not value.size:
-        yield f"{start}{head}{suffix}"
-    elif arrays == "full":
-        yield f"{start}{head}{suffix}"
+def _array_lines(value: np.ndarray, start: str, unit: str, arrays: str) -> Iterator[str]:
+    head = f"{start}{value.dtype}[{', '.join(map(str, value.shape))}]"
+    if arrays == "short" and value.size:
+        head += f"  {_items(value, terminal_width() - len(head) - len(unit) - 2)}"
+    yield head + unit
+    if arrays == "full" and value.size:
         indent = " " * (len(start) - len(start.lstrip()) + 2)
         text = np.array2string(value, threshold=sys.maxsize, max_line_width=terminal_width() - len(indent))
         yield from (indent + line for line in text.splitlines())
-    else:
-        room = terminal_width() - len(start) - len(head) - len(suffix) - 2
-        yield f"{start}{head}  {_items(value, room)}{suffix}"
 
 
 def _items(array: np.ndarray, room: int) -> str:
     """As many items as fit, the last one among them."""
     flat = array.reshape(-1)
-    head = [_number(item) for item in flat[: max(1, room // 2)].tolist()]
-    if len(head) == flat.size and len(" ".join(head)) <= room:
-        return " ".join(head)
+    head = " ".join(_number(item) for item in flat[: max(1, room // 2 + 1)].tolist())
+    if flat.size <= room // 2 + 1 and len(head) <= room:
+        return head
     last = f"… {_number(flat[-1].item())}"
-    used = len(last)
-    shown: list[str] = []
-    for item in head:
-        used += len(item) + 1
-        if used > room or len(shown) == flat.size - 1:
-            break
-        shown.append(item)
-    return " ".join([*shown, last])
+    return f"{head[: max(0, room - len(last))].rpartition(' ')[0]} {last}".lstrip()
 
 
 def _number(value: Any) -> str:

@@ -6,7 +6,6 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from cortex.commands.session import CommandError, UsageError, hint, look_around
 from cortex.cppgen import generate, write_headers
 from cortex.evolution import differences, is_evolved
 from cortex.message import is_message
-from cortex.schema import EnumType, FieldType, ListType, OptionalType, Schema, schema_of
+from cortex.schema import EnumType, Schema, nested, schema_of
 from cortex.security import AUTHORIZED_FILE, default_directory, new_keys
 
 
@@ -105,22 +104,13 @@ def _find_type(name: str) -> type:
         key: value for key, value in vars(module).items() if isinstance(value, type) and is_message(value)
     }
     if isinstance(found, type) and issubclass(found, Enum):
-        users = sorted(key for key, value in known.items() if type_name in _enums(schema_of(value)))
-        raise CommandError(
-            f"{type_name} is an enum, which comes with the messages that use it: "
-            + (f"name one of {', '.join(users)}" if users else f"in {module_name} none does")
+        users = sorted(
+            key
+            for key, value in known.items()
+            if any(isinstance(kind, EnumType) and kind.name == type_name for kind in nested(schema_of(value)))
         )
+        use = f"name one of {', '.join(users)}" if users else f"in {module_name} none does"
+        raise CommandError(f"{type_name} is an enum, which comes with the messages that use it: {use}")
     raise CommandError(
         f"{module_name} has no message type {type_name}; it has {', '.join(sorted(known)) or 'none'}"
     )
-
-
-def _enums(kind: FieldType) -> Iterator[str]:
-    """The names of the enums in a type."""
-    if isinstance(kind, EnumType):
-        yield kind.name
-    elif isinstance(kind, Schema):
-        for field in kind.fields:
-            yield from _enums(field.type)
-    elif isinstance(kind, (OptionalType, ListType)):
-        yield from _enums(kind.item)

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,14 +65,8 @@ def echo(options: argparse.Namespace) -> int:
 
 
 def _print_json(info: Info, message: dict[str, Any]) -> None:
-    facts = {
-        "topic": info.topic,
-        "source": f"{info.source:016x}",
-        "sequence": info.sequence,
-        "latency_ns": info.latency_ns,
-        "size": info.size,
-        "message": message,
-    }
+    numbers = {name: getattr(info, name) for name in ("sequence", "latency_ns", "size")}
+    facts = {"topic": info.topic, "source": f"{info.source:016x}", **numbers, "message": message}
     print(json.dumps(facts, allow_nan=False), flush=True)
 
 
@@ -105,19 +100,17 @@ def show_delay(options: argparse.Namespace) -> int:
     return _watch(options, age, "age", seconds)
 
 
+@dataclass
 class _Second:
-    """What came within one second."""
+    """What came within one second, after a message that was published at `since_ns`."""
 
-    def __init__(self, since_ns: int) -> None:
-        self.began_ns = time.monotonic_ns()
-        self.since_ns = since_ns
-        """When the last message before was published."""
-        self.last_ns = since_ns
-        """When the last message was published."""
-        self.values: list[float] = []
-        self.seen = 0
-        self.bytes = 0
-        self.missed = 0
+    since_ns: int
+    last_ns: int
+    values: list[float] = field(default_factory=list)
+    seen: int = 0
+    bytes: int = 0
+    missed: int = 0
+    began_ns: int = field(default_factory=time.monotonic_ns)
 
 
 def _watch(
@@ -133,8 +126,8 @@ def _watch(
         for printed, second in enumerate(_by_second(subscriber, lambda info: measure(info, node), patience)):
             window.append(second)
             if printed % _HEAD_EVERY == 0:
-                second_title = "bandwidth" if what == "size" else "std"
-                print(_line("rate", what, second_title, "min", "p50", "p99", "max", "lost"))
+                spread = "bandwidth" if what == "size" else "std"
+                print(_line("rate", what, spread, "min", "p50", "p99", "max", "lost"))
             print(_statistics(window, show, with_bandwidth=what == "size"), flush=True)
             if printed + 1 == options.count:
                 break
@@ -152,7 +145,7 @@ def _by_second(
             missed = subscriber.counters.lost + subscriber.counters.overtaken
             second.missed, before = missed - before, missed
             yield second
-            second = _Second(second.last_ns)
+            second = _Second(second.last_ns, second.last_ns)
             continue
         try:
             info, _, _ = subscriber.recv_raw(_WAIT_S if second is None else min(left_ns * 1e-9, _WAIT_S))
@@ -162,7 +155,7 @@ def _by_second(
         patience.heard()
         value = measure(info)
         if second is None:  # the first message begins the first second, and counts for none
-            second = _Second(info.publish_ns)
+            second = _Second(info.publish_ns, info.publish_ns)
             continue
         second.seen += 1
         second.bytes += info.size

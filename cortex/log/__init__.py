@@ -14,21 +14,13 @@ A file explains itself: every channel has the structure of its type. It needs th
 (`pip install mcap`).
 """
 
-from cortex.log.format import LogError, LogInfo, LogTopic
-from cortex.log.player import Player
-from cortex.log.reader import Log, open_log
-from cortex.log.recorder import Recorder, RecordStats, TopicStats
-from cortex.log.writer import LogWriter
-
-__all__ = [
-    "Log",
-    "LogError",
-    "LogInfo",
-    "LogTopic",
-    "LogWriter",
-    "Player",
-    "RecordStats",
-    "Recorder",
-    "TopicStats",
-    "open_log",
-]
+from cortex.log.format import LogError as LogError
+from cortex.log.format import LogInfo as LogInfo
+from cortex.log.format import LogTopic as LogTopic
+from cortex.log.player import Player as Player
+from cortex.log.reader import Log as Log
+from cortex.log.reader import open_log as open_log
+from cortex.log.recorder import Recorder as Recorder
+from cortex.log.recorder import RecordStats as RecordStats
+from cortex.log.recorder import TopicStats as TopicStats
+from cortex.log.writer import LogWriter as LogWriter

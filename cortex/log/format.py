@@ -11,9 +11,8 @@ record `cortex.start` says where and when, `cortex.end` what was counted, as JSO
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
-from cortex.log.sink import Sink
 from cortex.schema import Schema
 
 PROFILE = "cortex"
@@ -42,60 +41,11 @@ def require_mcap() -> None:
         ) from error
 
 
-def open_writer(sink: Sink, compression: str) -> Any:
-    """Open the writer of the library `mcap`; the compression is "none", "lz4" or "zstd"."""
-    from mcap.exceptions import UnsupportedCompressionError
-    from mcap.writer import CompressionType, Writer
-
-    try:
-        return Writer(
-            cast(Any, sink), chunk_size=CHUNK_BYTES, compression=CompressionType[compression.upper()]
-        )
-    except UnsupportedCompressionError as error:
-        library = {"lz4": "lz4", "zstd": "zstandard"}[compression]
-        raise ImportError(f"the compression {compression} needs: pip install {library}") from error
-
-
-def add_channel(
-    writer: Any,
-    schemas: dict[int, int],
-    topic: str,
-    schema: Schema,
-    *,
-    source: int,
-    node: str = "",
-    latch: bool = False,
-) -> int:
-    """Add the channel of a publisher, and its schema where that is new; return MCAP's number of the channel.
-
-    Args:
-        writer: From `open_writer`.
-        schemas: MCAP's numbers of those that the file has, by fingerprint; gets the new one.
-        topic: Of the messages.
-        schema: Of the messages.
-        source: The publisher's number.
-        node: Name of its node.
-        latch: Whether it latches.
-    """
-    number = schemas.get(schema.fingerprint)
-    if number is None:
-        number = writer.register_schema(schema.name, SCHEMA_ENCODING, schema.to_json().encode())
-        schemas[schema.fingerprint] = number
-    metadata = {
-        "fingerprint": f"{schema.fingerprint:016x}",
-        "source": f"{source:016x}",
-        "node": node,
-        "latch": "1" if latch else "0",
-    }
-    return int(writer.register_channel(topic, MESSAGE_ENCODING, number, metadata))
-
-
 class LogInfo(NamedTuple):
     """What is known of a recorded message besides its content."""
 
     topic: str
     node: str
-    """Name of the node that published it."""
     source: int
     """The publisher's number."""
     sequence: int
@@ -107,7 +57,6 @@ class LogInfo(NamedTuple):
     log_ns: int
     """When it was received [ns since 1970]."""
     size: int
-    """Bytes of the body."""
 
 
 class LogTopic(NamedTuple):
@@ -116,8 +65,6 @@ class LogTopic(NamedTuple):
     topic: str
     schema: Schema
     message_count: int
-    """Messages."""
     nodes: tuple[str, ...]
-    """Names of the nodes that published it."""
     latch: bool
     """Whether one of them gave its last message to late joiners."""

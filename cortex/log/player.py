@@ -8,21 +8,21 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 
+from cortex.codec import RawMessage
+from cortex.context import Closing
 from cortex.log.format import LogInfo
 from cortex.log.reader import Log
 from cortex.node import Node
 from cortex.publisher import Publisher
-from cortex.raw import RawMessage
 from cortex.topic import check_topic
 
 logger = logging.getLogger(__name__)
 
 SUBSCRIBERS_WAIT_S = 2.0
 _SPAN_MIN_NS = 1_000_000
-_LOOK_S = 0.02
 
 
-class Player:
+class Player(Closing):
     """Publishes the messages of a recording; their `stamp_ns` stay as they were.
 
     Args:
@@ -67,14 +67,11 @@ class Player:
                     shared[key] = node.raw_publisher(key[0], entry.schema, latch=key in latched)
                 self._publishers[entry.topic, entry.schema.fingerprint] = shared[key]
         self.published = 0
-        """Messages so far."""
         self.late_ns = 0
         """How late the latest one was, at a finite rate [ns]."""
         self.position_s = 0.0
         """Where in the recording it is [s after the first message]."""
         self._stopped = threading.Event()
-        self._resumed = threading.Event()
-        self._resumed.set()
 
     def run(
         self,
@@ -119,10 +116,7 @@ class Player:
             for info, body, schema in self._log.raw(self._topics, start_s=start_s, end_s=end_s):
                 # Receive times jitter, publish times do not; but a clock that is ahead must delay nobody.
                 from_first_ns = max(0, min(info.publish_ns, info.log_ns) - first_ns)
-                origin_ns = self._wait_until(
-                    origin_ns, 0 if rate == math.inf else round(from_first_ns / rate)
-                )
-                if self._stopped.is_set():
+                if not self._wait_until(origin_ns, 0 if rate == math.inf else round(from_first_ns / rate)):
                     break
                 self._publish(info, body, schema.fingerprint)
             if self.published == at_start and not self._stopped.is_set():
@@ -140,39 +134,16 @@ class Player:
         self._publishers[info.topic, fingerprint].publish(RawMessage(body, info.stamp_ns or 0))
         self.published += 1
 
-    def _wait_until(self, origin_ns: int, after_ns: int) -> int:
-        """Sleep until a time after the origin, or until stopped.
-
-        Returns:
-            The origin, later by as long as we were paused.
-        """
+    def _wait_until(self, origin_ns: int, after_ns: int) -> bool:
+        """Sleep until a time after the origin; False if stopped."""
         while not self._stopped.is_set():
-            now_ns = time.monotonic_ns()
-            if not self._resumed.is_set():
-                while not self._resumed.is_set() and not self._stopped.is_set():
-                    time.sleep(_LOOK_S)
-                origin_ns += time.monotonic_ns() - now_ns
-                continue
-            left_ns = origin_ns + after_ns - now_ns
+            left_ns = origin_ns + after_ns - time.monotonic_ns()
             if left_ns <= 0:
                 if after_ns:
                     self.late_ns = max(self.late_ns, -left_ns)
-                break
+                return True
             time.sleep(min(left_ns * 1e-9, 0.1))  # an interrupted `wait` could keep the event's lock
-        return origin_ns
-
-    def pause(self) -> None:
-        """Hold on until `resume`; may be called from any thread."""
-        self._resumed.clear()
-
-    def resume(self) -> None:
-        """Go on where it was paused."""
-        self._resumed.set()
-
-    @property
-    def paused(self) -> bool:
-        """Whether it is paused."""
-        return not self._resumed.is_set()
+        return False
 
     def stop(self) -> None:
         """Make `run` return; may be called from any thread."""
@@ -187,12 +158,6 @@ class Player:
         self.stop()
         for publisher in set(self._publishers.values()):
             publisher.close()
-
-    def __enter__(self) -> Player:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _await_subscribers(self, wait_s: float) -> None:
         deadline_s = time.monotonic() + wait_s

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 from cortex.codec import codec_of
-from cortex.layout import SCALAR_CODES, measure_fields
+from cortex.context import Closing
+from cortex.layout import measure_fields
 from cortex.log.format import (
     END,
     MESSAGE_ENCODING,
@@ -24,7 +25,7 @@ from cortex.log.format import (
     LogTopic,
     require_mcap,
 )
-from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
+from cortex.schema import SCALAR_CODES, Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
 
 if TYPE_CHECKING:
     from mcap import records
@@ -71,7 +72,7 @@ class _Contents:
     cut: str = ""
 
 
-class Log:
+class Log(Closing):
     """A recording that is open for reading; made by `open_log`. One thread at a time may use it."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
@@ -91,12 +92,10 @@ class Log:
         """Topics in another encoding than that of Cortex, which are passed over."""
         self.topics = _summarise(self._channels, contents.counts)
         self.message_count = sum(topic.message_count for topic in self.topics)
-        """Messages in all."""
         known = [chunk for chunk in self._chunks if chunk.end_ns]
         self.start_ns = min((chunk.start_ns for chunk in known), default=0)
         """When the first message was received [ns since 1970]; 0 if there is none."""
         self.end_ns = max((chunk.end_ns for chunk in known), default=0)
-        """When the last one was."""
 
     @property
     def duration_s(self) -> float:
@@ -186,12 +185,6 @@ class Log:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Log:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def open_log(path: str | os.PathLike[str]) -> Log:
@@ -367,10 +360,10 @@ def _summarise(channels: Mapping[int, _Channel], counts: Mapping[int, int]) -> t
 
 
 def _stamp_place(schema: Schema) -> tuple[struct.Struct, int] | None:
-    for item, offset in zip(schema.fields, measure_fields(schema)[0], strict=True):
-        if item.name == "stamp_ns" and isinstance(item.type, str) and "int" in item.type:
-            return struct.Struct(f"<{SCALAR_CODES[item.type]}"), offset
-    return None
+    k = schema.stamp_index
+    if k < 0:
+        return None
+    return struct.Struct(f"<{SCALAR_CODES[str(schema.fields[k].type)]}"), measure_fields(schema)[0][k]
 
 
 def _stamp_in(channel: _Channel, body: bytes) -> int | None:
@@ -386,7 +379,6 @@ def _stamp_in(channel: _Channel, body: bytes) -> int | None:
 
 
 def _read_chunk(file: BinaryIO, position: int, size: int) -> bytes:
-    """Return the records of a chunk, uncompressed and checked."""
     file.seek(position)
     with _damage(f"the chunk at byte {position} is damaged"):
         code, length = _FRAME.unpack(file.read(_FRAME.size))
@@ -421,7 +413,6 @@ def _decompress(compression: str, data: bytes, size: int) -> bytes:
 
 
 def _payloads(data: bytes, wanted: int, position: int) -> Iterator[memoryview]:
-    """The records of one kind in a chunk's data."""
     view, at = memoryview(data), 0
     shortest = _MESSAGE.size if wanted == _opcodes().MESSAGE else 0
     while at < len(data):

@@ -8,7 +8,6 @@ import errno
 import json
 import logging
 import os
-import select
 import socket
 import threading
 import time
@@ -16,27 +15,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
 from cortex.context import Closed
 from cortex.link import Info
-from cortex.log.format import (
-    END,
-    FORMAT_VERSION,
-    PROFILE,
-    START,
-    add_channel,
-    open_writer,
-    require_mcap,
-)
-from cortex.log.sink import Sink
+from cortex.log import format as names
+from cortex.log.writer import Sink, add_channel, open_writer
 from cortex.node import Node
 from cortex.policy import Policy, reliable
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
-from cortex.subscriber import Subscriber
+from cortex.subscriber import Subscriber, watch
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
@@ -44,13 +35,12 @@ logger = logging.getLogger(__name__)
 FLUSH_NS = 500_000_000
 """What was received longer ago than this is in the file, even if the process is killed."""
 _LOOK_NS = 100_000_000
-"""How often to look for new topics."""
 _DRAIN_NS = 250_000_000
 _WAIT_MS = 50.0
 _TURN_MESSAGES = 64
 """Messages of one subscriber that are taken at a time, so that a busy topic does not hold up the others."""
 _TURN_BYTES = 8 << 20
-_CHANNELS_MAX = 60_000
+_CHANNELS_MAX = 65_535
 """MCAP numbers channels with 16 bits."""
 _U64_MAX = 2**64 - 1
 _COMPRESSIONS = ("none", "lz4", "zstd")
@@ -63,13 +53,11 @@ class TopicStats:
     written: int = 0
     """Messages handed to the file."""
     bytes: int = 0
-    """Bytes of their bodies."""
     lost: int = 0
     """Messages that were published after the recorder had subscribed, and never arrived."""
     overtaken: int = 0
     """Messages that gave way to newer ones; only without `reliable`."""
     rejected: int = 0
-    """Frames that were malformed."""
     cut_off: int = 0
     """Publishers whose end was not heard: how many of their last messages are missing is not known."""
 
@@ -80,7 +68,6 @@ class RecordStats:
 
     topics: dict[str, TopicStats]
     written: int
-    """Messages in all."""
     unwritten: int
     """Messages that were received, but lost because the file could not be written."""
     file_bytes: int
@@ -92,10 +79,7 @@ class RecordStats:
         return sum(topic.lost + topic.overtaken for topic in self.topics.values())
 
 
-class _Taken(NamedTuple):
-    info: Info
-    body: bytes | np.ndarray
-    schema: Schema
+_Taken = tuple[Info, "bytes | np.ndarray", Schema]
 
 
 class Recorder:
@@ -132,7 +116,7 @@ class Recorder:
         overwrite: bool = False,
         compression: str = "none",
     ) -> None:
-        require_mcap()
+        names.require_mcap()
         if compression not in _COMPRESSIONS:
             raise ValueError(f"compression must be one of {', '.join(_COMPRESSIONS)}, got {compression!r}")
         if topics is not None and not topics:
@@ -148,7 +132,6 @@ class Recorder:
         self._topics: dict[str, TopicStats] = {}
         self._counters: dict[str, SubscriberCounters] = {}
         self._channels: dict[tuple[str, int], int] = {}
-        self._first_channels: dict[tuple[str, int], int] = {}
         self._schemas: dict[int, int] = {}
         self._busy: set[str] = set()
         self._pending: Counter[tuple[str, int]] = Counter()
@@ -291,29 +274,24 @@ class Recorder:
                 self._stopping = True
                 continue
             (self._busy.add if more else self._busy.discard)(topic)
-        taken.sort(key=lambda item: item.info.publish_ns)
+        taken.sort(key=lambda item: item[0].publish_ns)
         self._received += len(taken)
         return taken
 
     def _ready(self, wait_ms: float) -> list[str]:
         """Topics on which something may have come; all of them if the wait was for nothing."""
-        poll, owners = select.poll(), {}
-        poll.register(self._wakeup.fd, select.POLLIN)
-        for topic, subscriber in self._subscribers.items():
-            for fd in (subscriber.wakeup.fd, *subscriber.fds()):
-                poll.register(fd, select.POLLIN)
-                owners[fd] = topic
+        poll, owners = watch(self._subscribers.values(), self._wakeup.fd)
         events = poll.poll(0.0 if self._busy else wait_ms)
         if not events:
             return list(self._subscribers)
         ready = set(self._busy)
         for fd, _ in events:
-            if fd == self._wakeup.fd:
-                self._wakeup.clear()
-                continue
-            ready.add(owners[fd])
-            if fd == self._subscribers[owners[fd]].wakeup.fd:
-                self._subscribers[owners[fd]].wakeup.clear()
+            subscriber = owners.get(fd)
+            if subscriber is not None:
+                ready.add(subscriber.topic)
+            for wakeup in (self._wakeup, *([subscriber.wakeup] if subscriber else [])):
+                if fd == wakeup.fd:
+                    wakeup.clear()
         return list(ready)
 
     def _write(self, taken: list[_Taken]) -> int:
@@ -354,13 +332,9 @@ class Recorder:
     def _channel_of(self, info: Info, schema: Schema) -> int:
         channel = self._channels.get((info.topic, info.source))
         if channel is None:
-            if len(self._channels) < _CHANNELS_MAX:
-                channel = self._add_channel(info, schema)
-            else:  # publishers come and go without end: mix their sequence numbers, but lose nothing
-                channel = self._first_channels.get((info.topic, schema.fingerprint))
-                if channel is None:
-                    raise OSError(errno.EMFILE, f"more than {_CHANNELS_MAX} publishers", str(self.path))
-            self._first_channels.setdefault((info.topic, schema.fingerprint), channel)
+            if len(self._channels) == _CHANNELS_MAX:
+                raise OSError(errno.EMFILE, f"more than {_CHANNELS_MAX} publishers", str(self.path))
+            channel = self._channels[info.topic, info.source] = self._add_channel(info, schema)
         return channel
 
     def _add_channel(self, info: Info, schema: Schema) -> int:
@@ -369,16 +343,14 @@ class Recorder:
             for publisher in record.publishers:
                 if publisher.source == info.source:
                     node, latch = record.name, publisher.latch
-        channel = add_channel(
+        return add_channel(
             self._writer, self._schemas, info.topic, schema, source=info.source, node=node, latch=latch
         )
-        self._channels[info.topic, info.source] = channel
-        return channel
 
     def _begin(self, topics: Sequence[str] | None) -> None:
-        self._writer.start(profile=PROFILE, library="cortex")
+        self._writer.start(profile=names.PROFILE, library="cortex")
         start = {
-            "format": FORMAT_VERSION,
+            "format": names.FORMAT_VERSION,
             "host": socket.gethostname(),
             "node": self._node.name,
             "domain": str(self._node.domain),
@@ -386,7 +358,7 @@ class Recorder:
             "policy": str(self._policy),
             "topics": "all" if topics is None else " ".join(topics),
         }
-        self._writer.add_metadata(START, start)
+        self._writer.add_metadata(names.START, start)
         self._writer.flush()
         self._note_chunk()
 
@@ -395,7 +367,7 @@ class Recorder:
         self._note_chunk()
         self._count_losses()
         counts = {topic: json.dumps(asdict(stats)) for topic, stats in sorted(self._topics.items())}
-        self._writer.add_metadata(END, counts)
+        self._writer.add_metadata(names.END, counts)
         self._writer.finish()
 
     def _fail(self, error: Exception) -> None:
@@ -417,8 +389,8 @@ class Recorder:
     def _count_losses(self) -> None:
         for topic, counters in self._counters.copy().items():
             stats = self._topics[topic]
-            stats.lost, stats.overtaken, stats.rejected = counters.lost, counters.overtaken, counters.rejected
-            stats.cut_off = counters.cut_off
+            for name in ("lost", "overtaken", "rejected", "cut_off"):
+                setattr(stats, name, getattr(counters, name))
 
 
 def _clamp(time_ns: int) -> int:
@@ -431,14 +403,14 @@ def _take_from(subscriber: Subscriber[Any], taken: list[_Taken]) -> bool:
     size = 0
     for _ in range(_TURN_MESSAGES):
         try:
-            item = _Taken(*subscriber.recv_raw(0.0))
+            item = subscriber.recv_raw(0.0)
         except TimeoutError:
             return False
         except TypeMismatch as error:
             logger.warning("%s", error)
             continue
         taken.append(item)
-        size += item.info.size
+        size += item[0].size
         if size >= _TURN_BYTES:
             return True
     return True

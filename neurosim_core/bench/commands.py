@@ -1,24 +1,31 @@
 """The command `neurosim bench`: which questions there are, and what each takes.
 
-A question is a module of this package. Its function `measure` takes `options.Options` and a function that is
-told what is measured next, and returns a `report.Chapter`. What measures is imported when it is asked for.
+A question is a module of this package. Its function `measure` takes `options.Options` and returns a
+`report.Chapter`. What measures is imported when it is asked for.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.metadata
+import os
+import platform
+import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neurosim_core.bench.options import Options, Progress, add_option
+import neurosim_core
+from neurosim_core.bench.options import Options, add_option
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.signals import handle_signals
 
@@ -39,66 +46,33 @@ class Question:
     in_all: bool = True
     """Whether `bench all` asks it: those with processes in real time want a machine for themselves."""
 
-    def measure(self, options: Options, progress: Progress) -> Chapter:
+    def measure(self, options: Options) -> Chapter:
         """Return the answer."""
         module = importlib.import_module(f"neurosim_core.bench.{self.name.replace('-', '_')}")
-        chapter: Chapter = module.measure(options, progress)
+        chapter: Chapter = module.measure(options)
         return chapter
 
 
 _VIEW = ("scene", "device", "width", "height")
+_STEPS = ("instants", "steps", "max_displacement", "samples")
+_LOOP = ("rates", "renderer", "seconds", "settings")
+_STREAM = ("sampling_rate", "seconds", "settings")
+_DELAY = ("delays", "tours", "mode", "seconds", "settings")
 
 QUESTIONS: Sequence[Question] = (
     Question("dynamics", "error against run time of the flight dynamics, and stiff and extreme flights"),
-    Question(
-        "replay",
-        "logs of real flights of a Crazyflie against the vehicle model, in open loop",
-        ("logs",),
-        False,
-    ),
-    Question(
-        "events",
-        "error against run time of events, over renders a second and rays per pixel",
-        (*_VIEW, "samples"),
-    ),
+    Question("replay", "logs of real flights of a Crazyflie against the vehicle model", ("logs",), False),
+    Question("events", "error against run time, over renders a second and rays", (*_VIEW, "samples")),
     Question("pixel", "a test bench of the event pixel: ramp, step, sine, noise of the presets", ("device",)),
     Question("render", "error against run time of rendering", ("scene", "device", "samples")),
-    Question(
-        "throughput",
-        "whole steps a second, where their time goes, and a naive event camera on the same frames",
-        ("scene", "device", "samples"),
-    ),
-    Question(
-        "worlds",
-        "many worlds stepped together for learning: renders a second of all",
-        (*_VIEW, "worlds", "seconds"),
-    ),
-    Question("data", "windows a second from a recording, and event files of all formats there and back"),
+    Question("throughput", "whole steps a second, and what their parts take", ("scene", "device", "samples")),
+    Question("worlds", "renders a second of many worlds stepped together", (*_VIEW, "worlds", "seconds")),
+    Question("data", "windows a second from a recording, for learning"),
     Question("leave-out", "what a scene does not need is not computed: kernels, memory, libraries, time"),
-    Question(
-        "step",
-        "whole steps a second with one event camera",
-        (*_VIEW, "instants", "steps", "max_displacement", "samples"),
-        False,
-    ),
-    Question(
-        "closed-loop",
-        "simulator and controller as processes: from command to image, images a second",
-        ("rates", "renderer", *_VIEW, "seconds", "settings"),
-        False,
-    ),
-    Question(
-        "streaming",
-        "a flight in real time: how punctual an IMU is beside an event camera",
-        (*_VIEW, "sampling_rate", "seconds", "settings"),
-        False,
-    ),
-    Question(
-        "delay",
-        "a slow controller in real time against the same delay in lockstep",
-        ("delays", "tours", "mode", "seconds", "factor", "settings"),
-        False,
-    ),
+    Question("step", "whole steps a second with one event camera", (*_VIEW, *_STEPS), False),
+    Question("closed-loop", "from command to image between processes", (*_VIEW, *_LOOP), False),
+    Question("streaming", "an IMU beside an event camera in real time", (*_VIEW, *_STREAM), False),
+    Question("delay", "a slow controller against the same delay in lockstep", _DELAY, False),
 )
 """All questions; `bench all` asks in this order."""
 
@@ -169,7 +143,6 @@ def _stages(question: Question, arguments: argparse.Namespace) -> Path:
 
 def _answer(question: Question, arguments: argparse.Namespace, console: Console, prefix: str) -> Chapter:
     """Measure and print, or take what an earlier run has left."""
-    from neurosim_core.bench.machine import describe_machine
     from neurosim_core.bench.render_report import print_chapter
     from neurosim_core.bench.report import read_chapter
 
@@ -188,7 +161,7 @@ def _answer(question: Question, arguments: argparse.Namespace, console: Console,
         def tell(what: str) -> None:
             line.update(f"{prefix}{question.name}, {time.monotonic() - begin_s:.0f} s: {what}")
 
-        chapter = question.measure(Options(**given, stages=stages), tell)
+        chapter = question.measure(Options(**given, progress=tell, stages=stages))
     facts["took"] = f"{time.monotonic() - begin_s:.0f} s"
     chapter = replace(chapter, facts=facts)
     if not arguments.json:
@@ -209,3 +182,44 @@ def _failed(question: Question, error: Exception, console: Console) -> Chapter:
         summary="This could not be measured.\n\n" + "".join(traceback.format_exception(error)),
         claims=[Claim("it can be measured", "this command", reason, False)],
     )
+
+
+def describe_machine() -> dict[str, str]:
+    """Return date, command, processor, devices and versions: term -> text."""
+    import warp as wp
+
+    load = " ".join(f"{value:.2f}" for value in os.getloadavg())
+    libraries = ("numpy", "scipy", "warp-lang")
+    versions = {
+        "Neurosim": " ".join(filter(None, (neurosim_core.__version__, _commit()))),
+        "Python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in libraries},
+    }
+    facts = {
+        "date": f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
+        "command": shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]]),
+        "machine": f"{os.cpu_count()} cores, {_processor()}, {platform.system()}, load {load}",
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
+    if devices := [str(device.name) for device in wp.get_cuda_devices()]:
+        facts["CUDA devices"] = ", ".join(devices)
+    return facts
+
+
+def _commit() -> str:
+    """Return the commit of the checkout that this program runs from; empty where there is none."""
+    root = Path(neurosim_core.__file__).resolve().parent.parent
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=10.0)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _processor() -> str:
+    """Return the name of the processor."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

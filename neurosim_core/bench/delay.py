@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 
 from neurosim_core.bench.engine import Recording, SimulationConfig, load_config, set_options
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
 TRANSPORT_S = 5e-4
 """What a command and its odometry are on their way, and a sleep takes longer than it should [wall-clock s].
-Where a
-delay is a whole number of control periods it decides that a command misses the last of them."""
+Where a delay is a whole number of control periods it decides that a command misses the last of them."""
 _DEADLINE_S = 120.0
 """Longest that a flight may take beyond its own time [wall-clock s]."""
 
@@ -33,11 +32,6 @@ def predicted_settings(delay_s: float, *, control_rate_hz: float, transport_s: f
     """Return the settings of a lockstep simulation whose commands come like those of a slow controller.
 
     It looks at the newest state, sleeps, sends, and looks again: one command per delay.
-
-    Args:
-        delay_s: What the controller sleeps [s].
-        control_rate_hz: Control periods a second [Hz].
-        transport_s: What messages and sleeps take besides [s].
     """
     return {
         "live.mode": "lockstep",
@@ -46,20 +40,20 @@ def predicted_settings(delay_s: float, *, control_rate_hz: float, transport_s: f
     }
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Fly tours with delays, in streaming and in lockstep."""
     delays_s = options.delays or ((0.0, 0.02) if options.quick else (0.0, 0.02, 0.05))
     tours = (1 if options.quick else 3) if options.tours is None else options.tours
     seconds = 4.0 if options.seconds is None else options.seconds
     if not all(0.0 <= delay_s < 10.0 for delay_s in delays_s):
         raise ValueError(f"delays must be from 0 to less than 10 s, got {list(delays_s)}")
-    for name, value in (("tours", tours), ("seconds", seconds), ("factor", options.factor)):
+    for name, value in (("tours", tours), ("seconds", seconds)):
         if not value > 0:  # also refuses nan
             raise ValueError(f"{name} must be > 0, got {value}")
     rows: list[Row] = []
     with own_runtime() as scratch:
         for tour, delay_s in itertools.product(range(tours), delays_s):
-            progress(f"tour {tour}, {1e3 * delay_s:g} ms")
+            options.progress(f"tour {tour}, {1e3 * delay_s:g} ms")
             base: dict[str, Any] = {
                 "duration_s": seconds,
                 "device": "cpu",
@@ -69,24 +63,21 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
                 "live": {"run_on": False},
             }
             config = load_config(base, overrides=options.settings, options=set_options(options.settings))
-            folder = scratch / f"{len(rows)}"
-            rows.append(_compare(config, folder, tour, delay_s, options.mode, options.factor))
+            rows.append(_compare(config, scratch / f"{len(rows)}", tour, delay_s, options.mode))
     return _chapter(rows, options.mode)
 
 
-def _compare(
-    config: SimulationConfig, folder: Path, tour: int, delay_s: float, mode: str, factor: float
-) -> Row:
+def _compare(config: SimulationConfig, folder: Path, tour: int, delay_s: float, mode: str) -> Row:
     """Fly one tour in lockstep and in streaming."""
-    rate_hz, transport_s = config.control.rate_hz, TRANSPORT_S * factor
-    lockstep = predicted_settings(delay_s, control_rate_hz=rate_hz, transport_s=transport_s)
+    rate_hz = config.control.rate_hz
+    lockstep = predicted_settings(delay_s, control_rate_hz=rate_hz, transport_s=TRANSPORT_S)
     streaming = {
         "live.mode": "streaming",
-        "live.real_time_factor": factor,
+        "live.real_time_factor": 1.0,
         "links.command.jitter_s": 1e-10,  # a link that takes 0 ns, but is recorded
     }
     predicted_m, predicted_s = _fly(config, lockstep, folder / "lockstep", mode, 0.0)
-    measured_m, measured_s = _fly(config, streaming, folder / "streaming", mode, delay_s / factor)
+    measured_m, measured_s = _fly(config, streaming, folder / "streaming", mode, delay_s)
     return {
         "tour": f"tour {tour}",
         "delay [ms]": 1e3 * delay_s,
@@ -101,11 +92,7 @@ def _compare(
 def _fly(
     config: SimulationConfig, changes: Mapping[str, Any], folder: Path, mode: str, sleep_s: float
 ) -> tuple[float, float]:
-    """Fly by processes; return the RMS distance from the path [m] and the median time between commands [s].
-
-    Raises:
-        ProcessEnded: A process failed.
-    """
+    """Fly by processes; return the RMS distance from the path [m], and the median command period [s]."""
     folder.mkdir(parents=True)
     changed = load_config(config.model_dump(mode="json"), overrides=changes)
     record = ("--record", str(folder / "flight"))
@@ -135,7 +122,7 @@ def _chapter(rows: list[Row], mode: str) -> Chapter:
         for kind in ("predicted", "measured")
     ]
     note = (
-        "Where commands come far less often than the delay says, the machine is too slow: time was held back."
+        "Where commands come far less often than the delay says the machine was too slow: it held time back."
     )
     return Chapter(
         name="delay",
@@ -143,13 +130,9 @@ def _chapter(rows: list[Row], mode: str) -> Chapter:
         summary=f"Distance from the path, root mean square, commanded by {mode}: measured over predicted is "
         f"{median:.3f} in the median, from {min(ratios):.3f} to {max(ratios):.3f}.",
         claims=[
-            Claim(
-                "the error in real time is that predicted in lockstep, to 10 % in the median",
-                "the same delay, simulated",
-                f"{median:.3f}",
-                abs(median - 1.0) <= 0.1,
-            )
+            Claim("the error in real time is that predicted in lockstep, to 10 % in the median",
+                  "the same delay, simulated", f"{median:.3f}", abs(median - 1.0) <= 0.1)
         ],
         tables=[Table("delay", title, rows, note)],
         plots=[Plot("delay", title, [panel(errors, "delay [ms]", "error [cm]", by="what", y_min=0.0)])],
-    )
+    )  # fmt: skip

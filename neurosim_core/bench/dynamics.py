@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.bench import rotorpy_peer
 from neurosim_core.bench.dynamics_flights import (
     EXTREMES,
     FLIGHTS,
@@ -24,9 +23,16 @@ from neurosim_core.bench.dynamics_flights import (
     Flight,
     short_flight,
 )
-from neurosim_core.bench.dynamics_oracle import Reference, compare, make_reference
+from neurosim_core.bench.dynamics_oracle import (
+    INSTALL_ROTORPY,
+    Reference,
+    compare,
+    fly_rotorpy,
+    make_reference,
+    rotorpy_version,
+)
 from neurosim_core.bench.engine import DynamicsError, Multirotor
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Table, cell, panel
 
 RKMK4, DORMAND_PRINCE, CALLED = "RKMK4 (ours)", "Dormand-Prince (ours)", "ours, called from Python"
@@ -43,19 +49,19 @@ _STEPS_PER_LAUNCH = 250
 """So that the 3 us of a launch count for little, copies of the vehicle fly beside it."""
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Measure, and return the chapter."""
     quick = options.quick
     samples: list[Row] = []
     peers: list[Row] = []
     for name in FLIGHTS:
-        progress(name)
+        options.progress(name)
         of_flight, of_peers = options.stage(name, partial(_precise, name, quick))
         samples += of_flight
         peers += of_peers
     lagging = {tau_s: partial(short_flight, "hummingbird", motor_time_constant_s=tau_s) for tau_s in MOTORS_S}
-    motors = _hard({f"{tau_s:g} s": (make, False) for tau_s, make in lagging.items()}, options, progress)
-    extremes = _hard(EXTREMES, options, progress)
+    motors = _hard({f"{tau_s:g} s": (make, False) for tau_s, make in lagging.items()}, options)
+    extremes = _hard(EXTREMES, options)
     claims = [
         *(_precision_claim(samples, flight, limit_m) for flight, limit_m in LIMITS_M.items()),
         _hard_claim("any motor time constant", motors, 1e-8),
@@ -64,10 +70,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     ]
     at_one_ms = [row for row in samples if row[STEP] == 1.0 or row["rtol"] == 1e-6]
     errors = {row["method"]: cell(_error_m(row)) for row in at_one_ms if row["flight"] == "figure eight"}
-    sampled = (
-        "Largest errors over the ends of all holds of 10 ms. CPU is that of the launches per simulated "
-        "second and vehicle."
-    )
+    sampled = "Largest errors over the ends of all holds of 10 ms. CPU is of launches, per simulated second."
     hard = (
         "Position errors [m] after steps of 1 ms, or at rtol 1e-6. RKMK4 (ours) is the vehicle as it is: "
         "holds in which its guard trips are flown again by Dormand-Prince. Not finite: NaN, or 1000 km off."
@@ -96,8 +99,7 @@ def _fly(
 ) -> tuple[Array, Row]:
     """Fly the vehicle through all commands, and time the launches alone, or the checked calls from Python.
 
-    Returns:
-        States at the end of each hold, shape [K, 13 + R]; and CPU time and effort as part of a row.
+    Returns states at the end of each hold, shape [K, 13 + R], and CPU time and effort as part of a row.
     """
     vehicle = Multirotor(flight.config, count=copies, **options)
     vehicle.step(np.tile(flight.commands[0], (copies, 1)), HOLD_NS)  # compiles
@@ -150,16 +152,12 @@ def _ours(flight: Flight, name: str, method: str, setting: float, known: Referen
 def _precise(name: str, quick: bool) -> tuple[list[Row], list[Row]]:
     """Fly one of `FLIGHTS` with every method and setting, and as RotorPy is called from Python."""
     flight = FLIGHTS[name]()
-    known = make_reference(flight, cross_check=name in ("rotor step", "flip") and not quick)
-    peers = not quick or name in ("rotor step", "figure eight")
-    return _sweep(flight, known, quick), _peers(flight, known) if peers else []
-
-
-def _sweep(flight: Flight, known: Reference, quick: bool) -> list[Row]:
-    """Fly a flight with every method and setting."""
+    known = make_reference(flight, cross_check=name == "flip" and not quick)
     settings = [(RKMK4, step_s) for step_s in (STEPS_S[:5] if quick else STEPS_S)]
     settings += [(DORMAND_PRINCE, rtol) for rtol in (TOLERANCES[1:6:2] if quick else TOLERANCES)]
-    return [_ours(flight, flight.name, method, value, known, 3 if quick else 5) for method, value in settings]
+    rows = [_ours(flight, name, method, value, known, 3 if quick else 5) for method, value in settings]
+    peers = not quick or name == "figure eight"
+    return rows, _peers(flight, known) if peers else []
 
 
 def _peers(flight: Flight, known: Reference) -> list[Row]:
@@ -168,8 +166,8 @@ def _peers(flight: Flight, known: Reference) -> list[Row]:
     for step_s in (1e-3, 1e-2):
         states, measured = _fly(flight, repetitions=3, called=True, max_step_ns=round(1e9 * step_s))
         rows.append(_row(flight.name, CALLED, step_s, states, known, **{CPU: measured[CPU]}))
-    for step_s in (1e-3, 1e-2) if rotorpy_peer.rotorpy_version() else ():
-        states, cpu_s = rotorpy_peer.fly_rotorpy(flight, step_s)
+    for step_s in (1e-3, 1e-2) if rotorpy_version() else ():
+        states, cpu_s = fly_rotorpy(flight, step_s)
         row = _row(flight.name, ROTORPY, step_s, states, known, **{CPU: cpu_s / flight.duration_s})
         exacter = [mine[CPU] for mine in rows[:2] if _error_m(mine) <= _error_m(row)]
         row["ratio to ours, no less exact"] = row[CPU] / min(exacter) if exacter else None
@@ -177,13 +175,11 @@ def _peers(flight: Flight, known: Reference) -> list[Row]:
     return rows
 
 
-def _hard(
-    cases: Mapping[str, tuple[Callable[[], Flight], bool]], options: Options, progress: Progress
-) -> list[Row]:
+def _hard(cases: Mapping[str, tuple[Callable[[], Flight], bool]], options: Options) -> list[Row]:
     """Fly stiff and extreme flights by all methods, at 1 ms or rtol 1e-6; what is refused says why."""
     rows: list[Row] = []
     for name, (make, stiff) in cases.items():
-        progress(name)
+        options.progress(name)
         rows += options.stage(name, partial(_hard_case, name, make, stiff, options.quick))
     return rows
 
@@ -197,8 +193,8 @@ def _hard_case(name: str, make: Callable[[], Flight], stiff: bool, quick: bool) 
     known = make_reference(flight, stiff=stiff)
     methods = ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6))
     rows = [_ours(flight, name, method, setting, known, 1) for method, setting in methods]
-    if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
-        states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
+    if rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
+        states, cpu_s = fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
         outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"
         rows.append(_row(name, ROTORPY, 1e-3, states, known, outcome=outcome))
     return rows
@@ -229,8 +225,8 @@ def _hard_claim(what: str, rows: Sequence[Row], limit_m: float) -> Claim:
 def _peer_claim(peers: Sequence[Row]) -> Claim:
     text = "figure eight, called from Python once a command: >= 10 times as fast as RotorPy at 1 ms, as exact"
     reference = "RotorPy 3.0, arXiv 2306.04485, in the same run"
-    if rotorpy_peer.rotorpy_version() is None:
-        return Claim(text, reference, rotorpy_peer.INSTALL, None)
+    if rotorpy_version() is None:
+        return Claim(text, reference, INSTALL_ROTORPY, None)
     ours, theirs = (_find(peers, "figure eight", method) for method in (CALLED, ROTORPY))
     ratio, exact = theirs[CPU] / ours[CPU], _error_m(ours) <= _error_m(theirs)
     said = f"{ratio:,.0f} times, {cell(_error_m(ours))} m against {cell(_error_m(theirs))} m"
@@ -262,7 +258,7 @@ def _pivot(rows: Sequence[Row]) -> list[Row]:
 
 def _plots(samples: list[Row], peers: list[Row], motors: list[Row]) -> list[Plot]:
     def panels(rows: list[Row], x: str, y: str) -> list[Panel]:
-        by_flight = {name: [row for row in rows if row["flight"] == name] for name in list(FLIGHTS)[1:]}
+        by_flight = {name: [row for row in rows if row["flight"] == name] for name in FLIGHTS}
         limits = {"log": "xy", "y_min": 1e-16, "y_max": 1e2}
         return [panel(r, x, y, by="method", title=f, **limits) for f, r in by_flight.items()]
 
@@ -273,7 +269,7 @@ def _plots(samples: list[Row], peers: list[Row], motors: list[Row]) -> list[Plot
     lost = "Stiff motors, steps of 1 ms or rtol 1e-6; no mark: not finite, or too slow"
     motor = panel(stiff, tau, POSITION_M, by="method", log="xy", x_lines={"step": 1e-3})
     return [
-        Plot("dynamics-work-precision", "Error against CPU time", panels(timed, CPU, POSITION_M), 2, True),
-        Plot("dynamics-step", "Error against step size", steps, 4, True),
+        Plot("dynamics-work-precision", "Error against CPU time", panels(timed, CPU, POSITION_M), 2),
+        Plot("dynamics-step", "Error against step size", steps, 4),
         Plot("dynamics-motor", lost, [motor]),
     ]

@@ -57,23 +57,6 @@ def _commands(config: engine.MultirotorConfig, count: int, *, share: float, seed
     return np.asarray(config.hover_rotor_speed_rad_s * (1.0 + noise))
 
 
-# Flights of ordinary vehicles
-
-
-def hover() -> Flight:
-    """Return 2 s of hover, which every method should keep to rounding."""
-    config = engine.preset("crazyflie")
-    commands = np.full((200, 4), config.hover_rotor_speed_rad_s)
-    return Flight(name="hover", config=config, start=at_rest(config), commands=commands)
-
-
-def rotor_step() -> Flight:
-    """Return 0.6 s after a step of 5 % in the command of one rotor."""
-    config = engine.preset("crazyflie")
-    command = config.hover_rotor_speed_rad_s * np.array([1.05, 1.0, 1.0, 1.0])
-    return Flight(name="rotor step", config=config, start=at_rest(config), commands=np.tile(command, (60, 1)))
-
-
 def flip() -> Flight:
     """Return a roll of 0.75 s that reaches 700 deg/s: a torque, its opposite, and hover thrust between."""
     config = engine.preset("crazyflie")
@@ -87,9 +70,8 @@ def tumble() -> Flight:
     """Return 2 s that begin at 20 rad/s about three axes at once, with commands that change by 20 %."""
     config = engine.preset("hummingbird")
     start = at_rest(config, velocity=(2.0, -1.0, 1.0), body_rate=(12.0, -11.0, 11.6))
-    return Flight(
-        name="tumble", config=config, start=start, commands=_commands(config, 200, share=0.2, seed=4)
-    )
+    commands = _commands(config, 200, share=0.2, seed=4)
+    return Flight(name="tumble", config=config, start=start, commands=commands)
 
 
 def figure_eight_flight() -> Flight:
@@ -107,15 +89,10 @@ def figure_eight_flight() -> Flight:
 
 
 FLIGHTS: dict[str, Callable[[], Flight]] = {
-    "hover": hover,
-    "rotor step": rotor_step,
     "flip": flip,
     "tumble": tumble,
     "figure eight": figure_eight_flight,
 }
-
-
-# Stiff and extreme flights
 
 
 def short_flight(
@@ -128,12 +105,8 @@ def short_flight(
 ) -> Flight:
     """Return 0.2 s of a preset with changed parameters, with commands within 10 % of hover.
 
-    Args:
-        airframe: Name of the preset.
-        inertia: Matrix, or its diagonal [kg m^2]; None: the preset's.
-        body_rate: At the start [rad/s].
-        bang_bang: Rotors are commanded to stop or to full speed instead, at random.
-        **changes: Parameters of the vehicle.
+    The inertia is a matrix, or its diagonal [kg m^2]. With `bang_bang` rotors are commanded to stop or to
+    full speed instead, at random.
     """
     if inertia is not None:
         matrix = np.diag(inertia) if np.ndim(inertia) == 1 else inertia
@@ -166,19 +139,15 @@ EXTREMES: dict[str, tuple[Callable[[], Flight], bool]] = {
         f"mass {label}, 100 m/s wind, quadratic drag": _case("crazyflie", mass_kg=mass_kg, **_STORM)
         for label, mass_kg in _MASSES_KG.items()
     },
-    "mass 9.5 g, the same with a hummingbird's rotors": _case("hummingbird", mass_kg=9.5e-3, **_STORM),
-    "mass 3 mg, the same with a hummingbird's rotors": _case(
-        "hummingbird", mass_kg=3e-6, stiff=True, **_STORM
-    ),
+    "mass 9.5 g, a hummingbird's rotors": _case("hummingbird", mass_kg=9.5e-3, **_STORM),
+    "mass 3 mg, a hummingbird's rotors": _case("hummingbird", mass_kg=3e-6, stiff=True, **_STORM),
     **{
         f"inertia x {share:g}": _case("crazyflie", inertia=_INERTIA * share, stiff=share < 1e-3)
         for share in (1.0, 1e-2, 1e-4, 1e-6)
     },
     **{
-        f"inertia {ratio}, 200 rad/s": _case(
-            "hummingbird", inertia=1e-4 * np.array(of), body_rate=(_FAST,) * 3
-        )
-        for ratio, of in _RATIOS.items()
+        f"inertia {name}, 200 rad/s": _case("hummingbird", inertia=1e-4 * np.array(of), body_rate=[_FAST] * 3)
+        for name, of in _RATIOS.items()
     },
     "bang-bang commands": _case("crazyflie", bang_bang=True),
     "200 rad/s about three axes": _case("crazyflie", body_rate=(_FAST, -_FAST, _FAST)),

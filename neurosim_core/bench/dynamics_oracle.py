@@ -1,15 +1,20 @@
-"""What the integrators of the vehicle are judged by: SciPy on equations of its own.
+"""What the integrators of the vehicle are judged by: SciPy on equations of its own, and RotorPy beside it.
 
 `Equations` states the equations of motion a second time, in NumPy, independently of the kernels of the
-vehicle, and SciPy solves them to rounding.
+vehicle, and SciPy solves them to rounding. RotorPy 3.0 flies as it is: its `Multirotor.step` calls
+`scipy.integrate.solve_ivp` with RK45 at its default tolerances (rtol 1e-3, atol 1e-6).
 
-Reference: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
-aerodynamic effects.
+References: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
+aerodynamic effects; Folk, Paulos, Kumar (2023), RotorPy: A Python-based multirotor simulator with
+aerodynamics for education and research, arXiv 2306.04485.
 """
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import math
+import time
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +31,9 @@ Solver = Literal["DOP853", "Radau"]
 POSITION, VELOCITY, ORIENTATION, BODY_RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 """Where each part stands in a state; rotor speeds follow."""
 _HOLD_S = HOLD_NS * 1e-9
+INSTALL_ROTORPY = "RotorPy is not installed: pip install rotorpy==3.0.0"
+_NAMES = ("x", "v", "q", "w", "rotor_speeds")
+"""What RotorPy calls the parts of a state."""
 
 
 def _cross(a: Any, b: Any) -> Array:
@@ -83,16 +91,8 @@ class Equations:
 def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
     """Solve a flight, restarted at each change of command, with the rotor speeds in closed form.
 
-    Args:
-        flight: What to fly.
-        solver: Method of `scipy.integrate.solve_ivp`.
-        rtol: Its relative tolerance; the absolute one is a tenth of it.
-
-    Returns:
-        States at the end of each hold, shape [K, 13 + R].
-
-    Raises:
-        ArithmeticError: The solver gave up.
+    The absolute tolerance is a tenth of the relative one. Returns states at the end of each hold, shape
+    [K, 13 + R]; raises ArithmeticError where the solver gives up.
     """
     equations = Equations(flight.config)
     tau_s = equations.time_constant_s
@@ -160,13 +160,68 @@ class Reference(NamedTuple):
 def make_reference(flight: Flight, *, stiff: bool = False, cross_check: bool = False) -> Reference:
     """Solve a flight by DOP853 at rtol 3e-14, or by Radau at 1e-11 where it is stiff, and solve it again.
 
-    Args:
-        flight: What to fly.
-        stiff: Damped so fast that an explicit solver takes tiny steps.
-        cross_check: Compare with Radau at 1e-12, which takes ten times as long, instead of DOP853 at 1e-13.
+    A cross-check is by Radau at 1e-12, which takes ten times as long as DOP853 at 1e-13.
     """
     solver: Solver = "Radau" if stiff else "DOP853"
     rtol = 1e-11 if stiff else 3e-14
     states = solve(flight, solver, rtol)
     again = solve(flight, "Radau", 1e-12) if cross_check else solve(flight, solver, rtol * 10.0 / 3.0)
     return Reference(states, compare(again, states))
+
+
+def rotorpy_version() -> str | None:
+    """Return the version that is installed, or None."""
+    return importlib.metadata.version("rotorpy") if importlib.util.find_spec("rotorpy") else None
+
+
+def make_rotorpy_vehicle(config: MultirotorConfig) -> Any:
+    """Return a vehicle of RotorPy with our parameters under its names."""
+    from rotorpy.vehicles.multirotor import Multirotor
+
+    if config.motor_time_constant_s == 0.0 or config.gravity_m_s2 != 9.81:
+        raise ValueError("RotorPy divides by the motor time constant and knows one gravity, 9.81 m/s^2")
+    inertia = np.array(config.inertia_kg_m2)
+    return Multirotor(
+        {
+            "mass": config.mass_kg,
+            **{f"I{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)},
+            **{f"c_D{axis}": c for axis, c in zip("xyz", config.parasitic_drag_kg_m, strict=True)},
+            "num_rotors": config.rotor_count,
+            "rotor_pos": {f"r{k + 1}": np.array(r) for k, r in enumerate(config.rotor_position_m)},
+            "rotor_directions": np.array(config.rotor_direction),
+            "rotor_speed_min": config.rotor_speed_min_rad_s,
+            "rotor_speed_max": config.rotor_speed_max_rad_s,
+            "k_eta": config.thrust_coefficient_n_s2,
+            "k_m": config.torque_coefficient_n_m_s2,
+            "k_d": config.rotor_drag_kg,
+            "k_z": config.rotor_inflow_kg,
+            "k_h": config.translational_lift_kg_m,
+            "k_flap": config.flapping_kg_m,
+            "tau_m": config.motor_time_constant_s,
+        }
+    )
+
+
+def fly_rotorpy(flight: Flight, step_s: float, *, cpu_max_s: float = np.inf) -> tuple[Array, float]:
+    """Fly with RotorPy's vehicle, in steps that divide `HOLD_NS`, and give up after some CPU time.
+
+    Returns:
+        States at the end of each hold, shape [K, 13 + R], NaN from where it gave up or failed; and the CPU
+        time of the whole flight [s], scaled up from what was flown.
+    """
+    vehicle = make_rotorpy_vehicle(flight.config)
+    state = {name: np.array(value) for name, value in zip(_NAMES, flight.start, strict=True)}
+    state["wind"] = np.array(flight.config.wind_m_s)
+    states = np.full((len(flight.commands), 13 + flight.config.rotor_count), np.nan)
+    begin_s, flown = time.process_time(), 0
+    for command in flight.commands:
+        try:
+            for _ in range(round(HOLD_NS * 1e-9 / step_s)):
+                state = vehicle.step(state, {"cmd_motor_speeds": command}, step_s)
+        except ValueError:  # SciPy and its rotations raise it for NaN and zero norm
+            break
+        states[flown] = np.concatenate([state[name] for name in _NAMES])
+        flown += 1
+        if time.process_time() - begin_s > cpu_max_s:
+            break
+    return states, (time.process_time() - begin_s) * len(states) / max(flown, 1)

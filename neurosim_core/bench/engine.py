@@ -24,10 +24,8 @@ from neurosim_core.record import Recording
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.renderer import make_renderer, upload_scene
-from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
-from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
-from neurosim_core.scene.scene import Ambient, Light, Material, Scene, Texture
+from neurosim_core.scene.scene import Ambient, Material, Scene
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.event_config import EventCameraConfig, event_presets
 from neurosim_core.sensors.events import EventCamera
@@ -54,20 +52,8 @@ def scene_settings(scene: Path | None, *, quick: bool = False) -> dict[str, Any]
     return {"scene": {"kind": "apartment", "rooms": 1}} if quick else {}
 
 
-def load_scene(file: Path | None, *, rooms: int | None = None) -> Scene:
-    """Return the scene of a mesh file, or the generated apartment."""
-    if file is not None:
-        return load_mesh_scene(MeshSceneConfig(file=file.resolve()))
-    return make_apartment(ApartmentConfig() if rooms is None else ApartmentConfig(rooms=rooms))
-
-
 def option_names(camera: str, **more: str) -> dict[str, str]:
-    """Return what the command line calls settings, for error messages: setting -> option.
-
-    Args:
-        camera: Name of the camera that the options are about.
-        more: Options of further settings of it.
-    """
+    """Return what the command line calls settings of a camera, for error messages: setting -> option."""
     names = {"lens.width": "--width", "lens.height": "--height", **more}
     return {"device": "--device", **{f"sensors.{camera}.{key}": name for key, name in names.items()}}
 
@@ -107,21 +93,15 @@ def camera_poses(p_WB: NDArray[np.float64], R_WB: Rotation) -> Poses:
 
 def default_mount() -> Mount:
     """Return where an event camera is on the body if nothing is said of it."""
-    camera: Any = load_config().sensors["events"]
-    mount: Mount = camera.mount
+    mount: Mount = getattr(load_config().sensors["events"], "mount")  # noqa: B009
     return mount
 
 
 def fly(config: SimulationConfig, rate_hz: float, *, pilot: Any = None, velocity: Any = None) -> Flown:
     """Fly without cameras, and note the states at the ticks of a rate.
 
-    Args:
-        config: Scene, vehicle, path and duration; its sensors are replaced.
-        rate_hz: When states are noted [Hz].
-        pilot: Takes the airframe and the share of the flight that is over, and returns a command and its
-            mode;
-            None: follow the path.
-        velocity: At the start, in W [m/s]; None: as configured.
+    A pilot takes the airframe and the share of the flight that is over, and returns a command and its mode;
+    without one the path is followed. `velocity` is that at the start, in W [m/s].
     """
     settings = config.model_dump()
     settings["sensors"] = {"odometry": {"kind": "odometry", "rate_hz": rate_hz}}
@@ -154,21 +134,15 @@ def adaptive_ticks(
 ) -> tuple[NDArray[np.int64], float]:
     """Return the ticks that adaptive sampling renders, and the time that the choice takes [s].
 
-    Args:
-        flown: The flight, seen by the default camera.
-        arrays: The scene (`upload_scene`).
-        lens: Of the camera.
-        limit_px: How far a point may move between two renders [px].
-        forced: Ticks that are rendered in any case, shape [n].
+    A point may move by `limit_px` between two renders; `forced` ticks, shape [n], are rendered in any case.
     """
     states: Any = wp.array(flown.states[:, None], dtype=wp.float64, device=arrays.device)
     mount = default_mount()
     p_BC, q_BC = wp.vec3d(*mount.position_m), wp.quatd(*mount.optical_quaternion())
     best_s, chosen = 0.0, [0]
     for count in (1, len(forced)):  # the first compiles
-        rule = DisplacementRule(
-            arrays, lens, max_displacement_px=limit_px, rate=flown.rate, p_BC=p_BC, q_BC=q_BC
-        )
+        pose: dict[str, Any] = {"p_BC": p_BC, "q_BC": q_BC}
+        rule = DisplacementRule(arrays, lens, max_displacement_px=limit_px, rate=flown.rate, **pose)
         begin_s = busy_s(arrays.device)
         chosen = rule.choose(states, range(count), flown.stamps_ns[:count].tolist(), forced[:count].tolist())
         best_s = busy_s(arrays.device) - begin_s
@@ -204,13 +178,7 @@ class ShiftedLens:
 
 
 class View:
-    """Renders stacks of log radiance.
-
-    Args:
-        arrays: The scene (`upload_scene`).
-        lens: Of the camera.
-        count: The most pictures of a stack.
-    """
+    """Renders stacks of log radiance, of `count` pictures at most."""
 
     def __init__(self, arrays: Any, lens: Any, *, count: int, output: str = "log_radiance") -> None:
         self.device = str(arrays.device)
@@ -239,35 +207,24 @@ def join_events(parts: Sequence[Any]) -> EventArrays:
 
 
 def event_settings(
+    size: tuple[int, int],
     *,
-    width: int,
-    height: int,
     rate_hz: float,
     instants: int,
-    duration_s: float,
-    device: str,
-    scene: Path | None = None,
     samples: int | None = None,
     max_displacement_px: float | None = None,
-    more: Mapping[str, Any] | None = None,
-    quick: bool = False,
 ) -> dict[str, Any]:
     """Return the settings of a flight with one event camera; packets end with the launches."""
+    camera = {
+        "kind": "event_camera",
+        "lens": {"width": size[0], "height": size[1], "horizontal_fov_rad": 1.5},
+        "sampling_rate_hz": rate_hz,
+        "packet_rate_hz": rate_hz / instants,
+        "max_displacement_px": max_displacement_px,
+    }
     return {
-        "duration_s": duration_s,
-        "device": device,
         "instants_per_launch": instants,
         "vehicle": {"on_collision": "report"},
         "render": {} if samples is None else {"samples_per_pixel": samples},
-        "sensors": {
-            "events": {
-                "kind": "event_camera",
-                "lens": {"width": width, "height": height, "horizontal_fov_rad": 1.5},
-                "sampling_rate_hz": rate_hz,
-                "packet_rate_hz": rate_hz / instants,
-                "max_displacement_px": max_displacement_px,
-            }
-        },
-        **scene_settings(scene, quick=quick),
-        **(more or {}),
+        "sensors": {"events": camera},
     }

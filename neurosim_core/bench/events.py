@@ -14,8 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -33,7 +32,7 @@ from neurosim_core.bench.events_space import (
 )
 from neurosim_core.bench.matching import match
 from neurosim_core.bench.naive_events import NaiveEventCamera
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, cell, panel
 
 FIXED_HZ = (250.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0)
@@ -41,35 +40,29 @@ ADAPTIVE_PX = (2.0, 1.0, 0.5, 0.35, 0.2, 0.1)
 WINDOW_MS = 10.0
 """Window of the study in time: q = 200/s."""
 _STACK = 128
-_TIMED_MAX = 1000
+_TIMED = 1000
+"""Renders that are timed, spread over the flight: those of a candidate take their mean."""
 _SLOW_SHARE, _FAST_SHARE = 0.75, 0.15
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
-    """Measure, and return the chapter.
-
-    Raises:
-        ValueError: The scene cannot be loaded, the device is not there, or samples are out of range.
-    """
-    device, quick = engine.find_device(options.device), options.quick
+def measure(options: Options) -> Chapter:
+    """Measure, and return the chapter."""
+    options, quick = replace(options, device=engine.find_device(options.device)), options.quick
     samples = options.samples or (SAMPLES[::2] if quick else SAMPLES)
     if not all(1 <= count <= REFERENCE_SAMPLES for count in samples):
         raise ValueError(f"samples must be in [1, {REFERENCE_SAMPLES}], got {list(samples)}")
-    on_cuda = wp.get_device(device).is_cuda
+    on_cuda = options.device != "cpu"
 
     def lens(columns: int) -> engine.PinholeConfig:
         rows = options.height or round((9 / 16 if columns == 1280 else 3 / 4) * columns)
         return engine.PinholeConfig(width=columns, height=rows, horizontal_fov_rad=1.5)
 
     columns = options.width or (346 if on_cuda else 32 if quick else 64)
-    time_rows = _sample_in_time(lens(columns), options.scene, device, quick, progress)
+    time_rows = _sample_in_time(lens(columns), options)
     wanted = (options.width,) if options.width else (60,) if quick else (120, 346, 640, 1280)
     lenses = [lens(columns) for columns in (wanted if on_cuda else wanted[:2])]
-    space_rows = sample_in_space(lenses, options.scene, device, quick, samples, progress)
+    space_rows = sample_in_space(lenses, samples, options)
     return _chapter(time_rows, space_rows, quick)
-
-
-# In time
 
 
 @dataclass(kw_only=True, eq=False)
@@ -103,36 +96,41 @@ class _Candidate:
 def _dodge(airframe: Any, share: float) -> tuple[tuple[float, ...], str]:
     """Command a slow drift, then a roll as fast as a flip and back, and recover."""
     weight_n = airframe.mass_kg * airframe.gravity_m_s2
-    progress = (share - _SLOW_SHARE) / _FAST_SHARE
-    if progress < 0.0:
+    through = (share - _SLOW_SHARE) / _FAST_SHARE
+    if through < 0.0:
         return (0.12, 0.05, 0.0, 0.08), "velocity"
-    if progress < 1.0:
-        sign = 1.0 if progress < 0.5 else -1.0
+    if through < 1.0:
+        sign = 1.0 if through < 0.5 else -1.0
         return (weight_n, 10.0 * sign, 5.0 * sign, 1.0 * sign), "rates"
     return (weight_n, 0.0, 0.0, 0.0, 1.0), "attitude"
 
 
-def _sample_in_time(
-    lens: engine.PinholeConfig, scene: Path | None, device: str, quick: bool, progress: Progress
-) -> list[Row]:
+def _sample_in_time(lens: engine.PinholeConfig, options: Options) -> list[Row]:
     """Return a row for each candidate."""
-    progress("fly")
+    device, quick = options.device, options.quick
+    options.progress("fly")
     settings = {
         "duration_s": 0.3 if quick else 1.0,
         "device": device,
         "path": {"kind": "hover"},
         "render": {"samples_per_pixel": 8},
-        **engine.scene_settings(scene, quick=quick),
+        **engine.scene_settings(options.scene, quick=quick),
     }
     rate_hz = 10_000.0 if quick else 100_000.0
     flown = engine.fly(engine.load_config(settings), rate_hz, pilot=_dodge, velocity=(0.12, 0.05, 0.0))
     arrays = engine.upload_scene(flown.model.scene, flown.model.config.render, device=device)
-    progress("choose the renders of adaptive sampling")
+    options.progress("choose the renders of adaptive sampling")
     everything = np.arange(len(flown.stamps_ns))
     reference = _Candidate(scheme="reference", setting=rate_hz, ticks=everything)
     candidates = list(_candidates(flown, arrays, lens, quick))
     view, poses = engine.View(arrays, lens, count=_STACK), flown.poses()
-    render_s = _time_renders(view, poses, candidates, progress)
+    options.progress("time renders")
+    some = np.linspace(0, len(everything) - 1, _TIMED, dtype=np.int64)
+    view.render((poses[0][:1], poses[1][:1]))  # compiles
+    begin_s = engine.busy_s(device)
+    for _ in view.stacks((poses[0][some], poses[1][some])):
+        pass
+    render_s = (engine.busy_s(device) - begin_s) / _TIMED
     pixel = engine.EventCameraConfig()
     size: dict[str, Any] = {"width": lens.width, "height": lens.height, "device": device}
     thresholds: dict[str, Any] = {"threshold_on": pixel.threshold_on, "threshold_off": pixel.threshold_off}
@@ -143,13 +141,14 @@ def _sample_in_time(
         )
     for rows, frames in view.stacks(poses):
         if rows.start % (_STACK * 32) == 0:
-            progress(f"render {rows.start:,} of {len(everything):,}")
+            options.progress(f"render {rows.start:,} of {len(everything):,}")
         for candidate in (reference, *candidates):
             candidate.see(frames, flown.stamps_ns[rows], rows.start)
     truth = engine.join_events(reference.parts)
     found = []
-    for candidate, seconds in zip(candidates, render_s, strict=True):
-        progress(f"compare {candidate.scheme} {candidate.setting:g}")
+    for candidate in candidates:
+        options.progress(f"compare {candidate.scheme} {candidate.setting:g}")
+        seconds = render_s * len(candidate.ticks)
         found.append(_time_row(candidate, truth, flown, lens.width, seconds))
     return found
 
@@ -158,39 +157,19 @@ def _candidates(
     flown: engine.Flown, arrays: Any, lens: engine.PinholeConfig, quick: bool
 ) -> Iterator[_Candidate]:
     """Yield who sees which ticks of the reference."""
+
+    def clock(rate_hz: float) -> NDArray[np.int64]:
+        return np.arange(0, len(flown.stamps_ns), round(flown.rate.rate_hz / rate_hz))
+
     for rate_hz in FIXED_HZ[:5] if quick else FIXED_HZ:
-        ticks = _ticks(flown, rate_hz)
-        yield _Candidate(scheme="fixed", setting=rate_hz, ticks=ticks)
-        yield _Candidate(scheme="naive", setting=rate_hz, ticks=ticks)
+        for scheme in ("fixed", "naive"):
+            yield _Candidate(scheme=scheme, setting=rate_hz, ticks=clock(rate_hz))
     forced = np.zeros(len(flown.stamps_ns), dtype=bool)
-    forced[_ticks(flown, 100.0)] = True  # ends of packets
+    forced[clock(100.0)] = True  # ends of packets
     forced[-1] = True
     for limit_px in ADAPTIVE_PX[1:] if quick else ADAPTIVE_PX:
         ticks, choice_s = engine.adaptive_ticks(flown, arrays, lens, limit_px, forced)
         yield _Candidate(scheme="adaptive", setting=limit_px, ticks=ticks, choice_s=choice_s)
-
-
-def _ticks(flown: engine.Flown, rate_hz: float) -> NDArray[np.int64]:
-    """Return the ticks of the reference at which a slower clock ticks."""
-    return np.arange(0, len(flown.stamps_ns), round(flown.rate.rate_hz / rate_hz))
-
-
-def _time_renders(
-    view: engine.View, poses: engine.Poses, candidates: Sequence[_Candidate], progress: Progress
-) -> list[float]:
-    """Return what the renders of each candidate take [s]; equal ticks are timed once, and some of many."""
-    known: dict[bytes, float] = {}
-    view.render((poses[0][:1], poses[1][:1]))  # compiles
-    for candidate in candidates:
-        key = candidate.ticks.tobytes()
-        if key not in known:
-            progress(f"time the renders of {candidate.scheme} {candidate.setting:g}")
-            some = candidate.ticks[:: -(-len(candidate.ticks) // _TIMED_MAX)]
-            begin_s = engine.busy_s(view.device)
-            for _ in view.stacks((poses[0][some], poses[1][some])):
-                pass
-            known[key] = (engine.busy_s(view.device) - begin_s) * len(candidate.ticks) / len(some)
-    return [known[candidate.ticks.tobytes()] for candidate in candidates]
 
 
 def _time_row(
@@ -221,28 +200,17 @@ def _time_row(
 def saving(rows: Sequence[Row], cost: str) -> dict[float, float]:
     """Return how many times as much a fixed rate costs for the same distance as adaptive sampling.
 
-    Between two rates the curve is interpolated in logarithms; what no fixed rate is as good or as bad as is
-    left out.
-
-    Args:
-        rows: Of the study in time.
-        cost: Heading of the cost.
-
-    Returns:
-        Factor by displacement [px].
+    The factors are by displacement [px]; `cost` is a heading. Between two rates the curve is interpolated in
+    logarithms; what no fixed rate is as good or as bad as is left out.
     """
     fixed = sorted((r for r in rows if r["scheme"] == "fixed"), key=lambda r: r["distance per event"])
     errors, costs = (np.log([row[heading] for row in fixed]) for heading in ("distance per event", cost))
-    return {
-        row["Hz or px"]: float(
-            np.exp(np.interp(math.log(row["distance per event"]), errors, costs)) / row[cost]
-        )
-        for row in rows
-        if row["scheme"] == "adaptive" and errors[0] <= math.log(row["distance per event"]) <= errors[-1]
-    }
-
-
-# The chapter
+    found = {}
+    for row in (row for row in rows if row["scheme"] == "adaptive"):
+        error = math.log(row["distance per event"])
+        if errors[0] <= error <= errors[-1]:
+            found[row["Hz or px"]] = float(np.exp(np.interp(error, errors, costs)) / row[cost])
+    return found
 
 
 def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapter:
@@ -311,10 +279,9 @@ def _time_claims(rows: Sequence[Row], fewer: dict[float, float], quick: bool) ->
 
 
 def _span(factors: dict[float, float]) -> str:
-    if not factors:
-        return "?"
-    low, high = (f"{bound(factors.values()):.2g}" for bound in (min, max))
-    return low if low == high else f"{low} to {high}"
+    return (
+        " to ".join(dict.fromkeys(f"{end(factors.values()):.2g}" for end in (min, max))) if factors else "?"
+    )
 
 
 def _time_plot(rows: list[Row]) -> Plot:

@@ -1,38 +1,37 @@
 """What a scene does not need is left out: kernels, memory, libraries and time of runs, small and large.
 
-Each case flies in a process of its own (`python -m neurosim_core.bench.leave_out`); what it holds and has
-imported is counted there when it has flown.
+Each case flies in a process of its own; what it holds and has imported is counted there when it has flown.
 """
 
 from __future__ import annotations
 
 import gc
 import itertools
-import json
 import resource
-import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any
 
 import warp as wp
 
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, panel
 
 _SCENE_LIBRARIES = ("trimesh", "PIL", "networkx", "embreex", "pyrender", "OpenGL")
-LIBRARIES = (*_SCENE_LIBRARIES, "h5py", "mcap", "matplotlib", "rerun", "zmq", "cortex", "scipy", "torch")
+_LIBRARIES = (*_SCENE_LIBRARIES, "h5py", "mcap", "matplotlib", "rerun", "zmq", "cortex", "scipy", "torch")
 """Libraries that a run may or may not need; the first ones are for scenes."""
 _HEIGHT_PX, _WIDTH_PX = 47, 61
 """Prime, and of no other array: what has them is a picture."""
 _TIMEOUT_S = 600.0
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Fly the cases one after the other, on the CPU: what is counted does not depend on the device."""
     rows, quick = [], options.quick
     for title, config in cases(quick).items():
-        progress(title)
+        options.progress(title)
         rows.append({"run": title, **run_case(config, seconds=0.2 if quick else 1.0)})
     return _chapter(rows)
 
@@ -60,7 +59,6 @@ def cases(quick: bool) -> dict[str, dict[str, Any]]:
     chosen: dict[str, dict[str, Any]] = {
         "IMU only": {"sensors": {"imu": {"kind": "imu"}}},
         "events only": {"sensors": {"events": events}},
-        "RGB and depth": {"sensors": pictures},
         "all sensors": {"sensors": {"events": events, **pictures, **inertial}},
         "all sensors and terms": {"sensors": everything, "vehicle": {"parameters": terms}, "bodies": ball},
     }
@@ -72,42 +70,16 @@ def cases(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def run_case(config: dict[str, Any], *, seconds: float) -> Row:
-    """Fly in a fresh process and return what was counted there.
-
-    Args:
-        config: Settings.
-        seconds: Simulated time that is measured, after as much that is not [s].
-
-    Raises:
-        RuntimeError: The run failed.
-    """
-    done = subprocess.run(
-        [sys.executable, "-m", "neurosim_core.bench.leave_out"],
-        input=json.dumps({"config": config, "seconds": seconds}),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=_TIMEOUT_S,
-    )
-    if done.returncode != 0:
-        raise RuntimeError(f"a run ended with status {done.returncode}: {done.stderr.strip()[-2000:]}")
-    row: Row = json.loads(done.stdout.splitlines()[-1])
-    return row
-
-
-# In the process of a run
-
-
-def _held_arrays() -> list[Any]:
-    """Return the Warp arrays of this process that own their memory."""
-    objects = (thing for thing in gc.get_objects() if isinstance(thing, wp.array))
-    return [array for array in objects if getattr(array, "_allocator", None) is not None]
+    """Fly in a fresh process and return what was counted there in some seconds, after as many before."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        return fresh.submit(_fly, config, seconds).result(_TIMEOUT_S)
 
 
 def _fly(config: dict[str, Any], seconds: float) -> Row:
     """Fly, and return what was counted; for a process that does nothing else."""
     from warp._src.context import user_modules
 
+    wp.config.log_level = wp.LOG_WARNING
     begin_s = time.process_time()  # what else runs on the machine does not count
 
     from neurosim_core.config import load_config
@@ -124,7 +96,8 @@ def _fly(config: dict[str, Any], seconds: float) -> Row:
             halfway, flown_ns, flight_s = True, packet.stamp_ns, time.process_time()
         last_ns = packet.stamp_ns
     cpu_s = time.process_time() - flight_s
-    arrays = _held_arrays()
+    arrays: list[Any] = [thing for thing in gc.get_objects() if isinstance(thing, wp.array)]
+    arrays = [array for array in arrays if getattr(array, "_allocator", None) is not None]  # own their memory
     return {
         "arrays": len(arrays),
         "their size [MiB]": sum(array.capacity for array in arrays) / 2**20,
@@ -133,7 +106,7 @@ def _fly(config: dict[str, Any], seconds: float) -> Row:
         "most memory [MiB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "set-up [s of CPU]": setup_s,
         "CPU per simulated s [ms]": 1e3 * cpu_s / (1e-9 * (last_ns - flown_ns)),
-        "libraries": ", ".join(name for name in LIBRARIES if name in sys.modules) or "none",
+        "libraries": ", ".join(name for name in _LIBRARIES if name in sys.modules) or "none",
     }
 
 
@@ -141,10 +114,8 @@ def _chapter(rows: list[Row]) -> Chapter:
     least, most = rows[0], rows[-1]
     imported = [name for name in _SCENE_LIBRARIES if name in least["libraries"].split(", ")]
     cpu, setup = "CPU per simulated s [ms]", "set-up [s of CPU]"
-    drawn = [
-        panel([{**row, "": heading} for row in rows], "run", heading, by="", y_min=0.0)
-        for heading in (cpu, "modules of kernels", "their size [MiB]")
-    ]
+    headings = (cpu, "modules of kernels", "their size [MiB]")
+    drawn = [panel([{**row, "": y} for row in rows], "run", y, by="", y_min=0.0) for y in headings]
     return Chapter(
         name="leave-out",
         title="What a scene does not need is left out",
@@ -152,27 +123,12 @@ def _chapter(rows: list[Row]) -> Chapter:
         f"one with every sensor and term {most[cpu]:,.0f} ms; set-up takes {least[setup]:.1f} and "
         f"{most[setup]:.1f} s.",
         claims=[
-            Claim(
-                "a run with an IMU only allocates no picture",
-                "arrays of Warp in the process of the run",
-                f"{least['pictures']} of {least['arrays']} arrays; {most['pictures']} with all sensors",
-                least["pictures"] == 0 < most["pictures"],
-            ),
-            Claim(
-                "a run with an IMU only imports no library for scenes",
-                "modules of the process of the run",
-                ", ".join(imported) or f"none of {', '.join(_SCENE_LIBRARIES)}",
-                not imported,
-            ),
+            Claim("a run with an IMU only allocates no picture", "arrays of Warp in the process of the run",
+                  f"{least['pictures']} of {least['arrays']} arrays; {most['pictures']} with all sensors",
+                  least["pictures"] == 0 < most["pictures"]),
+            Claim("a run with an IMU only imports no library for scenes", "modules of the process of the run",
+                  ", ".join(imported) or f"none of {', '.join(_SCENE_LIBRARIES)}", not imported),
         ],
-        tables=[
-            Table("leave-out", "Kernels, memory, libraries and time", rows, "On the CPU, each in a process."),
-        ],
+        tables=[Table("leave-out", "Kernels, memory, libraries and time", rows, "Each run in a process.")],
         plots=[Plot("leave-out", "What runs take, few parts to many", drawn, 1)],
-    )
-
-
-if __name__ == "__main__":
-    wp.config.log_level = wp.LOG_WARNING
-    request = json.load(sys.stdin)
-    print(json.dumps(_fly(request["config"], request["seconds"])))
+    )  # fmt: skip

@@ -17,8 +17,7 @@ Reference: Victor, Purpura (1996), Nature and precision of temporal coding in vi
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -85,8 +84,7 @@ def _align(
             column -= 1
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Alignment:
+class Alignment(NamedTuple):
     """The cheapest way from a reference to another stream of events."""
 
     distance: float
@@ -113,14 +111,9 @@ def match(
 ) -> Alignment:
     """Find the cheapest way to turn a reference into another stream of events.
 
-    Args:
-        reference: What is right.
-        other: What is compared with it.
-        width: Columns of the sensor [px]; it has fewer than 2^22 pixels.
-        window_us: Events further apart are not the same [us].
-        shift_cost: What a shift by the window costs. 2 gives the distance of Victor and Purpura, and next to
-            nothing as many pairs as possible.
-        device: Where to compute.
+    The sensor has `width` columns and fewer than 2^22 pixels. Events further apart than the window are not
+    the same. A shift by the window costs `shift_cost`: 2 gives the distance of Victor and Purpura, and next
+    to nothing as many pairs as possible.
     """
     a, b = _sorted_keys(reference, width), _sorted_keys(other, width)
     begin, count = _groups(a, b, window_us)
@@ -150,9 +143,7 @@ def match(
 
 def _sorted_keys(events: EventArrays, width: int) -> NDArray[np.int64]:
     """Return a key for each event, sorted: its train, one for each pixel and polarity, and then its time."""
-    y, x, polarity, t = (
-        np.asarray(v, dtype=np.int64) for v in (events.y, events.x, events.polarity, events.t)
-    )
+    t, x, y, polarity = (np.asarray(column, dtype=np.int64) for column in events)
     return np.sort((2 * (y * width + x) + polarity) << _TIME_BITS | t)
 
 
@@ -162,9 +153,8 @@ def _groups(
     """Return the beginnings in a and b, and the lengths, of stretches of trains that are independent."""
     both = np.concatenate([a << 1, b << 1 | 1])
     both.sort()
-    starts = np.flatnonzero(
-        np.diff(both >> 1, prepend=-(1 << 62)) > window_us
-    )  # another train is further away
+    # Another train is further away than any window.
+    starts = np.flatnonzero(np.diff(both >> 1, prepend=-(1 << 62)) > window_us)
     b_count = np.add.reduceat(both & 1, starts) if len(starts) else starts
     count = np.stack([np.diff(np.append(starts, len(both))) - b_count, b_count])
     return np.cumsum(count, axis=1) - count, count

@@ -1,39 +1,18 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,arg-type,operator,call-overload,type-arg"
-# mypy: disable-error-code="untyped-decorator,empty-body"
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,no-untyped-call,type-arg"
+# mypy: disable-error-code="untyped-decorator"
 """An event camera as many simulators have it, to measure ours against: one event per pixel and frame.
 
 A pixel whose log radiance has changed by a threshold since its last event fires one event, stamped at the
 frame, and takes its new log radiance as reference: what exceeds the threshold is forgotten. An atomic
-counter gives the events of a warp their places, in no order. For each frame the host launches, waits for the
-device and reads the count. This is no part of the simulator.
+counter gives the events their places, in no order. For each frame the host waits and reads the count.
 """
 
 import warp as wp
 
 from neurosim_core.bench.engine import EventArrays
 
-wp.set_module_options({"enable_backward": False})
 
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned active = __activemask();
-    const unsigned firing = __ballot_sync(active, fires);
-    if (firing == 0) return 0;
-    const int lane = threadIdx.x & 31, leader = __ffs(firing) - 1;
-    int start = 0;
-    if (lane == leader) start = atomicAdd(count.data, __popc(firing));
-    return __shfl_sync(active, start, leader) + __popc(firing & ((1u << lane) - 1));
-#else
-    return fires ? count.data[0]++ : 0;
-#endif
-""")
-def _take_place(fires: bool, count: wp.array[int]) -> int:
-    """Return the place of a pixel's event if it fires; all pixels come here."""
-    ...
-
-
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def _compare(
     # Model:
     threshold_on: float,
@@ -53,9 +32,8 @@ def _compare(
     row, col = wp.tid()
     value = log_radiance[row, col]
     change = value - reference[row, col]
-    fires = change >= threshold_on or change <= -threshold_off
-    place = _take_place(fires, count)
-    if fires:
+    if change >= threshold_on or change <= -threshold_off:
+        place = wp.atomic_add(count, 0, 1)
         x_out[place] = wp.uint16(col)
         y_out[place] = wp.uint16(row)
         t_out[place] = stamp_us
@@ -64,15 +42,7 @@ def _compare(
 
 
 class NaiveEventCamera:
-    """Takes one frame of log radiance at a time, and leaves its events on the device.
-
-    Args:
-        width: Columns [px].
-        height: Rows [px].
-        threshold_on: Step of log radiance upwards.
-        threshold_off: Step of log radiance downwards.
-        device: Where to compute.
-    """
+    """Takes one frame of log radiance at a time, shape [H, W], and leaves its events on the device."""
 
     def __init__(
         self, *, width: int, height: int, threshold_on: float, threshold_off: float, device: str
@@ -84,19 +54,15 @@ class NaiveEventCamera:
         self._columns = [wp.empty(width * height, dtype=kind, device=device) for kind in kinds]
 
     def reset(self, log_radiance: wp.array) -> None:
-        """Take a frame as reference, shape [H, W]."""
+        """Take a frame as reference."""
         wp.copy(self._reference, log_radiance)
 
     def feed(self, log_radiance: wp.array, stamp_us: int) -> int:
-        """Find the events of a frame, shape [H, W], and return how many; waits for the device."""
+        """Find the events of a frame, and return how many; waits for the device."""
         self._count.zero_()
-        wp.launch(
-            _compare,
-            dim=self._reference.shape,
-            inputs=[*self._thresholds, log_radiance, stamp_us, self._reference, self._count],
-            outputs=self._columns,
-            device=self._reference.device,
-        )
+        inputs = [*self._thresholds, log_radiance, stamp_us, self._reference, self._count]
+        size, device = self._reference.shape, self._reference.device
+        wp.launch(_compare, dim=size, inputs=inputs, outputs=self._columns, device=device)
         return int(self._count.numpy()[0])
 
     def events(self, count: int) -> EventArrays:

@@ -8,15 +8,8 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 from urllib.parse import quote
-
-Progress: TypeAlias = Callable[[str], None]
-"""Is told what is measured next."""
-
-
-def silent(_: str) -> None:
-    """Tell nobody."""
 
 
 def _numbers(kind: type) -> Callable[[str], tuple[Any, ...]]:
@@ -70,21 +63,14 @@ class Options:
         choices=["synthetic", "warp"],
     )
     sampling_rate: float | None = _option(
-        "renders of the event camera a second (default: a quarter of what the machine can do)",
-        type=float,
-        metavar="HZ",
+        "renders of the event camera a second (default: 25, on a GPU 500)", type=float, metavar="HZ"
     )
     delays: tuple[float, ...] | None = _option(
         "what the controller sleeps before commands", type=_numbers(float), metavar="S,..."
     )
     tours: int | None = _option("how many paths to fly", type=int, metavar="N")
     mode: str = _option(
-        "what is commanded (default: velocity)",
-        "velocity",
-        choices=["motor_speeds", "velocity", "position"],
-    )
-    factor: float = _option(
-        "real-time factor of the slow controller (default: 1)", 1.0, type=float, metavar="F"
+        "what is commanded (default: velocity)", "velocity", choices=["motor_speeds", "velocity", "position"]
     )
     logs: tuple[Path, ...] | None = _option(
         "logs of flights: time [s], accelerometer [g], gyroscope [deg/s], commands of four motors [PWM]",
@@ -93,22 +79,20 @@ class Options:
     )
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Further settings by dotted key."""
+    progress: Callable[[str], None] = field(default=lambda _: None, repr=False)
+    """Is told what is measured next."""
     stages: Path | None = None
     """Folder of what has been measured before the chapter is complete; None: it is not kept."""
 
     def stage(self, name: str, measure: Callable[[], Any]) -> Any:
         """Return what a stage of a question finds, or what an interrupted run with these options left of it.
 
-        Args:
-            name: Differs from those of the question's other stages.
-            measure: Returns something that JSON has, or numbers of NumPy.
+        What it finds is something that JSON has, or numbers of NumPy.
         """
         if self.stages is None:
             return measure()
-        file, asked = (
-            self.stages / f"{quote(name, safe=' ')}.json",
-            repr(dataclasses.replace(self, stages=None)),
-        )
+        file = self.stages / f"{quote(name, safe=' ')}.json"
+        asked = repr(dataclasses.replace(self, stages=None))
         if file.exists():
             options, found = json.loads(file.read_text(encoding="utf-8"))
             if options == asked:

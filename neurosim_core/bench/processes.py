@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from neurosim_core.bench.engine import SimulationConfig, to_yaml
+from neurosim_core.bench.engine import ProbeError, SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
 _VARIABLES = (_RUNTIME, "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
@@ -28,11 +28,7 @@ class ProcessEnded(RuntimeError):
 
 @contextlib.contextmanager
 def own_runtime() -> Iterator[Path]:
-    """Keep the nodes that are started within from meeting others of this user.
-
-    Yields:
-        A folder for logs and settings, removed at the end.
-    """
+    """Keep the nodes that are started within from meeting others; yield a folder, removed at the end."""
     parent = tempfile.gettempdir()
     folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
     before = {name: os.environ.pop(name, None) for name in _VARIABLES}
@@ -48,11 +44,7 @@ def own_runtime() -> Iterator[Path]:
 class NeurosimProcess:
     """A command of `neurosim` as a process of its own; leaving the `with` block ends it.
 
-    Args:
-        command: What follows `neurosim` on the command line.
-        config: Settings that it is given as a file; None: none.
-        arguments: What follows.
-        log: File for what it says.
+    Settings are given to it as a file; what it says goes to `log`.
     """
 
     def __init__(self, command: str, config: SimulationConfig | None, *arguments: str, log: Path) -> None:
@@ -62,23 +54,23 @@ class NeurosimProcess:
             settings = log.with_suffix(".yaml")
             settings.write_text(to_yaml(config), encoding="utf-8")
             arguments = (str(settings), *arguments)
+        program = [sys.executable, "-m", "neurosim_core", command, *arguments]
         with log.open("wb") as out:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "neurosim_core", command, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-            )
+            self._process = subprocess.Popen(program, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
 
     def check(self) -> None:
-        """Raise if it has ended.
-
-        Raises:
-            ProcessEnded: It has.
-        """
+        """Raise `ProcessEnded` if it has ended."""
         status = self._process.poll()
         if status is not None:
             raise ProcessEnded(f"`neurosim {self._command}` ended with status {status}; {self.last_words()}")
+
+    @contextlib.contextmanager
+    def told(self) -> Iterator[None]:
+        """Let the errors of probes within tell what this process said last."""
+        try:
+            yield
+        except ProbeError as error:
+            raise ProbeError(f"{error}; `neurosim {self._command}`: {self.last_words()}") from None
 
     def last_words(self) -> str:
         """Return the last lines that it said, for an error message."""
@@ -86,12 +78,7 @@ class NeurosimProcess:
         return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it ends by itself.
-
-        Raises:
-            ProcessEnded: It ended with another status than 0.
-            TimeoutError: It goes on.
-        """
+        """Wait until it ends by itself; raise `ProcessEnded` where its status is not 0, or `TimeoutError`."""
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:

@@ -36,30 +36,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VERDICTS = {True: "met", False: "missed", None: "not measured here"}
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Of series, in turn.
-
-Reference: Okabe and Ito (2008), Color Universal Design, without its yellow, which is faint on white.
-"""
-MARKERS = "os^DvPX"
-"""Of series, in turn: no difference is shown by colour alone."""
-
 _FOLDED_ROWS = 24
 _PANEL_IN = {1: (8.0, 4.8), 2: (4.6, 4.0), 3: (3.6, 3.6)}
 """Width and height of a panel by the number of panels in a row [inch]."""
+_COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"]
+"""Of series, in turn, each with a marker of its own: no difference is shown by colour alone.
+
+Reference: Okabe and Ito (2008), Color Universal Design, without its yellow, which is faint on white.
+"""
 _LOOK: dict[str, Any] = {
     "axes.axisbelow": True,
     "axes.grid": True,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
     "axes.titlesize": 10,
     "font.size": 9,
     "grid.alpha": 0.25,
     "legend.fontsize": 7,
-    "legend.framealpha": 0.6,
     "lines.markersize": 5,
 }
-_LINES = {"line": "-", "dashed": "--", "points": "none", "law": "-"}
+_LINES = {"line": "-", "dashed": "--", "points": "none"}
 
 
 def print_chapter(chapter: Chapter, console: Console) -> None:
@@ -78,14 +72,13 @@ def print_chapter(chapter: Chapter, console: Console) -> None:
 def print_table(table: Table, console: Console) -> None:
     """Print a table with its title and note; it may be wider than the terminal."""
     grid = rich.table.Table(box=None, pad_edge=False, header_style="bold")
-    rows = [[cell(row.get(key)) for key in table.headings] for row in table.rows]
-    for column, heading in enumerate(table.headings):
+    for heading in table.headings:
         side: Literal["left", "right"] = "right" if is_numeric(table, heading) else "left"
         wrapped = textwrap.fill(heading, 12)
-        longest = max(map(len, [*wrapped.split(), *(row[column] for row in rows)]))
+        longest = max(map(len, [*wrapped.split(), *(cell(row.get(heading)) for row in table.rows)]))
         grid.add_column(Text(wrapped), justify=side, min_width=longest)
-    for row in rows:
-        grid.add_row(*map(Text, row))
+    for row in table.rows:
+        grid.add_row(*(Text(cell(row.get(heading))) for heading in table.headings))
     console.print(Text(table.title, style="bold"))
     console.print(grid, highlight=False, crop=False, soft_wrap=True)
     if table.note:
@@ -95,11 +88,7 @@ def print_table(table: Table, console: Console) -> None:
 def write_report(chapters: Sequence[Chapter], out: str | Path, console: Console) -> None:
     """Write the last chapter with its tables and plots, and `report.html` of all; say so.
 
-    Args:
-        chapters: What the page says; chapters, tables and plots have unique names.
-        out: Folder; made if need be.
-        console: Where to say it. Without matplotlib and jinja2 there are no plots and no page, and it is
-            said.
+    Chapters, tables and plots have unique names. Plots and page need matplotlib and jinja2.
     """
     folder = Path(out)
     write_chapter(chapters[-1], folder)
@@ -142,19 +131,19 @@ def html_page(chapters: Sequence[Chapter], pictures: Mapping[str, str]) -> str:
 def draw_plot(plot: Plot) -> bytes:
     """Return a plot as PNG."""
     import matplotlib
+    from cycler import cycler
     from matplotlib.figure import Figure
 
+    look = {**_LOOK, "axes.prop_cycle": cycler(color=_COLOURS, marker=list("os^DvPX"))}
     columns = min(plot.columns, len(plot.panels))
     rows = math.ceil(len(plot.panels) / columns)
     width, height = _PANEL_IN[min(columns, 3)]
-    with matplotlib.rc_context(cast(Any, {**matplotlib.rcParamsDefault, **_LOOK})):
+    with matplotlib.rc_context(cast(Any, {**matplotlib.rcParamsDefault, **look})):
         figure = Figure(figsize=(width * columns, height * rows + 0.3), dpi=130, layout="constrained")
         figure.suptitle(plot.title, x=0.01, ha="left", fontsize=11)
-        share = plot.shared_axes
-        places = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share).ravel()
+        places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes, panel in zip(places, plot.panels, strict=False):
             _draw_panel(axes, panel)
-            axes.tick_params(labelbottom=True, labelleft=True)  # of shared axes, too
         for axes in places[len(plot.panels) :]:
             axes.axis("off")
         _add_legends(figure, places[: len(plot.panels)])
@@ -166,20 +155,17 @@ def draw_plot(plot: Plot) -> bytes:
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     from matplotlib.ticker import LogLocator
 
-    number = -1
     for series in panel.series:
-        law = series.style == "law"
-        number += not law
-        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        look: dict[str, Any] = {"color": colour, "linestyle": _LINES[series.style]}
-        look |= {"linewidth": 1.0} if law else {"label": series.label, "marker": marker}
         x, y = (np.array([math.nan if v is None else v for v in values]) for values in (series.x, series.y))
         if "y" in panel.log:
             y = np.where(y > 0.0, y, math.nan)  # else a line to 0 falls vertically, as if at the last mark
-        axes.plot(x, y, **look)
+        if series.style == "law":
+            axes.plot(x, y, color=axes.lines[-1].get_color(), marker="none", linewidth=1.0)
+        else:
+            axes.plot(x, y, linestyle=_LINES[series.style], label=series.label)
     for draw, marks in ((axes.axvline, panel.x_lines), (axes.axhline, panel.y_lines)):
         for label, at in marks.items():
-            draw(at, color="0.45", linestyle=":", linewidth=1.2, label=label)
+            draw(at, color="0.45", linestyle=":", linewidth=1.2, label=label, marker="none")
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     axes.set(xscale="log" if "x" in panel.log else axes.get_xscale())
     axes.set(yscale="log" if "y" in panel.log else "linear", ylim=(panel.y_min, panel.y_max))

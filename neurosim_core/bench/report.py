@@ -9,7 +9,6 @@ import csv
 import io
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,23 +23,17 @@ Values: TypeAlias = Sequence[float | str | None]
 """Numbers or names of categories; None stands for a value that is unknown or not finite."""
 Style = Literal["line", "dashed", "points", "law"]
 
-_NAME = re.compile(r"[a-z0-9]([a-z0-9_-]*[a-z0-9])?")
-
 
 @dataclass(frozen=True)
 class Table:
     """Rows under headings; becomes `<name>.csv`."""
 
     name: str
-    """Of the file: lower-case letters, digits, - and _."""
     title: str
     rows: Sequence[Mapping[str, Any]]
     """Values by heading, which says the unit; a value that is missing, None or nan reads as unknown."""
     note: str = ""
     """What a reader must know."""
-
-    def __post_init__(self) -> None:
-        _check_name(self.name)
 
     @property
     def headings(self) -> list[str]:
@@ -70,9 +63,8 @@ class Panel:
     log: Literal["", "x", "y", "xy"] = ""
     """Axes that are logarithmic."""
     x_lines: Mapping[str, float] = field(default_factory=dict)
-    """Vertical lines: label -> x."""
     y_lines: Mapping[str, float] = field(default_factory=dict)
-    """Horizontal lines: label -> y."""
+    """Vertical and horizontal lines: label -> x or y."""
     y_min: float | None = None
     y_max: float | None = None
 
@@ -82,16 +74,10 @@ class Plot:
     """Panels beside each other; becomes `<name>.png`."""
 
     name: str
-    """Of the file: lower-case letters, digits, - and _."""
     title: str
     panels: Sequence[Panel]
     columns: int = 3
     """The most panels in a row."""
-    shared_axes: bool = False
-    """All panels have the same limits."""
-
-    def __post_init__(self) -> None:
-        _check_name(self.name)
 
 
 @dataclass(frozen=True)
@@ -99,7 +85,6 @@ class Claim:
     """A statement with a limit, where the limit comes from, and what was measured."""
 
     text: str
-    """What is claimed, with its limit."""
     reference: str
     """The law, closed form, publication or independent program that the limit rests on."""
     measured: str
@@ -113,7 +98,7 @@ class Chapter:
     """The answer to one question; becomes `<name>.json`."""
 
     name: str
-    """Unique in a report: lower-case letters, digits, - and _."""
+    """Unique in a report."""
     title: str
     summary: str
     """The answer in words; paragraphs are separated by an empty line."""
@@ -122,14 +107,6 @@ class Chapter:
     plots: Sequence[Plot] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     """Term -> text: when, by which command, on which machine, with which versions."""
-
-    def __post_init__(self) -> None:
-        _check_name(self.name)
-
-
-def _check_name(name: str) -> None:
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"name must be of lower-case letters, digits, - and _, got {name!r}")
 
 
 def chapter_to_json(chapter: Chapter) -> str:
@@ -140,9 +117,7 @@ def chapter_to_json(chapter: Chapter) -> str:
 def _plain(value: Any) -> Any:
     """Return nested values as JSON has them."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, np.generic):
@@ -155,21 +130,15 @@ def table_to_csv(table: Table) -> str:
     out = io.StringIO(newline="")
     writer = csv.DictWriter(out, table.headings)
     writer.writeheader()
-    writer.writerows(
-        {k: v.item() if isinstance(v, np.generic) else v for k, v in r.items()} for r in table.rows
-    )
+    for row in table.rows:
+        writer.writerow({k: v.item() if isinstance(v, np.generic) else v for k, v in row.items()})
     return out.getvalue()
 
 
 def panel(rows: Sequence[Mapping[str, Any]], x: str, y: str, *, by: str, **more: Any) -> Panel:
-    """Return a panel with a line through the rows of each value of a column.
+    """Return a panel with a line through the rows of each value of the column `by`.
 
-    Args:
-        rows: Of a table.
-        x: Heading of what stands on the horizontal axis.
-        y: Heading of what stands on the vertical axis; what is no number leaves a gap.
-        by: Heading of the column whose values name the lines.
-        more: Fields of `Panel`; `series` are added to those of the rows.
+    What is no number in the column `y` leaves a gap; `more` are fields of `Panel`, whose `series` are added.
     """
     found = []
     for name in dict.fromkeys(row[by] for row in rows):
@@ -214,10 +183,6 @@ def write_chapter(chapter: Chapter, folder: Path) -> None:
 
 
 def read_chapter(folder: str | Path, name: str) -> Chapter | None:
-    """Return the chapter that `write_chapter` left in a folder, or None.
-
-    Raises:
-        ValueError: The file is no such chapter.
-    """
+    """Return the chapter that `write_chapter` left in a folder, or None."""
     file = Path(folder) / f"{name}.json"
     return TypeAdapter(Chapter).validate_json(file.read_text(encoding="utf-8")) if file.exists() else None

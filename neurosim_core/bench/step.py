@@ -9,32 +9,26 @@ from typing import Any, cast
 import numpy as np
 
 from neurosim_core.bench import engine
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.report import Chapter, Row, Table
 
 RATE_HZ = 1000.0
 """Steps per simulated second."""
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Fly with one event camera and nothing else, and time it."""
     count = options.steps // 10 if options.quick else options.steps
     names = engine.option_names("events", max_displacement_px="--max-displacement")
     names["render.samples_per_pixel"] = "--samples"
     rows = []
     for rays in options.samples or (None,):
-        progress("set-up" if rays is None else f"{rays} rays per pixel")
-        settings = engine.event_settings(
-            width=options.width or 640,
-            height=options.height or 480,
-            rate_hz=RATE_HZ,
-            instants=options.instants,
-            duration_s=7.0 * count / RATE_HZ + 1.0,
-            device=options.device,
-            scene=options.scene,
-            samples=rays,
-            max_displacement_px=options.max_displacement,
-        )
+        options.progress("set-up" if rays is None else f"{rays} rays per pixel")
+        more: dict[str, Any] = {"samples": rays, "max_displacement_px": options.max_displacement}
+        size = (options.width or 640, options.height or 480)
+        settings = engine.event_settings(size, rate_hz=RATE_HZ, instants=options.instants, **more)
+        settings |= {"duration_s": 7.0 * count / RATE_HZ + 1.0, "device": options.device}
+        settings |= engine.scene_settings(options.scene)
         model = engine.make_model(engine.load_config(settings, options=names))
         rows.append(time_steps(model, warm_up=count // 2, count=count, repetitions=5))
     best = max(rows, key=lambda row: row["whole steps/s"])
@@ -53,12 +47,8 @@ def time_steps(
 ) -> Row:
     """Fly a model with one event camera and nothing else, and return a row of what was measured.
 
-    Args:
-        model: Its run is long enough.
-        warm_up: Steps before the first repetition.
-        count: Steps per repetition.
-        repetitions: How often to measure; the flight goes on from one to the next.
-        repetition_s: A repetition ends after this time, even if it has taken fewer steps [s].
+    The flight goes on from one repetition to the next. A repetition ends after `count` steps or
+    `repetition_s`, whichever comes first.
     """
     camera: Any
     (camera,) = model.config.sensors.values()

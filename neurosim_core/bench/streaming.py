@@ -1,44 +1,32 @@
 """A flight in real time between processes: how punctual an IMU at 1 kHz is beside an event camera.
 
-Three processes: simulator, controller (`neurosim fly`), and this one, which listens. How often the event
-camera is rendered is chosen by what the machine can do, which is measured first.
+Three processes: simulator, controller (`neurosim fly`), and this one, which listens.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from neurosim_core.bench import engine
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table
-from neurosim_core.bench.step import measure as measure_steps
 
-RENDER_SHARE = 0.25
-"""How much of the renders that the machine can do the event camera takes: the rest is for everybody else."""
-_SAMPLING_RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 25.0, 20.0, 10.0, 5.0)
-"""Those that are chosen from; each divides the rate of the IMU."""
 _IMU, _CAMERA, _IMU_RATE_HZ = "imu", "events", 1000.0
 _GROWTH_MAX_MIB = 4.0
 _SETTLED_S = 10.0
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Fly in real time, and listen."""
     seconds = (5.0 if options.quick else 60.0) if options.seconds is None else options.seconds
     if not 0.0 < seconds <= 86_400.0:  # also refuses nan
         raise ValueError(f"seconds must be > 0 and <= 86400, got {seconds}")
-    view = replace(options, width=options.width or 346, height=options.height or 260, instants=1, steps=100)
-    rate_hz = options.sampling_rate
-    if rate_hz is None:
-        progress("how fast does this machine render?")
-        (table,) = measure_steps(replace(view, quick=False)).tables
-        budget_hz = RENDER_SHARE * table.rows[0]["whole steps/s"]
-        rate_hz = next((rate for rate in _SAMPLING_RATES_HZ if rate <= budget_hz), _SAMPLING_RATES_HZ[-1])
-    lens = {"width": view.width, "height": view.height, "horizontal_fov_rad": 1.5}
+    width, height = options.width or 346, options.height or 260
+    rate_hz = options.sampling_rate or (25.0 if engine.find_device(options.device) == "cpu" else 500.0)
+    lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
     base: dict[str, Any] = {
         "duration_s": seconds + 5.0,
         "device": options.device,
@@ -53,7 +41,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     names = engine.option_names(_CAMERA, sampling_rate_hz="--sampling-rate")
     names |= engine.set_options(options.settings)
     config = engine.load_config(base, overrides=options.settings, options=names)
-    progress(f"streaming for {seconds:g} s, {rate_hz:g} renders a second")
+    options.progress(f"streaming for {seconds:g} s, {rate_hz:g} renders a second")
     vehicle = next(iter(config.vehicles))
     with (
         own_runtime() as folder,
@@ -61,19 +49,16 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         engine.StreamProbe(vehicle=vehicle, imu=_IMU, camera=_CAMERA) as probe,
         NeurosimProcess("fly", config, log=folder / "fly.log") as controller,
     ):
-        processes = (simulator, controller)
 
         def check() -> None:
-            for process in processes:
-                process.check()
+            simulator.check()
+            controller.check()
 
-        try:
+        with simulator.told():
             trace = probe.listen(
-                seconds, resident=lambda: [p.resident_bytes() for p in processes], check=check
+                seconds, resident=lambda: [p.resident_bytes() for p in (simulator, controller)], check=check
             )
-        except engine.ProbeError as error:
-            raise engine.ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
-    return summarise(trace, rate_hz, f"{view.width}x{view.height}")
+    return summarise(trace, rate_hz, f"{width}x{height}")
 
 
 def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
@@ -107,25 +92,18 @@ def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
     some = slice(None, None, max(1, len(late_ms) // 5000))
     period_ms, late = 1e3 / _IMU_RATE_HZ, figures["jitter, 99 % [ms]"]
     above, shares = np.sort(jitter_ms)[::-1][some], np.arange(1, len(jitter_ms) + 1)[some] / len(jitter_ms)
-
-    def drawn(title: str, x_label: str, y_label: str, lines: dict[str, Any], **more: Any) -> Panel:
-        series = [Series(label=name, x=x.tolist(), y=y.tolist()) for name, (x, y) in lines.items()]
-        return Panel(title=title, x_label=x_label, y_label=y_label, series=series, **more)
-
-    memory = {"simulator": 0, "controller": 1}
+    lateness = Series(label="lateness", x=since_s[some].tolist(), y=late_ms[some].tolist())
+    jitter = Series(label="jitter", x=above.tolist(), y=shares.tolist())
+    memory = [
+        Series(label=name, x=trace.resident_s.tolist(), y=(held / 2**20).tolist())
+        for name, held in zip(("simulator", "controller"), trace.resident_bytes.T, strict=True)
+    ]
     wall, period = "wall-clock time [s]", {"period of the IMU": period_ms}
     panels = [
-        drawn("each sample", wall, "lateness [ms]", {"lateness": (since_s[some], late_ms[some])}),
-        drawn("jitter", "jitter [ms]", "share above", {"jitter": (above, shares)}, log="xy", x_lines=period),
-        drawn(
-            "memory",
-            wall,
-            "resident [MiB]",
-            {name: (trace.resident_s, trace.resident_bytes[:, k] / 2**20) for name, k in memory.items()},
-            y_min=0.0,
-        ),
+        Panel(title="each sample", x_label=wall, y_label="lateness [ms]", series=[lateness]),
+        Panel(x_label="jitter [ms]", y_label="share above", series=[jitter], log="xy", x_lines=period),
+        Panel(title="memory", x_label=wall, y_label="resident [MiB]", series=memory, y_min=0.0),
     ]
-    arrivals = zip(trace.imu_stamp_ns, trace.imu_received_ns - trace.imu_received_ns[0], strict=True)
     return Chapter(
         name="streaming",
         title="A flight in real time between processes",
@@ -133,30 +111,15 @@ def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
         f"factor {figures['real-time factor']:.5f} over {elapsed_s:.0f} s; 99 % of the IMU's samples are at "
         f"most {late:.3f} ms early or late.",
         claims=[
-            Claim(
-                "99 % of the IMU's samples are less than a period early or late",
-                "the period of the IMU, 1 ms",
-                f"{late:.3f} ms",
-                late < period_ms,
-            ),
-            Claim(
-                "nothing is lost",
-                "sequence numbers of the messages",
-                ", ".join(f"{name}: {count}" for name, count in lost.items()),
-                not any(lost.values()),
-            ),
-            Claim(
-                f"no process grows by more than {_GROWTH_MAX_MIB:g} MiB after it has settled",
-                "resident memory, as the system reports it",
-                f"{grown_mib[0]:.2f} and {grown_mib[1]:.2f} MiB",
-                bool((grown_mib < _GROWTH_MAX_MIB).all()),
-            ),
+            Claim("99 % of the IMU's samples are less than a period early or late",
+                  "the period of the IMU, 1 ms", f"{late:.3f} ms", late < period_ms),
+            Claim("nothing is lost", "sequence numbers of the messages",
+                  ", ".join(f"{name}: {count}" for name, count in lost.items()), not any(lost.values())),
+            Claim(f"no process grows by more than {_GROWTH_MAX_MIB:g} MiB after it has settled",
+                  "resident memory, as the system reports it",
+                  f"{grown_mib[0]:.2f} and {grown_mib[1]:.2f} MiB",
+                  bool((grown_mib < _GROWTH_MAX_MIB).all())),
         ],
-        tables=[
-            Table("streaming", "Figures", [{"figure": k, "value": value} for k, value in figures.items()]),
-            Table(
-                "arrivals", "Samples of the IMU", [{"stamp [ns]": a, "received [ns]": b} for a, b in arrivals]
-            ),
-        ],
+        tables=[Table("streaming", "Figures", [{"figure": k, "value": v} for k, v in figures.items()])],
         plots=[Plot("streaming", "An IMU at 1 kHz in real time", panels)],
-    )
+    )  # fmt: skip

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -18,7 +19,7 @@ import warp as wp
 
 from neurosim_core.bench import engine
 from neurosim_core.bench.naive_events import NaiveEventCamera
-from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.options import Options
 from neurosim_core.bench.report import Chapter, Claim, Plot, Row, Table, cell, panel
 from neurosim_core.bench.step import RATE_HZ, time_steps
 
@@ -33,7 +34,7 @@ _STAMPS_NS = 1_000_000
 """Between two frames [ns]."""
 
 
-def measure(options: Options, progress: Progress = silent) -> Chapter:
+def measure(options: Options) -> Chapter:
     """Measure, and return the chapter."""
     device, quick = engine.find_device(options.device), options.quick
     on_cuda = bool(wp.get_device(device).is_cuda)
@@ -43,39 +44,35 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     counts = (1, 4) if quick else (1, 4, 16, 32, 64)
     duration_s = 2.0 if quick else 40.0 if on_cuda else 12.0
 
-    def settings(pixels: tuple[int, int] = size, launch: int = instants, **more: Any) -> dict[str, Any]:
-        view: dict[str, Any] = {
-            "width": pixels[0],
-            "height": pixels[1],
-            "device": device,
-            "scene": options.scene,
-            "quick": quick,
-        }
-        return engine.event_settings(rate_hz=RATE_HZ, instants=launch, duration_s=duration_s, **view, **more)
+    fixed = {"device": device, "duration_s": duration_s, **engine.scene_settings(options.scene, quick=quick)}
 
-    progress("the scene, its light and the path")
+    def settings(pixels: tuple[int, int] = size, launch: int = instants, **more: Any) -> dict[str, Any]:
+        return engine.event_settings(pixels, rate_hz=RATE_HZ, instants=launch, **more) | fixed
+
+    options.progress("the scene, its light and the path")
     base = engine.make_model(engine.load_config(settings()))
 
-    def model(**more: Any) -> engine.Model:
-        return engine.refit(base, engine.load_config(settings(**more)))
-
-    def with_rays(count: int) -> engine.Model:
-        config = engine.load_config(settings(samples=count))
-        uploaded = engine.upload_scene(base.scene, config.render, device=device)
+    def model(more: dict[str, Any]) -> engine.Model:
+        config = engine.load_config(settings(**more))
+        uploaded = base.scene_on_device
+        if "samples" in more:
+            uploaded = engine.upload_scene(base.scene, config.render, device=device)
         return engine.refit(dataclasses.replace(base, config=config, scene_on_device=uploaded), config)
 
-    cases: list[tuple[str, str, Callable[[], engine.Model]]] = []
-    for pixels in sizes:
-        cases.append(("resolution", EXACT, partial(model, pixels=pixels)))
-        cases.append(("resolution", ADAPTIVE, partial(model, pixels=pixels, max_displacement_px=0.5)))
-    cases += [("renders per launch", EXACT, partial(model, launch=count)) for count in counts]
-    cases += [("rays per pixel", EXACT, partial(with_rays, count)) for count in options.samples or (1, 4, 16)]
+    limits = {EXACT: None, ADAPTIVE: 0.5}
+    cases: list[tuple[str, str, dict[str, Any]]] = [
+        ("resolution", mode, {"pixels": pixels, "max_displacement_px": limit_px})
+        for pixels, (mode, limit_px) in itertools.product(sizes, limits.items())
+    ]
+    cases += [("renders per launch", EXACT, {"launch": count}) for count in counts]
+    cases += [("rays per pixel", EXACT, {"samples": count}) for count in options.samples or (1, 4, 16)]
     rows = []
-    for what, mode, make in cases:
-        progress(f"whole steps: {what}, {mode}")
-        rows.append({"what is varied": what, "mode": mode, **_try(partial(_steps, make, quick))})
-    progress("parts alone")
-    parts = _parts(base, quick, progress)
+    for what, mode, more in cases:
+        options.progress(f"whole steps: {what}, {mode}")
+        found = _try(partial(_steps, partial(model, more), quick))
+        rows.append({"what is varied": what, "mode": mode, **found})
+    options.progress("parts alone")
+    parts = _parts(base, options)
     return _chapter(rows, parts, device, on_cuda)
 
 
@@ -115,20 +112,20 @@ def _seconds(call: Callable[[], object], device: str, seconds: float) -> float:
         count = math.ceil(count * min(10.0, seconds / max(elapsed_s, 1e-6)))
 
 
-def _parts(model: engine.Model, quick: bool, progress: Progress) -> list[Row]:
+def _parts(model: engine.Model, options: Options) -> list[Row]:
     """Time the render and the event camera alone, and a naive camera on the same frames.
 
     Frames of a flight are shown forth and back, so that the picture never jumps.
     """
     device, instants = model.device, model.config.instants_per_launch
     (sensor,) = model.config.sensors.values()
-    lens, seconds = cast(Any, sensor).lens, 0.1 if quick else 0.5
+    lens, seconds = cast(Any, sensor).lens, 0.1 if options.quick else 0.5
     settings = model.config.model_copy(update={"duration_s": 1.5})
     flown = engine.fly(settings, RATE_HZ)
     position, orientation = (values[-instants:] for values in flown.poses())
     rows: list[Row] = []
     for output, name in (("depth", "cast: rays alone"), ("log_radiance", "render: log radiance")):
-        progress(name)
+        options.progress(name)
         view = engine.View(model.scene_on_device, lens, count=instants, output=output)
         taken_s = _seconds(partial(view.render, (position, orientation)), device, seconds)
         rows.append({"part": name, "us per frame": 1e6 * taken_s / instants})
@@ -136,47 +133,39 @@ def _parts(model: engine.Model, quick: bool, progress: Progress) -> list[Row]:
     forth_and_back = np.concatenate([stack, stack[::-1]])
     frames: Any = wp.array(forth_and_back, dtype=float, device=device)
     count, pixel = len(forth_and_back), engine.EventCameraConfig()
+    each = [frames[index] for index in range(count)]
     size: dict[str, Any] = {"width": lens.width, "height": lens.height, "device": device}
     stamps = np.arange(1, count + 1, dtype=np.int64) * _STAMPS_NS
 
-    each = [frames[index] for index in range(count)]
-
-    def whole_stacks() -> Row:
-        camera = engine.EventCamera(pixel, **size)
-        camera.reset(each[0], 0)
+    def timed(part: str, frames_a_call: int, make: Any, feed: Callable[[Any, int], int]) -> Row:
+        """Feed a camera call by call; `feed` takes it and the number of the call, and returns its events."""
+        camera = make()
+        camera.reset(each[0])
         calls = found = 0
 
         def call() -> None:
             nonlocal calls, found
-            found += len(camera.feed(frames, calls * stamps[-1] + stamps).numpy().t)
+            found += feed(camera, calls)
             calls += 1
 
         taken_s = _seconds(call, device, seconds)
-        events = found / (calls * count)
-        return {"part": STACK, "us per frame": 1e6 * taken_s / count, "events per frame": events}
+        row: Row = {"part": part, "us per frame": 1e6 * taken_s / frames_a_call}
+        return {**row, "events per frame": found / (calls * frames_a_call)}
 
-    def one_by_one(title: str, camera: Any, feed: Callable[[Any, int], int]) -> Row:
-        camera.reset(each[0])
-        shown = found = 0
+    def whole_stack(camera: Any, call: int) -> int:
+        return len(camera.feed(frames, call * stamps[-1] + stamps).numpy().t)
 
-        def call() -> None:
-            nonlocal shown, found
-            shown += 1
-            found += feed(each[shown % count], shown * _STAMPS_NS)
+    def drop_in(camera: Any, call: int) -> int:
+        return len(camera.step(each[(call + 1) % count], (call + 1) * _STAMPS_NS))
 
-        taken_s = _seconds(call, device, seconds)
-        return {"part": title, "us per frame": 1e6 * taken_s, "events per frame": found / shown}
+    def naive(camera: Any, call: int) -> int:
+        return int(camera.feed(each[(call + 1) % count], (call + 1) * _STAMPS_NS // 1000))
 
-    def drop_in() -> Row:
-        camera = engine.EventCamera(pixel, **size)
-        return one_by_one(DROP_IN, camera, lambda frame, stamp_ns: len(camera.step(frame, stamp_ns)))
-
-    def naive() -> Row:
-        camera = NaiveEventCamera(**size, threshold_on=pixel.threshold_on, threshold_off=pixel.threshold_off)
-        return one_by_one(NAIVE, camera, lambda frame, stamp_ns: camera.feed(frame, stamp_ns // 1000))
-
-    for measure_camera in (whole_stacks, drop_in, naive):
-        rows.append(_try(measure_camera))
+    thresholds: dict[str, Any] = {"threshold_on": pixel.threshold_on, "threshold_off": pixel.threshold_off}
+    ours, theirs = partial(engine.EventCamera, pixel, **size), partial(NaiveEventCamera, **size, **thresholds)
+    cases = (STACK, count, ours, whole_stack), (DROP_IN, 1, ours, drop_in), (NAIVE, 1, theirs, naive)
+    for part, frames_a_call, make, feed in cases:
+        rows.append(_try(partial(timed, part, frames_a_call, make, feed)))
     for row in rows:
         row["frames/s"] = 1e6 / row["us per frame"] if "us per frame" in row else None
     return rows
@@ -203,27 +192,18 @@ def _chapter(rows: list[Row], parts: list[Row], device: str, on_cuda: bool) -> C
         f"({best['pixels']}, {best['mode']}); a step is physics, control, render, event scan and "
         "packets on the host.",
         claims=[
-            Claim(
-                "640x480, every step rendered: >= 2,700 whole steps a second on a CUDA device",
-                "Neurosim paper, arXiv 2602.15018: 2,300 to 2,700 on an RTX 4090",
-                f"{vga[y]:,.0f}/s" if vga else "not flown",
-                vga[y] >= 2700.0 if vga and on_cuda else None,
-            ),
-            Claim(
-                "the event camera takes no longer for a frame than a naive one on the same frames",
-                "one event per pixel and frame, unsorted, its count read by the host, in the same run",
-                f"{cell(stack)} against {cell(naive)} frames/s",
-                stack >= naive if stack and naive else None,
-            ),
+            Claim("640x480, every step rendered: >= 2,700 whole steps a second on a CUDA device",
+                  "Neurosim paper, arXiv 2602.15018: 2,300 to 2,700 on an RTX 4090",
+                  f"{vga[y]:,.0f}/s" if vga else "not flown",
+                  vga[y] >= 2700.0 if vga and on_cuda else None),
+            Claim("the event camera takes no longer for a frame than a naive one on the same frames",
+                  "one event per pixel and frame, unsorted, its count read by the host, in the same run",
+                  f"{cell(stack)} against {cell(naive)} frames/s",
+                  stack >= naive if stack and naive else None),
         ],
         tables=[
-            Table(
-                "throughput-steps",
-                "Whole steps a second",
-                rows,
-                "Medians, from 1 s of the flight on, at 1 kHz.",
-            ),
+            Table("throughput-steps", "Whole steps a second", rows, "Medians, from 1 s on, at 1 kHz."),
             Table("throughput-parts", "Parts alone", parts, "Frames of a flight, shown forth and back."),
         ],
         plots=[Plot("throughput", "Whole steps a second", panels, 2)],
-    )
+    )  # fmt: skip

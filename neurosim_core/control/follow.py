@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
 from typing import Literal, get_args
 
 import numpy as np
@@ -114,29 +113,20 @@ class PathFollower:
         if self._controller is None:
             command = self._velocity(self._cursor.at(stamp_ns), position, orientation)
         else:
-            state = {
-                "position": position,
-                "velocity": velocity,
-                "orientation": orientation,
-                "body_rate": body_rate,
-                "rotor_speed": rotor_speed,
-            }
-            command = self._motor_speeds(self._controller, operator.index(stamp_ns), state)
+            host, stamp_ns = self._host, operator.index(stamp_ns)
+            host["position"][0] = position
+            host["velocity"][0] = velocity
+            host["orientation"][0] = orientation
+            host["body_rate"][0] = body_rate
+            host["rotor_speed"][0] = rotor_speed
+            if stamp_ns < host["stamp_ns"][0]:
+                self._controller.begin(self._all)
+            host["stamp_ns"][0] = stamp_ns
+            self._controller.update(self._feedback)
+            command = np.array(host["rotor_speed_command"][0])
         if not math.isfinite(sum(command.tolist())):
             raise ValueError(f"no finite command follows from the state at {stamp_ns} ns: it is not finite")
         return command
-
-    def _motor_speeds(
-        self, controller: PathController, stamp_ns: int, state: Mapping[str, ArrayLike]
-    ) -> NDArray[np.float64]:
-        host = self._host
-        for name, value in state.items():
-            host[name][0] = value
-        if stamp_ns < host["stamp_ns"][0]:
-            controller.begin(self._all)
-        host["stamp_ns"][0] = stamp_ns
-        controller.update(self._feedback)
-        return np.array(host["rotor_speed_command"][0])
 
     def error_m(self, stamp_ns: int, position: ArrayLike) -> float:
         """Return how far a position is from where the path is at a stamp [m]."""

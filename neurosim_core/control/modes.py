@@ -42,7 +42,6 @@ from neurosim_core.control.se3 import (
     velocity_wrench,
 )
 from neurosim_core.frames import as_rows
-from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
@@ -283,7 +282,7 @@ class Controller:
         self.setpoint = wp.zeros((count, len(self.layout)), dtype=wp.float64, device=self.device)
         matrix = allocation_matrix(vehicle)
         terms = frozenset(vehicle.terms()).intersection(AIR_TERMS if gains.feed_forward_air else ())
-        self._launch = RecordedLaunch(mode_kernel(mode, terms), self.device, block_dim=BLOCK_DIM)
+        self._kernel = mode_kernel(mode, terms)
         airframe = make_airframe(vehicle, self.device)
         self._model = [
             make_parameters(vehicle, gains, matrix),
@@ -292,7 +291,7 @@ class Controller:
             wp.array(matrix, dtype=wp.float64, device=self.device),
             upload_paths(given, self.device) if given else PathArrays(),
         ]
-        self._bound: tuple[Any, list[Any]] = (None, [])
+        self._bound: tuple[Any, Any] = (None, None)
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
@@ -308,8 +307,8 @@ class Controller:
             ValueError: If the arrays are of another number of vehicles or rotors, or on another device.
         """
         if self._bound[0] is not arrays:
-            self._bound = (arrays, self._arguments(arrays))
-        self._launch.launch(self.count, self._bound[1])
+            self._bound = (arrays, self._record(arrays))
+        self._bound[1].launch()
 
     def begin(self, mask: Any) -> None:
         """Nothing is remembered."""
@@ -349,8 +348,8 @@ class Controller:
             self.clamped_count += len(beyond)
         return rows
 
-    def _arguments(self, arrays: Any) -> list[Any]:
-        """Return the arguments of the kernel for some arrays."""
+    def _record(self, arrays: Any) -> Any:
+        """Prepare the launch on some arrays."""
         shape = (self.count, self.rotor_count)
         if arrays.rotor_speed.shape != shape or arrays.rotor_speed.device != self.device:
             raise ValueError(
@@ -360,4 +359,12 @@ class Controller:
         feedback = Feedback()
         for name in ("position", "velocity", "orientation", "body_rate", "rotor_speed", "stamp_ns"):
             setattr(feedback, name, getattr(arrays, name))
-        return [*self._model, feedback, self.setpoint, arrays.rotor_speed_command]
+        return wp.launch(
+            self._kernel,
+            dim=self.count,
+            inputs=[*self._model, feedback, self.setpoint],
+            outputs=[arrays.rotor_speed_command],
+            device=self.device,
+            block_dim=BLOCK_DIM,
+            record_cmd=True,
+        )

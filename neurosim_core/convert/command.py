@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurosim_core.overrides import add_set_option, read_settings
+from neurosim_core.settings_file import nested
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -192,11 +193,7 @@ def _convert_video(arguments: argparse.Namespace) -> int:
 
 
 def read_config(arguments: argparse.Namespace) -> ConversionConfig:
-    """Return the settings of a command line.
-
-    Raises:
-        ValueError: One is unknown or out of range; the message has one line for each.
-    """
+    """Return the settings of a command line."""
     from pydantic import ValidationError
 
     from neurosim_core.config_errors import explain
@@ -212,23 +209,9 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     if "time_unit" in settings and "timestamps" not in settings:
         raise ValueError("--time-unit is that of --timestamps, which are not given")
     try:
-        return ConversionConfig.model_validate(_nested(settings))
+        return ConversionConfig.model_validate(nested(settings))
     except ValidationError as error:
         raise ValueError("; ".join(explain(ConversionConfig, error))) from None
-
-
-def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {"a": {"b": value}} for the key "a.b"."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        *groups, last = key.split(".")
-        group = nested
-        for name in groups:
-            group = group.setdefault(name, {})
-            if not isinstance(group, dict):
-                raise ValueError(f"{key}: {name} is {group!r}, and has no keys")
-        group[last] = value
-    return nested
 
 
 def print_conversion(conversion: Conversion, out: Path, console: Console) -> None:

@@ -216,14 +216,6 @@ def convert_video(
         on_start: Told about the source, once it is open.
         on_stack: Told how many frames and events there are so far, and the time of the last frame [ns].
         stopped: Asked after each stack whether to end here.
-
-    Raises:
-        FileNotFoundError: There is no such video or folder.
-        FileExistsError: `out` is there, and may not be replaced.
-        IsADirectoryError: It is a folder.
-        ValueError: A frame cannot be read or has another size, there is only one, or their times do not
-            increase by 1 us at least; the crop or the size does not fit.
-        ImportError: PyAV or h5py is not installed.
     """
     config = config or ConversionConfig()
     out = Path(out)

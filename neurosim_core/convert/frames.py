@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,7 +17,7 @@ from PIL import Image, ImageOps
 from neurosim_core.clock import Rate
 from neurosim_core.convert.light import BT2020_PRIMARIES, TRANSFERS, transfer_of
 from neurosim_core.convert.luminance import LightTables, LumaDecoder, matrix_of
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Names of pictures in a folder end so, in lower or upper case."""
@@ -64,16 +63,9 @@ def open_source(
 ) -> Source:
     """Open a video, or a folder of pictures.
 
-    Args:
-        path: The file or folder. Pictures are taken in the natural order of their names: 2 comes before 10.
-        fps: Frames a second; for a video instead of the times in it [Hz].
-        stamps_ns: Times of the frames [ns], in place of `fps`.
-        transfer: Name of the transfer function; auto: what the file says, else sRGB.
-
-    Raises:
-        FileNotFoundError: There is no such file or folder.
-        ValueError: It cannot be read, is no video, has no pictures, or its times are not known.
-        ImportError: It is a video and PyAV is not installed.
+    `path`: the file or folder. Pictures are taken in the natural order of their names: 2 comes before 10.
+    `fps`: frames a second; for a video instead of the times in it [Hz]. `stamps_ns`: times of the frames
+    [ns], in place of `fps`. `transfer`: name of the transfer function; auto: what the file says, else sRGB.
     """
     if path.is_dir():
         return FolderSource(path, fps=fps, stamps_ns=stamps_ns, transfer=transfer)
@@ -86,15 +78,7 @@ def read_stamps(path: Path, *, unit: str = "s") -> list[int]:
     """Read times, one a line, exactly [ns].
 
     The first word of a line counts (what follows, such as a file name, does not); empty lines and lines that
-    begin with # are left out.
-
-    Args:
-        path: The file.
-        unit: What its numbers are in: s, ms, us or ns.
-
-    Raises:
-        ValueError: A line does not begin with a number; or the unit is not known.
-        OSError: It cannot be read.
+    begin with # are left out. `unit`: what its numbers are in: s, ms, us or ns.
     """
     if unit not in TIME_UNITS:
         raise ValueError(f"unit must be one of {', '.join(TIME_UNITS)}, got {unit!r}")
@@ -191,11 +175,7 @@ class FolderSource:
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Yield all frames, from the first.
-
-        Raises:
-            ValueError: A frame cannot be read, or has another size than the first.
-        """
+        """Yield all frames, from the first."""
         for number, file in enumerate(self._files):
             picture = _read_picture(file)
             _require_size(file, "the picture", (picture.shape[1], picture.shape[0]), self._size)
@@ -265,7 +245,7 @@ class VideoSource:
         stamps_ns: Sequence[int] | None = None,
         transfer: str = "auto",
     ) -> None:
-        self._av = _import_av()
+        self._av = need("videos need PyAV", "video", "av")
         self._path = path
         self._transfer = transfer
         self._clock = _Clock(fps=fps, stamps_ns=stamps_ns, path=path)
@@ -292,11 +272,7 @@ class VideoSource:
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Yield all frames, from the first.
-
-        Raises:
-            ValueError: A frame cannot be read, has another size or format than the first, or no time.
-        """
+        """Yield all frames, from the first."""
         with self._open() as container:
             for number, frame in enumerate(self._decoded(container)):
                 _require_size(self._path, f"frame {number}", (frame.width, frame.height), self._size)
@@ -328,14 +304,6 @@ class VideoSource:
                 number += 1
         except self._av.error.FFmpegError as error:
             raise ValueError(f"{self._path}: frame {number} cannot be decoded: {error.strerror}") from None
-
-
-def _import_av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError(f"videos need PyAV: {install_hint('video')}") from error
-    return av
 
 
 def _estimate(stream: Any, container: Any) -> int | None:

@@ -32,11 +32,7 @@ class Crop:
 
 
 def read_size(text: str) -> tuple[int, int]:
-    """Return width and height of a text such as 346x260 [px].
-
-    Raises:
-        ValueError: It is not of this form, or a number is 0.
-    """
+    """Return width and height of a text such as 346x260 [px]."""
     match = _SIZE.fullmatch(text)
     if match is None or "0" in match.groups():
         raise ValueError(f"size must be WIDTHxHEIGHT in pixels, such as 346x260, got {text!r}")
@@ -44,11 +40,7 @@ def read_size(text: str) -> tuple[int, int]:
 
 
 def read_crop(text: str) -> Crop:
-    """Return the rectangle of a text such as 640x480+10+0: width, height, first column, first row [px].
-
-    Raises:
-        ValueError: It is not of this form, or a width or height is 0.
-    """
+    """Return the rectangle of a text such as 640x480+10+0: width, height, first column, first row [px]."""
     match = _CROP.fullmatch(text)
     if match is None or "0" in match.groups()[:2]:
         raise ValueError(f"crop must be WIDTHxHEIGHT+X+Y in pixels, such as 640x480+10+0, got {text!r}")
@@ -67,15 +59,8 @@ class Resizer:
 
     An axis that becomes shorter is averaged over the areas of the larger pixels, exactly: a source pixel that
     lies in two pixels counts in each by the share of its area, so the mean is kept. An axis that becomes
-    longer is interpolated linearly between the centres of the source pixels.
-
-    Args:
-        source: Width and height of the pictures [px].
-        crop: What of them is taken.
-        size: Width and height of the result [px].
-
-    Raises:
-        ValueError: The rectangle is not inside the picture.
+    longer is interpolated linearly between the centres of the source pixels. `source`: width and height of
+    the pictures [px]. `size`: width and height of the result [px].
     """
 
     def __init__(self, source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:

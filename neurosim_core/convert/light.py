@@ -103,11 +103,7 @@ UNSPECIFIED = 2
 
 
 def transfer_of(number: int) -> str | None:
-    """Return the name of a transfer function by its number in H.273; None: the file does not tell.
-
-    Raises:
-        ValueError: It is not known here.
-    """
+    """Return the name of a transfer function by its number in H.273; None: the file does not tell."""
     if number in (0, UNSPECIFIED, 3):  # 0 and 3 are reserved
         return None
     if number not in _TRANSFER_OF_NUMBER:
@@ -129,9 +125,7 @@ def luminance_weights(primaries: int) -> tuple[float, float, float]:
 def code_step(codes: NDArray[np.float64], floor: float) -> float:
     """Return the largest change of log(luminance + floor) by one step of the stored numbers.
 
-    Args:
-        codes: Luminance of all numbers in their order, none if light is stored itself.
-        floor: Dark floor.
+    `codes`: luminance of all numbers in their order, none if light is stored itself.
     """
     return float(np.diff(np.log(codes + floor)).max()) if len(codes) > 1 else 0.0
 

@@ -71,10 +71,7 @@ def _luminance(
 class LightTables:
     """Looks up the luminance of numbers of which 0 is black and the largest is white.
 
-    Args:
-        transfer: Name of the transfer function, one of `TRANSFERS`.
-        bits: Of a number, 8 or 16.
-        primaries: Number of the primaries in H.273.
+    `transfer`: name of the transfer function, one of `TRANSFERS`.
 
     Attributes:
         codes: Luminance of the greys, from black to white.
@@ -89,8 +86,7 @@ class LightTables:
     def luminance(self, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the luminance of a picture, shape [H, W], white is 1.
 
-        Args:
-            picture: Greys, shape [H, W], or red, green, blue, shape [H, W, 3].
+        `picture`: greys, shape [H, W], or red, green, blue, shape [H, W, 3].
         """
         if picture.ndim == 2:
             return self._gray[picture]
@@ -102,9 +98,6 @@ def matrix_of(number: int, height: int) -> tuple[float, float]:
     """Return k_r and k_b by the number of the matrix in H.273.
 
     A file that does not tell is taken for BT.709 from 720 rows on, and for BT.601 below, as players do.
-
-    Raises:
-        ValueError: The matrix is not known here.
     """
     if number in (0, UNSPECIFIED, 3):
         number = 1 if height >= _HD_HEIGHT else 6
@@ -119,13 +112,9 @@ def matrix_of(number: int, height: int) -> tuple[float, float]:
 class LumaDecoder:
     """Turns pictures of luma and colour differences into luminance.
 
-    Args:
-        transfer: Name of the transfer function, one of `TRANSFERS`.
-        bits: Bits of a stored number, 8 to 16.
-        matrix: k_r and k_b.
-        primaries: Number of the primaries in H.273.
-        limited: Luma of black is 16 / 256 and of white 235 / 256 of the range, and colour differences span
-            16 / 256 to 240 / 256, else all of it. Beyond black and white it is black and white.
+    `transfer`: name of the transfer function, one of `TRANSFERS`. `bits`: bits of a stored number, 8 to 16.
+    `limited`: luma of black is 16 / 256 and of white 235 / 256 of the range, and colour differences span 16 /
+    256 to 240 / 256, else all of it. Beyond black and white it is black and white.
 
     Attributes:
         codes: Luminance of the greys, from black to white.
@@ -146,8 +135,7 @@ class LumaDecoder:
     def luminance(self, picture: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the luminance, shape [H, W], white is 1.
 
-        Args:
-            picture: Y', C_b, C_r, their highest bit at bit 15, shape [H, W, 3].
+        `picture`: Y', C_b, C_r, their highest bit at bit 15, shape [H, W, 3].
         """
         out = np.empty(picture.shape[:2], dtype=np.float32)
         inputs, outputs = (

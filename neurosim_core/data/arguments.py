@@ -13,11 +13,7 @@ _P = ParamSpec("_P")
 
 
 def refuse_unknown(name: str, given: Iterable[str], known: list[str]) -> None:
-    """Refuse names of arguments that are not known.
-
-    Raises:
-        TypeError: One is not; the message has all that are.
-    """
+    """Refuse names of arguments that are not known."""
     for argument in given:
         if argument not in known:
             hint = suggestion(argument, known)

@@ -23,15 +23,7 @@ _WINDOW_S = 0.02
 
 
 def write_card(plan: DatasetPlan, *, command: str) -> None:
-    """Write README.md and sheet.png.
-
-    Args:
-        plan: A data set that is complete.
-        command: What makes it again.
-
-    Raises:
-        OSError: They cannot be written.
-    """
+    """Write README.md and sheet.png."""
     numbers = range(plan.flight_count)
     stats = [_read_stats(plan.path(number).with_suffix(".json")) for number in numbers]
     picture = _draw_sheet(plan)

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neurosim_core.overrides import add_set_option, read_settings, set_options
+from neurosim_core.overrides import add_settings, load_settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Fly a configuration many times, with other seeds, and write recordings, a card and "
         "checksums. Started again after an interruption, it goes on; the bytes are the same.",
     )
-    parser.add_argument("config", nargs="?", type=Path, help="settings file (YAML); default: an apartment")
+    add_settings(parser)
     parser.add_argument("--flights", type=int, required=True, metavar="N", help="how many")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this one")
@@ -39,13 +39,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--flights-per-scene", type=int, default=10, metavar="N", help="flights in one generated scene"
     )
-    parser.add_argument("--duration", type=float, metavar="S", help="simulated time of a flight [s]")
-    parser.add_argument("--seed", type=int, help="seed of the first flight")
-    parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
     parser.add_argument(
         "--webdataset", type=Path, metavar="DIR", help="write windows of 50 ms as shards for WebDataset, too"
     )
-    add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
     parser.set_defaults(command=_make)
 
 
@@ -55,20 +51,15 @@ def _make(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from neurosim_core.config import load_config
     from neurosim_core.data.card import write_card
     from neurosim_core.data.make import DatasetPlan, prepare, write_checksums
     from neurosim_core.render.launch import single_threaded_blas
     from neurosim_core.signals import stop_at_signals
 
-    overrides = read_settings(arguments.settings)
-    given = {"duration_s": arguments.duration, "seed": arguments.seed, "device": arguments.device}
-    overrides |= {key: value for key, value in given.items() if value is not None}
-    options = set_options(read_settings(arguments.settings))
     if arguments.workers < 0:
         raise ValueError(f"--workers must be at least 0, got {arguments.workers}")
     plan = DatasetPlan(
-        config=load_config(arguments.config, overrides=overrides, options=options),
+        config=load_settings(arguments),
         folder=arguments.out,
         flight_count=arguments.flights,
         flights_per_scene=arguments.flights_per_scene,

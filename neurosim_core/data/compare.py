@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io import open_events
 from neurosim_core.packets import EventArrays
 
@@ -93,15 +93,8 @@ class EventStats:
 def measure_events(path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> EventStats:
     """Return the statistics of a file of events of any format.
 
-    Args:
-        path: The file.
-        size: Width and height of the sensor [px], where the file does not say it.
-        sensor: Event camera, of files that hold several; empty: the first.
-
-    Raises:
-        EventFileError: It is damaged.
-        ImportError: A library for its format is not installed.
-        OSError: It cannot be read.
+    `size`: width and height of the sensor [px], where the file does not say it. `sensor`: event camera, of
+    files that hold several; empty: the first.
     """
     with closing(open_events(path, size=size, sensor=sensor)) as reader:
         stats = EventStats(name=path.name, width=reader.width, height=reader.height)
@@ -198,25 +191,13 @@ def _radial(power: NDArray[np.float64], width: int) -> tuple[NDArray[np.float64]
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Return an empty figure of matplotlib, of 100 px an inch.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
-    try:
-        import matplotlib.figure
-    except ImportError as error:
-        raise ImportError(f"plots need matplotlib: {install_hint('view')}") from error
-    return matplotlib.figure.Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
+    """Return an empty figure of matplotlib, of 100 px an inch."""
+    figure = need("plots need matplotlib", "view", "matplotlib.figure")
+    return figure.Figure(figsize=(width_in, height_in), dpi=100, layout="constrained")
 
 
 def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
-    """Draw a page that compares files, as PNG, PDF or SVG.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        OSError: It cannot be written.
-    """
+    """Draw a page that compares files, as PNG, PDF or SVG."""
     figure = new_figure(14.0, 9.0)
     grid = figure.add_gridspec(3, 6, height_ratios=[1.0, 1.0, 0.9])
     plots = [figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])]

@@ -22,18 +22,11 @@ _BATCH_WINDOWS_MAX = 64
 class RecordedFlight:
     """The windows of one recording. It may be sent to other processes, and used after a fork.
 
-    Args:
-        path: File that `RecordingWriter` wrote.
-        config: Which windows.
-        name: For its samples; None: the path.
+    `path`: file that `RecordingWriter` wrote. `name`: for its samples; None: the path.
 
     Attributes:
         span_ns: From the first to the last event packet.
         skipped_count: Windows that were left out, as their ground truth is missing.
-
-    Raises:
-        ValueError: It is no recording, or does not have what is wanted.
-        OSError: It cannot be read.
     """
 
     def __init__(self, path: Path, config: WindowConfig, *, name: str | None = None) -> None:
@@ -68,11 +61,7 @@ class RecordedFlight:
         self._file = None
 
     def read(self, first: int, count: int) -> list[Sample]:
-        """Return consecutive windows.
-
-        Raises:
-            OSError: The file is damaged or gone.
-        """
+        """Return consecutive windows."""
         samples: list[Sample] = []
         for begin in range(first, first + count, _BATCH_WINDOWS_MAX):
             samples += self._read(begin, min(_BATCH_WINDOWS_MAX, first + count - begin))

@@ -127,12 +127,7 @@ def _indented(text: str) -> str:
 
 
 def prepare(plan: DatasetPlan) -> None:
-    """Make the folder, or see that what is in it belongs to this data set.
-
-    Raises:
-        FileExistsError: There is something else.
-        OSError: It cannot be written to.
-    """
+    """Make the folder, or see that what is in it belongs to this data set."""
     described = plan.folder / "dataset.yaml"
     if described.exists():
         if described.read_text("utf-8") != plan.description:
@@ -152,15 +147,9 @@ def make_flights(
 ) -> Iterator[int]:
     """Fly what is missing; yield the number of each flight when it is there.
 
-    Args:
-        plan: What to make; `prepare` must have been called.
-        workers: Processes; 0: in this one.
-        stopped: Asked now and then; when it returns true, flights that have begun are given up.
-        seconds: How often it is asked at least [s].
-
-    Raises:
-        RuntimeError: A worker died.
-        OSError, ValueError: A flight cannot be made.
+    `plan`: what to make; `prepare` must have been called. `workers`: processes; 0: in this one. `stopped`:
+    asked now and then; when it returns true, flights that have begun are given up. `seconds`: how often it is
+    asked at least [s].
     """
     missing = plan.missing()
     if workers == 0:

@@ -7,7 +7,6 @@ it when a few results wait to be taken: memory does not grow where training is s
 from __future__ import annotations
 
 import contextlib
-import importlib
 import itertools
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +19,7 @@ from neurosim_core.data.batch import Sample
 from neurosim_core.data.make import DatasetPlan, fly, stretches_of, write_whole
 from neurosim_core.data.sources import RunSource, fields_of, numbered
 from neurosim_core.data.windows import WindowConfig, choose_sensors
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.render.launch import limit_cores
 
 SEEDS_APART = 10_000
@@ -43,10 +42,7 @@ def cluster(address: str) -> Iterator[Any]:
         ImportError: Ray is not installed.
         ConnectionError: There is no such cluster.
     """
-    try:
-        ray = importlib.import_module("ray")
-    except ImportError as error:
-        raise ImportError(f"clusters need Ray: {install_hint('distributed')}") from error
+    ray = need("clusters need Ray", "distributed", "ray")
     if ray.is_initialized():
         yield ray
         return
@@ -158,15 +154,7 @@ def make_flights_on_ray(
 ) -> Iterator[int]:
     """Do what `make_flights` does, on a cluster: recordings are sent here, and no disk need be shared.
 
-    Args:
-        plan: See `make_flights`.
-        address: See `cluster`.
-        workers: How many tasks at a time.
-        stopped: See `make_flights`.
-
-    Raises:
-        ImportError, ConnectionError: See `cluster`.
-        OSError, ValueError: A flight cannot be made.
+    `plan`: see `make_flights`. `address`: see `cluster`. `stopped`: see `make_flights`.
     """
     waiting = stretches_of(plan, workers)
     with cluster(address) as ray:

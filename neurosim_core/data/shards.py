@@ -27,17 +27,9 @@ _FACTS = ("stamp_ns", "start_ns", "source", "width", "height", "dropped_count", 
 def write_shards(samples: Iterable[Sample], folder: Path, *, windows: int = 1000) -> list[Path]:
     """Write windows into shards in a new folder; the same windows give the same bytes.
 
-    Args:
-        samples: Such as a `Dataset`, or `RunSource(...).samples(...)`; taken one by one.
-        folder: It appears once all shards are complete.
-        windows: Of a shard, the last of which may have fewer.
-
-    Returns:
-        The shards, `windows-000000.tar` and so on.
-
-    Raises:
-        FileExistsError: The folder is there already.
-        ValueError: `windows` is less than 1.
+    `samples`: such as a `Dataset`, or `RunSource(...).samples(...)`; taken one by one. `folder`: it appears
+    once all shards are complete. `windows`: of a shard, the last of which may have fewer. Returns the shards,
+    `windows-000000.tar` and so on.
     """
     if windows < 1:
         raise ValueError(f"windows must be at least 1, got {windows}")
@@ -75,17 +67,12 @@ def _files(sample: Sample) -> Iterator[tuple[str, bytes]]:
 class ShardFlight:
     """The windows of one shard. It may be sent to other processes, and used after a fork.
 
-    Args:
-        path: A shard, with all windows of one length.
-        config: Which windows; stride and choice of sensors are those with which it was written.
+    `path`: a shard, with all windows of one length. `config`: which windows; stride and choice of sensors are
+    those with which it was written.
 
     Attributes:
         skipped_count: 0: what has no ground truth is not in it.
         span_ns: 0: it is not known.
-
-    Raises:
-        ValueError: It is no shard, is damaged, or does not have what is wanted.
-        OSError: It cannot be read.
     """
 
     skipped_count = 0
@@ -119,12 +106,7 @@ class ShardFlight:
         """Nothing is open between two reads."""
 
     def read(self, first: int, count: int) -> list[Sample]:
-        """Return consecutive windows.
-
-        Raises:
-            OSError: The file is gone.
-            ValueError: It is damaged.
-        """
+        """Return consecutive windows."""
         return [self._sample(number) for number in range(first, first + count)]
 
     def _sample(self, number: int) -> Sample:

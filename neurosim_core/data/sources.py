@@ -31,11 +31,7 @@ class SampleSource(Protocol):
     """Gives the samples of some flights, in the order in which they come."""
 
     def samples(self, config: WindowConfig) -> Iterator[Sample]:
-        """Yield the windows of the next flights; a new call begins new flights.
-
-        Raises:
-            ValueError: The source does not have what is wanted.
-        """
+        """Yield the windows of the next flights; a new call begins new flights."""
 
     @property
     def skipped_count(self) -> int:
@@ -102,10 +98,8 @@ class RunSource:
 class WorldsSource:
     """Worlds that are stepped together along their paths; their windows come in turns.
 
-    Each call of `samples` resets the worlds; the second and later ones with new seeds.
-
-    Args:
-        simulation: The worlds; they are used up to the end of `duration_s`.
+    Each call of `samples` resets the worlds; the second and later ones with new seeds. `simulation`: the
+    worlds; they are used up to the end of `duration_s`.
     """
 
     def __init__(self, simulation: Simulation) -> None:

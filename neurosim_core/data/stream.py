@@ -304,9 +304,6 @@ def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Return the files of a source: of folders all recordings and event files below, in alphabetical order.
 
     Texts, HDF5 and NPZ files in folders that hold no events, but poses say, are left out.
-
-    Raises:
-        FileNotFoundError: There is none.
     """
     from neurosim_core.io import is_event_file
 

@@ -7,7 +7,6 @@ import pickle
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import is_dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from neurosim_core.data.arguments import refuse_unknown
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import Position, Stream
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 
 
 class Loader:
@@ -137,13 +136,8 @@ def _require_sendable(transform: Any) -> None:
         ) from None
 
 
-def _import_torch() -> ModuleType:
-    try:
-        import torch
-        import torch.utils.data
-    except ImportError as error:
-        raise ImportError(f"loaders need PyTorch: {install_hint('learn')}") from error
-    return torch
+def _import_torch() -> Any:
+    return need("loaders need PyTorch", "learn", "torch", "torch.utils.data")
 
 
 def __getattr__(name: str) -> Any:

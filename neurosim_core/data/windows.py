@@ -100,10 +100,7 @@ def value_of(packet: Packet) -> Any:
 class PacketWindows:
     """Cuts the packets of one flight into windows. Sensors must be known before the first window ends.
 
-    Args:
-        config: Which windows.
-        sensors: Name of the sensor of each field that there is.
-        source: Name of the flight, for its samples.
+    `sensors`: name of the sensor of each field that there is. `source`: name of the flight, for its samples.
 
     Attributes:
         skipped_count: Windows that were left out, as their ground truth is missing.
@@ -217,13 +214,7 @@ def cut_events(parts: Iterable[EventArrays], start_us: int, end_us: int) -> Even
 def choose_sensors(found: Mapping[str, str | None], config: WindowConfig, *, source: str) -> dict[str, str]:
     """Return the name of the sensor of each field.
 
-    Args:
-        found: The field of each sensor, in the order in which the first is to be taken.
-        config: What the user wants.
-        source: Name for error messages.
-
-    Raises:
-        ValueError: A field that is wanted has no sensor, or there is no event camera.
+    `found`: the field of each sensor, in the order in which the first is to be taken.
     """
     chosen: dict[str, str] = {}
     for sensor, name in found.items():

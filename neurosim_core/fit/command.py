@@ -182,11 +182,7 @@ def fit_yaml(fit: SensorFit, width: int, height: int, lux: float, names: list[st
 
 
 def draw_fit(fit: SensorFit, out: Path) -> None:
-    """Draw the recording beside its simulation, as PNG, PDF or SVG.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+    """Draw the recording beside its simulation, as PNG, PDF or SVG."""
     import numpy as np
 
     from neurosim_core.data.compare import label_axes, new_figure

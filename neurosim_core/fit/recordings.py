@@ -186,9 +186,6 @@ def find_steps(events: EventArrays) -> tuple[Counts, Counts]:
     """Return when light begins to rise and to fall [us], in turns: a rise first, and each with its fall.
 
     The last fall is left out with its rise: a readout that is late may not have read it.
-
-    Raises:
-        ValueError: There are fewer than three of each.
     """
     begin_us = int(events.t[0]) if len(events.t) else 0
     bins = (events.t - begin_us) // _BIN_US

@@ -34,6 +34,7 @@ from neurosim_core.fit.recordings import (
 from neurosim_core.packets import EventArrays
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.events import EventCamera
+from neurosim_core.settings_file import nested
 
 _ROUNDS, _REFIT_ROUNDS = 5, 3
 _GAIN = 1.3
@@ -105,11 +106,7 @@ class SensorFit:
 
 def make_pixel(settings: Mapping[str, Any]) -> EventCameraConfig:
     """Return pixels of dotted settings."""
-    nested: dict[str, Any] = {}
-    for key, value in settings.items():
-        group, _, name = key.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[name] = value
-    return EventCameraConfig.model_validate(nested)
+    return EventCameraConfig.model_validate(nested(settings))
 
 
 def fit_sensor(
@@ -121,14 +118,7 @@ def fit_sensor(
 ) -> SensorFit:
     """Return the settings of an event camera whose recordings are like those given.
 
-    Args:
-        stimulus: The recordings.
-        repeats: Simulations for the standard errors, at least 2.
-        seed: Of the simulations.
-        progress: Is told what is done.
-
-    Raises:
-        ValueError: The recordings do not show what they must.
+    `repeats`: simulations for the standard errors, at least 2.
     """
     if repeats < 2:
         raise ValueError(f"repeats must be >= 2, got {repeats}")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
 from neurosim_core.packets import EventArrays
 
@@ -127,12 +126,8 @@ def _columns(events: Any) -> EventArrays:
     return events_of(*(events[name] for name in ("t", "x", "y", "on" if "on" in events.dtype.names else "p")))
 
 
-def _import_faery() -> ModuleType:
-    try:
-        import faery
-    except ImportError as error:
-        raise ImportError(f"AEDAT4 and Event Stream files need faery: {install_hint('formats')}") from error
-    return faery
+def _import_faery() -> Any:
+    return need("AEDAT4 and Event Stream files need faery", "formats", "faery")
 
 
 def _damage(path: Path, error: BaseException) -> BaseException:

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io.event_file import EventFileError, events_of
 from neurosim_core.io.hdf5_events import Hdf5Source, damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, Packet
@@ -130,10 +130,7 @@ class DsecSource:
 
 def _pixels(file: Path) -> NDArray[np.float64]:
     """Return a picture of 16 bit."""
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError(f"pictures of 16 bit need PyAV: {install_hint('video')}") from error
+    av = need("pictures of 16 bit need PyAV", "video", "av")
     try:
         with av.open(str(file)) as container:
             picture: Any = next(container.decode(video=0))

@@ -49,13 +49,8 @@ _FOLDERS = {"metadata.yaml": "rosbag", "events/left/events.h5": "dsec"}
 def format_of(path: Path, name: str | None = None) -> str:
     """Return the name of the format of a file, from its own name.
 
-    Args:
-        path: The file; what is in it does not count. A directory with metadata of rosbag2 is a bag, one with
-            events/left/events.h5 a sequence of DSEC.
-        name: The format, if the user says it.
-
-    Raises:
-        EventFileError: No format has this name, or this suffix.
+    `path`: the file; what is in it does not count. A directory with metadata of rosbag2 is a bag, one with
+    events/left/events.h5 a sequence of DSEC. `name`: the format, if the user says it.
     """
     if name is not None:
         if name not in FORMATS:
@@ -85,13 +80,7 @@ def is_event_file(path: Path) -> bool:
 
 
 def check_events(path: Path) -> None:
-    """Look whether there are events in a file of a format that is used for other things as well.
-
-    Raises:
-        NoEventsError: There are none.
-        EventFileError: It is damaged.
-        OSError: It cannot be read.
-    """
+    """Look whether there are events in a file of a format that is used for other things as well."""
     if path.is_dir() or (path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path)):
         return
     if (name := _format_in(path)) in (*_UNITLESS, "mvsec"):
@@ -136,12 +125,7 @@ def open_events(
 
 
 def is_recording(path: Path) -> bool:
-    """Whether an HDF5 file is a recording of Neurosim.
-
-    Raises:
-        EventFileError: It is no HDF5 file.
-        OSError: It cannot be read.
-    """
+    """Whether an HDF5 file is a recording of Neurosim."""
     with open_hdf5(path) as file, damage_of(path):
         return bool(file.attrs.get("format") == FORMAT)
 

@@ -40,12 +40,7 @@ _SPAN_MAX_US = 30 * 24 * 3_600_000_000
 
 
 def open_hdf5(path: Path) -> Any:
-    """Open an HDF5 file for reading.
-
-    Raises:
-        EventFileError: It is no HDF5 file, or not a whole one.
-        OSError: It cannot be read.
-    """
+    """Open an HDF5 file for reading."""
     h5py = import_h5py()
     with contextlib.suppress(ImportError):  # filters of files of DSEC, for whoever has them
         import_module("hdf5plugin")
@@ -198,19 +193,13 @@ def _class(recording: Recording, sensor: str) -> type[Packet]:
     return packet_class(recording.schema(sensor))
 
 
-class damage_of:
-    """Turns what h5py raises on a damaged file into an EventFileError."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        """Nothing to do."""
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: Any) -> None:
-        if isinstance(error, EventFileError) or not isinstance(
-            error, OSError | RuntimeError | KeyError | ValueError | TypeError | OverflowError | IndexError
-        ):
-            return
+@contextlib.contextmanager
+def damage_of(path: Path) -> Iterator[None]:
+    """Turn what h5py raises on a damaged file into an EventFileError."""
+    try:
+        yield
+    except EventFileError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError) as error:
         plugin = "; DSEC compresses with Blosc: pip install hdf5plugin" if "filter" in str(error) else ""
-        raise EventFileError(f"{self._path} is damaged: {error}{plugin}") from None
+        raise EventFileError(f"{path} is damaged: {error}{plugin}") from None

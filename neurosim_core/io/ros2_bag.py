@@ -8,28 +8,20 @@ wanted.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.io.event_file import EventFileError, EventSource, PacketCutter, gather_blocks
 from neurosim_core.packets import EventArrays, Odometry, Packet
 
-_BRIDGE = "cortex_ros2_bridge.bag_file"
 _VEHICLE = "drone"
 _EVENTS = "events"
 
 
 def open_mcap(path: Path, *, sensor: str = "") -> EventSource:
-    """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2.
-
-    Raises:
-        EventFileError: It is neither, or has no events.
-        ImportError: A library is not installed.
-        OSError: It cannot be read.
-    """
+    """Open a file of type MCAP: a log of Cortex, or a bag of ROS 2."""
     from neurosim_core.io.cortex_log import LogSource
 
     with open(path, "rb") as file:
@@ -141,7 +133,4 @@ class BagSink:
 
 
 def _bridge() -> Any:
-    try:
-        return importlib.import_module(_BRIDGE)
-    except ImportError as error:
-        raise ImportError(f"bags of ROS 2 need rosbags: {install_hint('ros2')}") from error
+    return need("bags of ROS 2 need rosbags", "ros2", "cortex_ros2_bridge.bag_file")

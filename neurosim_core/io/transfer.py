@@ -61,11 +61,6 @@ def transfer(
             it, so that pictures stay at multiples of their period.
         time_unit: Of `source`, where it does not say it; see `open_events`.
         on_block: Called with the number of events so far.
-
-    Raises:
-        EventFileError: `source` is damaged, or `out` cannot hold its events.
-        ImportError: A library for a format is not installed.
-        OSError: A file cannot be read or written.
     """
     name = format_of(out, out_format)
     folder = out.with_name(f".{out.name}.part")
@@ -112,12 +107,7 @@ def transfer(
 
 @contextlib.contextmanager
 def as_recording(path: Path) -> Iterator[Path]:
-    """Give a file of events as a recording: itself if it is one, else a copy that is removed afterwards.
-
-    Raises:
-        EventFileError: It is damaged.
-        OSError: It cannot be read, or there is no room for the copy.
-    """
+    """Give a file of events as a recording: itself if it is one, else a copy that is removed afterwards."""
     if path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path):
         yield path
         return

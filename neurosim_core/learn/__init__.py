@@ -14,7 +14,7 @@ from neurosim_core.lazy import lazy_names
 if TYPE_CHECKING:  # isort: off
     from neurosim_core.learn.dense import DenseNet as DenseNet
     from neurosim_core.learn.dense_train import load_dense as load_dense
-    from neurosim_core.learn.depth import depth_loss as depth_loss
+    from neurosim_core.learn.heads import depth_loss as depth_loss
     from neurosim_core.learn.env import (
         Env as Env,
         make_env as make_env,
@@ -42,11 +42,7 @@ if TYPE_CHECKING:  # isort: off
 
 
 def need(*modules: str) -> Any:
-    """Import libraries of the extra, and return the first.
-
-    Raises:
-        ImportError: One is not installed; says how to install it.
-    """
+    """Import libraries of the extra, and return the first."""
     try:
         found = [importlib.import_module(module) for module in modules]
         return found[0]

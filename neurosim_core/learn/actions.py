@@ -69,11 +69,7 @@ COMMANDS: dict[str, Callable[[Task, View], torch.Tensor]] = {
 
 
 def hover_command(mode: ActionMode, vehicle: MultirotorConfig) -> list[float]:
-    """Return what is commanded before the first action takes effect; an attitude is turned to the heading.
-
-    Raises:
-        ValueError: There is no such mode, or it does not suit the vehicle.
-    """
+    """Return what is commanded before the first action takes effect; an attitude is turned to the heading."""
     if mode not in COMMANDS:
         raise ValueError(f"unknown mode {mode!r} of actions, known: {', '.join(COMMANDS)}")
     if mode == "motor_speeds":

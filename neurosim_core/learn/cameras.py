@@ -27,16 +27,8 @@ LENS_COUNT = 64
 def draw_lenses(settings: Mapping[str, Any], drawn: Randomisation) -> tuple[list[Any], NDArray[np.float32]]:
     """Return the lenses that there are in episodes, the same in each call, and what they differ in.
 
-    Args:
-        settings: Of the lens.
-        drawn: What to draw.
-
-    Returns:
-        `LENS_COUNT` lenses, none where all are as the settings say; and factor of the focal length, shifts
-        of the optical axis along rows and columns (share of the width), and k1 of each, shape [lens, 4].
-
-    Raises:
-        ValueError: The lens has no focal length, or no k1 and that is to be drawn; or it would fold over.
+    Returns `LENS_COUNT` lenses, none where all are as the settings say; and factor of the focal length,
+    shifts of the optical axis along rows and columns (share of the width), and k1 of each, shape [lens, 4].
     """
     bounds = np.array(
         [
@@ -119,11 +111,8 @@ def _vary(
 class CameraDraws:
     """Draws how a camera is mounted and looks, and the light, when episodes begin; launches only.
 
-    Args:
-        sim: Where the camera is, made with `lenses` of `draw_lenses`; with `own_light` where light is drawn.
-        camera: Its name.
-        drawn: What to draw.
-        lens_table: What the lenses differ in, of `draw_lenses`.
+    `sim`: where the camera is, made with `lenses` of `draw_lenses`; with `own_light` where light is drawn.
+    `lens_table`: what the lenses differ in, of `draw_lenses`.
     """
 
     def __init__(

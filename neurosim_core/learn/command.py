@@ -184,11 +184,7 @@ _TRAIN = {
 
 
 def _refuse_unused(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuse options that would have no effect.
-
-    Raises:
-        ValueError: There are some.
-    """
+    """Refuse options that would have no effect."""
     options = {action.dest for action in parser._actions if action.dest in vars(arguments)} - {"what"}
     given = {name for name in options if getattr(arguments, name) != parser.get_default(name)}
     what, run = arguments.what, arguments.run

@@ -57,12 +57,8 @@ class DaggerConfig:
 class Dagger:
     """Trains a student in an environment, iteration by iteration.
 
-    Args:
-        env: The student sees its group `student`, of which `events` are pictures; the teacher `teacher`.
-            `Task.hint` is estimated besides.
-        teacher: Who is imitated.
-        config: How.
-        generator: Of all random numbers, on the device of the environment.
+    `env`: the student sees its group `student`, of which `events` are pictures; the teacher `teacher`.
+    `Task.hint` is estimated besides. `generator`: of all random numbers, on the device of the environment.
     """
 
     def __init__(self, env: Env, teacher: Teacher, config: DaggerConfig, generator: torch.Generator) -> None:
@@ -99,11 +95,7 @@ class Dagger:
     def iterate(self, done: float) -> dict[str, float]:
         """Fly some steps and learn from them; on a CPU learn meanwhile, from those before if there are any.
 
-        Args:
-            done: Share of the training that lies behind.
-
-        Returns:
-            What to log.
+        `done`: share of the training that lies behind. Returns what to log.
         """
         config = self.config
         rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0)))

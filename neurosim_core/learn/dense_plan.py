@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 from typing import Any
 
 from neurosim_core.config import SimulationConfig
@@ -51,9 +50,7 @@ class PathPlanner:
     def __enter__(self) -> PathPlanner:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for process in self._processes:
             process.kill()
             process.communicate()
@@ -70,12 +67,7 @@ class PathPlanner:
             process.stdin.flush()
 
     def result(self) -> list[Path]:
-        """Wait for the paths that were begun, and return them in their order.
-
-        Raises:
-            ValueError: One does not exist.
-            RuntimeError: A process has died.
-        """
+        """Wait for the paths that were begun, and return them in their order."""
         answers: list[Iterator[Path]] = []
         for process in self._processes:
             assert process.stdout is not None

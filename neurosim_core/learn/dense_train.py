@@ -23,9 +23,7 @@ from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import find_recordings
 from neurosim_core.learn.dense import DenseNet, Head, Memory
 from neurosim_core.learn.dense_live import flight_settings, live_flights
-from neurosim_core.learn.depth import DepthHead
-from neurosim_core.learn.flow import FlowHead
-from neurosim_core.learn.future import FutureHead
+from neurosim_core.learn.heads import DepthHead, FlowHead, FutureHead
 
 _log = logging.getLogger(__name__)
 HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}
@@ -119,11 +117,8 @@ def windows_of(batch: Batch, head: Head, bins: int) -> Windows:
 class WindowPool:
     """Windows to be seen again, in sequences that follow on each other; filled from any source.
 
-    Args:
-        length: Windows of a sequence.
-        room: Most windows.
-        mirrored: Factor of each channel of a target in a mirrored picture.
-        device: Where they are kept; None: where they come from.
+    `mirrored`: factor of each channel of a target in a mirrored picture. `device`: where they are kept; None:
+    where they come from.
     """
 
     def __init__(
@@ -204,11 +199,7 @@ def evaluate(
 ) -> Any:
     """Return the errors over flights, each from its first window to its last, with memory.
 
-    Args:
-        predict: Called with a voxel [1, bins, H, W] and the memory of the window before, or None.
-        tested: In order.
-        head: What is predicted.
-        device: Where the network is.
+    `predict`: called with a voxel [1, bins, H, W] and the memory of the window before, or None.
     """
     sums, memory, flight = head.errors(), None, None
     due: list[tuple[Tensor, Tensor]] = []
@@ -239,6 +230,8 @@ def train_dense(
 ) -> dict[str, Any]:
     """Train, test in scenes not seen, and leave all in a folder.
 
+    Returns errors of the network, of the network with its events zeroed, and of the mean of each pixel.
+
     Args:
         folder: Gets `TASK.pt` and `TASK.json`.
         config: What, and how.
@@ -247,14 +240,6 @@ def train_dense(
         ray: Address of a cluster of Ray where those of `live` fly instead; see `data.ray_source.cluster`.
         worlds: Or from so many worlds, on the device of the network.
         test: A data set to test on; None: flights in scenes of their own.
-
-    Returns:
-        Errors of the network, of the network with its events zeroed, and of the mean of each pixel.
-
-    Raises:
-        FileNotFoundError: There is no such data set.
-        ValueError: Not exactly one source is given, there is too little data, the backbone does not fit, or
-            `fly_device` is given for what are no worlds.
     """
     if bool(data) + bool(live) + bool(worlds) != 1:
         raise ValueError("say what to learn from: --data DIR, --live N, or --worlds N")

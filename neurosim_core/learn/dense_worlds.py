@@ -39,19 +39,9 @@ def world_windows(
 
     Generated scenes are eight, of the seeds from that of the settings on. When a flight is over, all worlds
     fly other paths with other thresholds, and one of these scenes has been replaced by the next. Other
-    processes plan these paths while the worlds fly; close the generator to end them.
-
-    Args:
-        settings: Of a flight.
-        head: What is predicted.
-        worlds: How many.
-        bins: Of the voxels.
-        window_s: Length of a window [s].
-        renders: Of the event camera in a window; None: as the settings say.
-        threshold_spread: Each world draws its thresholds up to this share above the nominal ones, or below.
-
-    Raises:
-        ValueError: A window is not a whole number of control periods, or no path exists.
+    processes plan these paths while the worlds fly; close the generator to end them. `window_s`: length of a
+    window [s]. `renders`: of the event camera in a window; None: as the settings say. `threshold_spread`:
+    each world draws its thresholds up to this share above the nominal ones, or below.
     """
     base = load_config(dict(settings) if renders is None else _with_renders(settings, renders / window_s))
     steps = round(window_s * base.control.rate_hz)

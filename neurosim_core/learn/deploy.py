@@ -36,27 +36,12 @@ def deploy(
 ) -> int:
     """Fly a vehicle by a policy until it is interrupted; in lockstep it answers every odometry.
 
-    The rates of odometry and events must be that of the policy (`neurosim deploy --print-config`).
-
-    Args:
-        policy: `policy.onnx` of a run.
-        vehicle: Name of the vehicle.
-        events: Name of its event camera.
-        duration_s: Stop after so much simulated time [s]; None: never.
-        ros: The vehicle is in ROS 2: nav_msgs/Odometry and event_camera_msgs/EventPacket come in from topics
-            of these names, mavros_msgs/AttitudeTarget goes out, through a bridge that is started, with
-            the backend auto, rclpy or dds.
-        max_thrust_n: What a thrust of 1 in AttitudeTarget is [N]; None: all that the vehicle has which the
-            policy was trained with.
-        say: Told what happens, line by line.
-
-    Returns:
-        0.
-
-    Raises:
-        TimeoutError: Events that are due have not come.
-        ValueError: The file is no policy, or the rate of the events is another.
-        RuntimeError: The bridge has ended.
+    The rates of odometry and events must be that of the policy (`neurosim deploy --print-config`). `policy`:
+    `policy.onnx` of a run. `duration_s`: stop after so much simulated time [s]; None: never. `ros`: the
+    vehicle is in ROS 2: nav_msgs/Odometry and event_camera_msgs/EventPacket come in from topics of these
+    names, mavros_msgs/AttitudeTarget goes out, through a bridge that is started, with the backend auto, rclpy
+    or dds. `max_thrust_n`: what a thrust of 1 in AttitudeTarget is [N]; None: all that the vehicle has which
+    the policy was trained with.
     """
     pilot = Pilot(policy)
     with contextlib.ExitStack() as stack:
@@ -116,11 +101,7 @@ _BRIDGED_DOMAIN = 1 + os.getpid() % 200
 
 @contextlib.contextmanager
 def _bridge(node: Node, backend: str, *, rate_hz: float, events: str, max_thrust_n: float) -> Iterator[None]:
-    """Run a bridge to a vehicle in ROS; the node is closed if it ends by itself.
-
-    Raises:
-        RuntimeError: It has.
-    """
+    """Run a bridge to a vehicle in ROS; the node is closed if it ends by itself."""
     parameters = {
         "backend": backend,
         "cortex_domain": node.domain,

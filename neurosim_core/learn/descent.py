@@ -17,10 +17,9 @@ _EAGER_STEPS = 3
 class Replayed:
     """A function without arguments, which a CUDA device replays as one graph.
 
-    Args:
-        function: Works on tensors that are the same in each call and whose values change; it must not wait
-            for the device.
-        on_cuda: Whether the tensors are on a CUDA device; elsewhere the function is called as it is.
+    `function`: works on tensors that are the same in each call and whose values change; it must not wait for
+    the device. `on_cuda`: whether the tensors are on a CUDA device; elsewhere the function is called as it
+    is.
     """
 
     def __init__(self, function: Callable[[], None], *, on_cuda: bool) -> None:
@@ -50,11 +49,8 @@ class Replayed:
 class Descent:
     """Minimises a loss by Adam; with several processes (`ranks`), the mean of their losses.
 
-    Args:
-        module: Its parameters are changed.
-        loss: Returns the loss; as the function of `Replayed`.
-        gradient_max: Gradients with a larger norm are scaled down to it.
-        **settings: Of Adam.
+    `loss`: returns the loss; as the function of `Replayed`. `gradient_max`: gradients with a larger norm are
+    scaled down to it.
 
     Attributes:
         optimizer: Adam.
@@ -83,11 +79,7 @@ class Descent:
         self._gradient = torch.zeros(size, device=device)
 
     def step(self, rate: float) -> None:
-        """Take a gradient step.
-
-        Args:
-            rate: Learning rate.
-        """
+        """Take a gradient step."""
         rate *= self.rate_factor
         for group in self.optimizer.param_groups:
             if self._on_cuda:

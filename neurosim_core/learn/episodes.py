@@ -254,14 +254,8 @@ def make_routes(
 ) -> tuple[Any, Any]:
     """Return points where episodes begin and their goals, device arrays of vec3 [scene, n].
 
-    Args:
-        spaces: Of each scene.
-        given: Of each scene; None: points in free space that are connected to each other, and lead nowhere.
-        clearance_m: Least distance to the scene [m].
-        device: Where they are needed.
-
-    Raises:
-        ValueError: A scene has no such point.
+    `given`: of each scene; None: points in free space that are connected to each other, and lead nowhere.
+    `clearance_m`: least distance to the scene [m].
     """
     ends = []
     for index, (space, routes) in enumerate(zip(spaces, given, strict=True)):
@@ -337,11 +331,7 @@ class Episodes:
         self._nominal: Any = None
 
     def seed(self, seed: int) -> None:
-        """Let world i go on from seed + i.
-
-        Raises:
-            ValueError: It is negative.
-        """
+        """Let world i go on from seed + i."""
         if operator.index(seed) < 0:
             raise ValueError(f"seed must be 0 at least, got {seed}")
         self.seeds.assign(np.arange(len(self.seeds), dtype=np.uint64) + np.uint64(seed))

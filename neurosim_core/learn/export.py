@@ -22,12 +22,7 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
 
     Inputs: `events` [1, C, H, W], `vector` [1, n], `memory` [1, m], zeros when an episode begins. Outputs:
     `action` [1, 4] in [-1, 1], `memory_out`. All float32. The graph is written node by node: exporters of
-    PyTorch change from release to release.
-
-    Args:
-        policy: The student.
-        card: What whoever flies it needs to know; kept in the file.
-        file: Where to.
+    PyTorch change from release to release. `card`: what whoever flies it needs to know; kept in the file.
     """
     onnx = need("onnx")
     shape, graph = policy.shape, _Graph(onnx)

@@ -34,15 +34,7 @@ def film_sensors(task: Task) -> dict[str, Any]:
 def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED) -> None:
     """Fly an episode in the first world, and leave a film or a recording of it.
 
-    Args:
-        env: Where, with the sensors of `film_sensors`.
-        actor: Who flies.
-        file: A film (.webp, .gif) or a recording (.h5).
-        seed: Of the episode.
-
-    Raises:
-        ValueError: The file is neither.
-        OSError: It cannot be written.
+    `env`: where, with the sensors of `film_sensors`. `file`: a film (.webp, .gif) or a recording (.h5).
     """
     with saved_flight(file, env.sim.model) as write:
         observations, _ = env.reset(seed=seed)

@@ -27,9 +27,7 @@ Arrays = dict[str, NDArray[Any]]
 class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
     """A task in N worlds as a vector environment that begins anew in the step that ends an episode.
 
-    Args:
-        env: The environment.
-        group: Observations of this group of the task only; None: all.
+    `group`: observations of this group of the task only; None: all.
     """
 
     def __init__(self, env: Env, *, group: str | None = None) -> None:
@@ -48,15 +46,9 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
     ) -> tuple[Arrays, dict[str, Any]]:
         """Begin an episode in all worlds.
 
-        Args:
-            seed: Of world 0; world i has seed + i. None: go on.
-            options: `spread` and `episodes` of `Env.reset`, the latter as an array.
-
-        Returns:
-            Observations, and a dictionary: `seed`, from which each episode can be played again.
-
-        Raises:
-            ValueError: There is no such option, or its value is not for these worlds.
+        `seed`: of world 0; world i has seed + i. None: go on. `options`: `spread` and `episodes` of
+        `Env.reset`, the latter as an array. Returns observations, and a dictionary: `seed`, from which each
+        episode can be played again.
         """
         given = dict(options or {})
         episodes = given.pop("episodes", None)
@@ -73,10 +65,9 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
     ) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Act in all worlds.
 
-        Returns:
-            Observations, rewards, terminated, truncated, and a dictionary: `seed` of each episode, `dropped`
-            (events that there was no room for), and where some ended `final_obs` and `final_info` (the
-            task's metrics), which count in the worlds of `_final_obs`.
+        Returns observations, rewards, terminated, truncated, and a dictionary: `seed` of each episode,
+        `dropped` (events that there was no room for), and where some ended `final_obs` and `final_info` (the
+        task's metrics), which count in the worlds of `_final_obs`.
         """
         given = torch.as_tensor(actions, dtype=torch.float32, device=self._env.device)
         observations, reward, terminated, truncated, info = self._env.step(given)

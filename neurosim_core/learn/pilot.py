@@ -45,8 +45,7 @@ class _EventsOfStep(NamedTuple):
 class Pilot:
     """Flies one vehicle by a policy, step by step.
 
-    Args:
-        file: `policy.onnx` of a run.
+    `file`: `policy.onnx` of a run.
 
     Attributes:
         card: What the policy was trained for.
@@ -116,9 +115,6 @@ class Pilot:
             stamp_ns: Now [ns].
             orientation: q_WB, xyzw; only the direction of gravity in it is used.
             body_rate: w_WB in B, as a gyroscope measures it [rad/s].
-
-        Raises:
-            ValueError: An event is of no pixel of the camera that it was trained with.
         """
         self._show(t, x, y, polarity, stamp_ns)
         q = np.asarray(orientation, dtype=np.float64)
@@ -181,11 +177,7 @@ def card_airframe(card: Mapping[str, Any]) -> MultirotorConfig:
 
 
 def shipped_policy(name: str) -> Path:
-    """Return the file of a policy: one that comes with the package by its name, or a path.
-
-    Raises:
-        ValueError: There is none.
-    """
+    """Return the file of a policy: one that comes with the package by its name, or a path."""
     folder = Path(__file__).parent / "policies_shipped"
     known = sorted(file.stem for file in folder.glob("*.onnx"))
     if name in known:
@@ -208,6 +200,8 @@ def fly_policy(
 ) -> float:
     """Throw a vehicle into the default apartment, and let a policy fly it, in this process.
 
+    Returns the mean speed of the last two seconds, or of all if it is shorter [m/s]; inf after a collision.
+
     Args:
         policy: Name of a policy that comes with the package, or a file.
         duration_s: For how long [s].
@@ -216,9 +210,6 @@ def fly_policy(
         save: Record the flight to this file, with a colour camera beside what the policy sees;
             where it ends in .webp or .gif, a film of it.
         say: Told how it goes, line by line.
-
-    Returns:
-        The mean speed of the last two seconds, or of all if it is shorter [m/s]; inf after a collision.
     """
     from neurosim_core import sim
     from neurosim_core.config import load_config

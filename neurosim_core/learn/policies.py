@@ -23,14 +23,7 @@ def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """What PPO needs besides the mean of actions: their spread, and the value of what is seen.
-
-    Args:
-        critic_size: Numbers that it sees.
-        action_count: Numbers in an action.
-        hidden: Widths of the hidden layers.
-        spread: Standard deviation of actions at first.
-    """
+    """What PPO needs besides the mean of actions: their spread, and the value of what is seen."""
 
     def __init__(
         self,
@@ -60,14 +53,7 @@ class Critic(nn.Module):
 
 
 class ActorCritic(Critic):
-    """A policy and its value from vectors, for PPO.
-
-    Args:
-        actor_size: Numbers that the actor sees.
-        critic_size: Numbers that the critic sees.
-        action_count: Numbers in an action.
-        hidden: Widths of the hidden layers.
-    """
+    """A policy and its value from vectors, for PPO."""
 
     def __init__(
         self, actor_size: int, critic_size: int, action_count: int = 4, *, hidden: Sequence[int] = (64, 64)
@@ -85,17 +71,9 @@ class EventPolicy(nn.Module):
     """A convolutional network on event surfaces, a GRU over time, and an estimate that is integrated.
 
     The estimate (such as of the velocity) is part of the memory, and the network gives its change in each
-    step: a vehicle that does not see much goes on from what it saw, by dead reckoning.
-
-    Args:
-        channels: Of the surfaces.
-        height: Of the surfaces [px].
-        width: Of the surfaces [px].
-        vector_size: Numbers seen besides.
-        action_count: Numbers in an action.
-        hint_count: Numbers that it estimates, at least 1.
-        hidden: Width of the GRU.
-        widths: Channels of the convolutions, of which as many are used as halve the picture to 4x4.
+    step: a vehicle that does not see much goes on from what it saw, by dead reckoning. `height`: of the
+    surfaces [px]. `width`: of the surfaces [px]. `hint_count`: Numbers that it estimates, at least 1.
+    `widths`: channels of the convolutions, of which as many are used as halve the picture to 4x4.
     """
 
     def __init__(
@@ -174,11 +152,8 @@ class EventPolicy(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions (not clamped) and estimates of a stretch of steps.
 
-        Args:
-            surfaces: [T, N, C, H, W].
-            vectors: [T, N, n].
-            begun: An episode begins with this step: the memory is empty, float32, [T, N].
-            memory: Before the first, [N, memory_size].
+        `surfaces`: [T, N, C, H, W]. `vectors`: [T, N, n]. `begun`: an episode begins with this step: the
+        memory is empty, float32, [T, N]. `memory`: before the first, [N, memory_size].
         """
         seen = self.see(surfaces.flatten(0, 1), vectors.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
         memories = []

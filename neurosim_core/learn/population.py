@@ -28,18 +28,9 @@ def train_population(
 
     Runs come back from the machines where they were trained, with checkpoints, policies and logs. One that
     fails does not end the others. Where the cluster is too small for one, that is said: it may grow.
-
-    Args:
-        folder: Of the runs: each in a folder there, of its name.
-        configs: By name.
-        address: See `data.ray_source.cluster`.
-        workers: Processes that train one policy, on any machines of the cluster, each with worlds of its own
-            (see `ranks`). With a CUDA device each takes a GPU, `cuda:0` to it; else a core.
-        say: Told what comes of each.
-
-    Raises:
-        ValueError: The folder holds one of the runs, or there are no settings or no workers.
-        RuntimeError: A training failed.
+    `folder`: of the runs: each in a folder there, of its name. `address`: see `data.ray_source.cluster`.
+    `workers`: processes that train one policy, on any machines of the cluster, each with worlds of its own
+    (see `ranks`). With a CUDA device each takes a GPU, `cuda:0` to it; else a core.
     """
     if not configs or workers < 1:
         raise ValueError(f"needs 1 training and 1 worker at least, got {len(configs)} and {workers}")

@@ -174,10 +174,7 @@ def minibatches(
 def add_advantages(batch: dict[str, torch.Tensor], later: torch.Tensor, config: PpoConfig) -> None:
     """Add `return` and `advantage` (of mean 0 and variance 1) to a batch of steps, [T, N].
 
-    Args:
-        batch: `reward`, `value`, `done`.
-        later: Value of what is seen after the last step, [N].
-        config: Discount and trace.
+    `batch`: `reward`, `value`, `done`. `later`: value of what is seen after the last step, [N].
     """
     value, following = batch["value"], torch.zeros_like(later)
     advantages = torch.empty_like(value)

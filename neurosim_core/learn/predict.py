@@ -35,21 +35,8 @@ def predict(
     """Publish what a network predicts at the end of each window, until its simulator is silent for 10 s.
 
     The network forgets when the simulator begins anew. The simulator waits for it rather than lose events.
-
-    Args:
-        file: What `neurosim learn depth` or `flow` left.
-        vehicle: Name of the vehicle.
-        events: Name of its event camera.
-        device: Of the network.
-        duration_s: Stop after so much simulated time [s]; None: never.
-        say: Told what happens, line by line.
-
-    Returns:
-        How many pictures were published.
-
-    Raises:
-        TimeoutError: There is no simulator.
-        ValueError: The file is no such network, or the vehicle has no such camera.
+    `file`: what `neurosim learn depth` or `flow` left. `duration_s`: stop after so much simulated time [s];
+    None: never. Returns how many pictures were published.
     """
     net, config = load_dense(file)
     if config.task not in _ENCODINGS:

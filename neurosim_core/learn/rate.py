@@ -16,10 +16,8 @@ _REPEATS = 5
 def measure_steps(env: Env, *, ending: int = 0, seconds: float = 1.0) -> tuple[float, float, float]:
     """Return steps of worlds a second: the median, the slowest and the fastest of five stretches.
 
-    Args:
-        env: The environment; actions are zero.
-        ending: Episodes that are cut in each step; no other ends by time.
-        seconds: How long to step in all, about [s].
+    `env`: the environment; actions are zero. `ending`: episodes that are cut in each step; no other ends by
+    time. `seconds`: how long to step in all, about [s].
     """
     actions = torch.zeros((env.num_envs, env.action_count), device=env.device)
     env.reset()

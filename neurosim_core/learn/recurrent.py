@@ -49,11 +49,8 @@ class _EventActorCritic(Critic):
 class RecurrentPpo:
     """Trains a policy on events in an environment, iteration by iteration.
 
-    Args:
-        env: The policy sees its group `student`, of which `events` are pictures; the critic `critic`.
-            `Task.hint` is estimated besides.
-        config: How.
-        generator: Of all random numbers, on the device of the environment.
+    `env`: the policy sees its group `student`, of which `events` are pictures; the critic `critic`.
+    `Task.hint` is estimated besides. `generator`: of all random numbers, on the device of the environment.
     """
 
     def __init__(self, env: Env, config: RecurrentPpoConfig, generator: torch.Generator) -> None:
@@ -97,11 +94,7 @@ class RecurrentPpo:
     def iterate(self, done: float) -> dict[str, float]:
         """Fly some steps and learn from them.
 
-        Args:
-            done: Share of the training that lies behind.
-
-        Returns:
-            What to log.
+        `done`: share of the training that lies behind. Returns what to log.
         """
         with torch.no_grad():
             log = self._fly()

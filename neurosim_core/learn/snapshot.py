@@ -22,11 +22,7 @@ Place = tuple[str, Any, str, Any]
 
 
 def state_of(env: Any) -> list[Place]:
-    """Return all that a step of an environment may change, as it is now.
-
-    Raises:
-        ValueError: A sensor remembers what cannot be saved.
-    """
+    """Return all that a step of an environment may change, as it is now."""
     cameras = [pair for group in env.sim._state.groups for pair in group.world_frames.items()]
     sensors = env.sim.model.config.sensors
     forgetful = [name for name, sensor in sensors.items() if getattr(sensor, "remembers", False)]
@@ -38,11 +34,7 @@ def state_of(env: Any) -> list[Place]:
 
 
 def put_state(places: list[Place], state: Mapping[str, Any]) -> None:
-    """Put a state in the place of what there is.
-
-    Raises:
-        ValueError: It is of an environment that was made otherwise.
-    """
+    """Put a state in the place of what there is."""
     here, there = (
         {path: getattr(value, "shape", None) for path, value in rows}
         for rows in ([(path, value) for path, _, _, value in places], state.items())

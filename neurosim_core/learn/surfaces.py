@@ -345,14 +345,8 @@ for _dtype in _DTYPES.values():  # all at once: a module is built anew for each 
 class EventSurface:
     """The surfaces of one event camera in all worlds.
 
-    Args:
-        config: What they show.
-        world_count: N.
-        width: Of the sensor [px].
-        height: Of the sensor [px].
-        step_s: How long a step is [s].
-        device: Where they are.
-        keep_ended: Keep what `forget` clears.
+    `width`: of the sensor [px]. `height`: of the sensor [px]. `step_s`: how long a step is [s]. `keep_ended`:
+    keep what `forget` clears.
 
     Attributes:
         array: The surfaces, of the dtype of the config, shape [N, channel, H, W]; overwritten by `update` and
@@ -404,9 +398,8 @@ class EventSurface:
     def update(self, events: Any, now_ns: Any) -> None:
         """Add the events of a step, and show them.
 
-        Args:
-            events: Of the camera in this step (`sensors.event_worlds.WorldEvents`).
-            now_ns: Time of each world at the end of the step [ns], device array of int64, shape [N].
+        `events`: of the camera in this step (`sensors.event_worlds.WorldEvents`). `now_ns`: time of each
+        world at the end of the step [ns], device array of int64, shape [N].
         """
         self.add(events, now_ns)
         self.show(now_ns)

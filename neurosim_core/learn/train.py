@@ -101,11 +101,8 @@ class TrainConfig:
 class Training:
     """A run of training.
 
-    Args:
-        folder: Where everything goes.
-        config: What to do; None: as `run.json` in the folder says.
-        say: Told what happens, line by line.
-        models: What `make_model` made of the scenes to train in; None: those of the task are loaded.
+    `config`: what to do; None: as `run.json` in the folder says. `models`: what `make_model` made of the
+    scenes to train in; None: those of the task are loaded.
 
     Attributes:
         config: What is done.
@@ -173,12 +170,7 @@ class Training:
         return self.env.sim.models
 
     def resume(self) -> None:
-        """Go on from the checkpoint of the folder.
-
-        Raises:
-            FileNotFoundError: There is none.
-            ValueError: It is of another version.
-        """
+        """Go on from the checkpoint of the folder."""
         file = self.folder / "checkpoint.pt"
         state = torch.load(file, map_location=self.env.device, weights_only=True)
         _check_layers(file, state, self.student)
@@ -189,8 +181,7 @@ class Training:
     def run(self, *, until: tuple[int, int] | None = None) -> None:
         """Train what is missing.
 
-        Args:
-            until: Iterations of teacher and student after which to stop, multiples of `block`; None: all.
+        `until`: iterations of teacher and student after which to stop, multiples of `block`; None: all.
         """
         from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -272,11 +263,7 @@ def default_config(
 ) -> TrainConfig:
     """Return how a task is trained: with more worlds on a GPU, and for longer.
 
-    Args:
-        task: Its name.
-        device: Where.
-        seed: Of everything.
-        algorithm: `dagger`: by imitation of a teacher; `ppo`: on events from scratch.
+    `algorithm`: `dagger`: by imitation of a teacher; `ppo`: on events from scratch.
     """
     found = find_task(task)
     teacher, student = dict(found.teacher), dict(found.student)
@@ -316,11 +303,7 @@ def default_config(
 
 
 def read_config(folder: Path) -> TrainConfig:
-    """Return what a run was asked for.
-
-    Raises:
-        ValueError: The folder holds no run.
-    """
+    """Return what a run was asked for."""
     file = folder / "run.json"
     if not file.is_file():
         raise ValueError(
@@ -334,11 +317,7 @@ def read_config(folder: Path) -> TrainConfig:
 
 
 def load_student(folder: Path, device: torch.device) -> EventPolicy:
-    """Return the student of a run.
-
-    Raises:
-        ValueError: The run has no checkpoint, or one of another version.
-    """
+    """Return the student of a run."""
     file = folder / "checkpoint.pt"
     if not file.is_file():
         raise ValueError(f"{folder} has no checkpoint.pt: train first")
@@ -403,15 +382,9 @@ def train(
 ) -> dict[str, Evaluation]:
     """Train, export and evaluate.
 
-    Args:
-        folder: Where everything goes.
-        config: What to do.
-        resume: Go on with the run in the folder, as it was configured; only `config.wandb` counts.
-        say: Told what happens, line by line.
-
-    Returns:
-        Evaluations in scenes that were not trained in: `events`, and `blind`; of several processes (`ranks`)
-        by the first only.
+    `resume`: go on with the run in the folder, as it was configured; only `config.wandb` counts. Returns
+    evaluations in scenes that were not trained in: `events`, and `blind`; of several processes (`ranks`) by
+    the first only.
     """
     from neurosim_core.learn.export import export_onnx
 

@@ -56,11 +56,8 @@ def evaluate_transfer(
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does under each of `CONDITIONS`.
 
-    Args:
-        folder: The run.
-        scenes: Where to fly, as for `make_env`.
-        device: None: as in the training.
-        worlds: Episodes; None: as configured.
+    `scenes`: where to fly, as for `make_env`. `device`: None: as in the training. `worlds`: episodes; None:
+    as configured.
     """
     config = read_config(folder)
     where: dict[str, Any] = {"scenes": scenes}

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.markup import escape
@@ -18,6 +17,7 @@ from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.live.topics import SERVICES, STATUS, STEP_DEADLINE_S
+from neurosim_core.overrides import read_settings
 
 _TABLE_WIDTH = 100
 GRACE_S = 1.0
@@ -27,15 +27,8 @@ GRACE_S = 1.0
 def call(arguments: argparse.Namespace) -> int:
     """Send the request of a command line, and print the answer.
 
-    Args:
-        arguments: As `neurosim call` parses them: `what`, `timeout` [s], and the arguments of the request.
-
-    Returns:
-        0 if it was done, 1 if it was refused.
-
-    Raises:
-        ValueError: A value of the command line is not allowed.
-        RuntimeError: There is no simulator, or it does not answer in time.
+    `arguments`: as `neurosim call` parses them: `what`, `timeout` [s], and the arguments of the request.
+    Returns 0 if it was done, 1 if it was refused.
     """
     console = Console(highlight=False, soft_wrap=True)
     timeout_s = arguments.timeout
@@ -58,25 +51,13 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
-    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text.
-
-    Raises:
-        ValueError: One is not KEY=VALUE, or its value is neither a number, true, false, text nor a list.
-    """
-    values: dict[str, Any] = {}
-    for setting in settings:
-        key, separator, text = setting.partition("=")
-        if not separator or not key:
-            raise ValueError(f"a setting is KEY=VALUE, got {setting!r}")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
-            value = None
+    """Return KEY=VALUE texts as parameters; values are read as YAML, lists stay text."""
+    values = read_settings(settings, option="set")
+    for key, value in values.items():
         if isinstance(value, list):
-            value = json.dumps(value)
-        if not isinstance(value, bool | int | float | str):
-            raise ValueError(f"{key} takes a number, true, false, text or a list, got {text!r}")
-        values[key] = value
+            values[key] = json.dumps(value)
+        elif not isinstance(value, bool | int | float | str):
+            raise ValueError(f"{key} takes a number, true, false, text or a list, got {value!r}")
     return Parameters.of(values)
 
 
@@ -115,10 +96,8 @@ def describe_status(
 ) -> str:
     """Return a status as Markdown: the run, its vehicles, its sensors.
 
-    Args:
-        status: The status.
-        rates_hz: Messages a second of simulated time [Hz], by vehicle and sensor, if known.
-        lost: Messages that a viewer has not received, by vehicle and sensor, if known.
+    `rates_hz`: messages a second of simulated time [Hz], by vehicle and sensor, if known. `lost`: messages
+    that a viewer has not received, by vehicle and sensor, if known.
     """
     run = f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods"
     counts = f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s"
@@ -192,14 +171,7 @@ def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
 def ask(node: Node, service: str, request: Any, timeout_s: float) -> SimulatorReply:
     """Send a request to the simulator, and return its answer.
 
-    Args:
-        node: Sends it.
-        service: One of `topics.SERVICES`.
-        request: Of the type of the service.
-        timeout_s: How long to wait [s].
-
-    Raises:
-        RuntimeError: There is no simulator, or it does not answer in time.
+    `service`: one of `topics.SERVICES`. `timeout_s`: how long to wait [s].
     """
     request_type, reply_type = SERVICES[service]
     try:

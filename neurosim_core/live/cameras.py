@@ -46,9 +46,7 @@ class CameraThread:
     def __init__(self, *, inline: bool, on_packets: Callable[[], object]) -> None:
         """Start the thread.
 
-        Args:
-            inline: Render in the calling thread instead.
-            on_packets: Called from the thread when there is something to `take`.
+        `on_packets`: called from the thread when there is something to `take`.
         """
         self.dropped: Counter[tuple[str, str]] = Counter()
         self._inline = inline
@@ -66,13 +64,7 @@ class CameraThread:
     def render(self, vehicle: VehicleNode, batches: Sequence[Batch], *, is_late: bool) -> None:
         """Queue batches of a vehicle; a batch without frames is done at once if nothing waits before it.
 
-        Args:
-            vehicle: Whose.
-            batches: What it has flown.
-            is_late: Drop them where rendering is inline, so that no batch waits.
-
-        Raises:
-            RuntimeError: The rendering of an earlier batch failed.
+        `is_late`: drop them where rendering is inline, so that no batch waits.
         """
         for batch in batches:
             job = _Job(vehicle=vehicle, state=vehicle.state, batch=batch)
@@ -97,12 +89,7 @@ class CameraThread:
     def wait_for(self, condition: Callable[[], bool], stop: Callable[[], bool]) -> bool:
         """Wait until a condition holds, which changes with each batch; return whether it does.
 
-        Args:
-            condition: What to wait for.
-            stop: Ends the wait; called every 20 ms.
-
-        Raises:
-            RuntimeError: The rendering failed.
+        `stop`: ends the wait; called every 20 ms.
         """
         with self._changed:
             while (holds := condition()) is False and self._failure is None and not stop():
@@ -129,8 +116,7 @@ class CameraThread:
     def drop_rest(self) -> bool:
         """Finish the batch in work, drop and count those that wait.
 
-        Returns:
-            Whether the batch in work ended in time; if not, the thread still uses the engine.
+        Returns whether the batch in work ended in time; if not, the thread still uses the engine.
         """
         with self._changed:
             dropped = list(self._jobs)
@@ -156,11 +142,7 @@ class CameraThread:
             self.dropped.clear()
 
     def check(self) -> None:
-        """Raise what went wrong in the thread.
-
-        Raises:
-            RuntimeError: The rendering failed.
-        """
+        """Raise what went wrong in the thread."""
         if self._failure is not None:
             raise RuntimeError(f"the cameras failed: {self._failure}") from self._failure
 

@@ -64,13 +64,9 @@ class PathController:
     ) -> None:
         """Connect.
 
-        Args:
-            node: Stays open.
-            vehicle: Name of the vehicle.
-            follower: Makes the commands; for this controller only.
-            lockstep: Whether the simulator waits for each command.
-            rotor_speed: Rotor speeds before any have arrived [rad/s], shape [R].
-            delay_s: How long to sleep before each command [s].
+        `follower`: makes the commands; for this controller only. `lockstep`: whether the simulator waits for
+        each command. `rotor_speed`: rotor speeds before any have arrived [rad/s], shape [R]. `delay_s`: how
+        long to sleep before each command [s].
         """
         self.vehicle = vehicle
         self.command_count = self.lost_count = self.missing_count = 0
@@ -98,15 +94,8 @@ class PathController:
     def answer(self, timeout_s: float | None = None) -> bool:
         """Wait for odometry, and send the command that answers it.
 
-        Args:
-            timeout_s: Longest wait for a simulator, and for its odometry [s]; None: forever.
-
-        Returns:
-            Whether any came.
-
-        Raises:
-            Closed: The controller or its node was closed.
-            ValueError: The vehicle has another number of rotors than the follower's.
+        `timeout_s`: longest wait for a simulator, and for its odometry [s]; None: forever. Returns whether
+        any came.
         """
         if not self.command_count and not self._connect(math.inf if timeout_s is None else timeout_s):
             return False
@@ -219,11 +208,7 @@ class _Fleet:
         self._before: dict[str, tuple[int, float]] = {}
 
     def plan(self, config: SimulationConfig) -> None:
-        """Plan the paths, unless that was done.
-
-        Raises:
-            ValueError: There is no such vehicle, or no path.
-        """
+        """Plan the paths, unless that was done."""
         if config == self._planned:
             return
         names = list(config.vehicles) if self._only is None else [self._only]

@@ -35,10 +35,9 @@ class Link:
     def __init__(self, config: LinkConfig, *, seed: int, name: str) -> None:
         """Make an empty link.
 
-        Args:
-            config: Its settings; those of the sensor's clock have no effect here.
-            seed: Seed of jitter and loss, 0 <= seed < 2^64.
-            name: What travels on it, such as "command"; links of other names draw other random numbers.
+        `config`: its settings; those of the sensor's clock have no effect here. `seed`: seed of jitter and
+        loss, 0 <= seed < 2^64. `name`: what travels on it, such as "command"; links of other names draw other
+        random numbers.
         """
         self._name = name
         self._stream = stream_id(f"link/{name}")
@@ -71,17 +70,9 @@ class Link:
     def send(self, item: Any, *, stamp_ns: int, size_bytes: int) -> Delivery | None:
         """Send a message.
 
-        Args:
-            item: The message; kept until it is due.
-            stamp_ns: When it is sent [ns], not before the message sent last.
-            size_bytes: The bandwidth it takes [bytes].
-
-        Returns:
-            What happens to it; `delivered_ns` is -1 if it is lost. None if the link does nothing and no
-            earlier message delays this one.
-
-        Raises:
-            ValueError: It is sent before an earlier message.
+        `item`: the message; kept until it is due. `stamp_ns`: when it is sent [ns], not before the message
+        sent last. `size_bytes`: the bandwidth it takes [bytes]. Returns what happens to it; `delivered_ns` is
+        -1 if it is lost. None if the link does nothing and no earlier message delays this one.
         """
         if stamp_ns < self._sent_ns:
             raise ValueError(

@@ -33,10 +33,7 @@ class PictureLoan:
     def __init__(self, publisher: Publisher[Any], *, device: str, settle: Callable[[], object]) -> None:
         """Use the slots of a publisher of images.
 
-        Args:
-            publisher: Whose slots.
-            device: The CUDA device that writes into them.
-            settle: See above.
+        `device`: the CUDA device that writes into them.
         """
         self.settle = settle
         self._publisher = publisher
@@ -50,8 +47,7 @@ class PictureLoan:
     def acquire(self, picture: NDArray[Any]) -> NDArray[Any] | None:
         """Return memory for a picture; None if there is none, or another picture is in flight.
 
-        Args:
-            picture: Of the shape and dtype needed, shape [H, W] or [H, W, C].
+        `picture`: of the shape and dtype needed, shape [H, W] or [H, W, C].
         """
         if picture.nbytes < _BYTES_MIN or not self._can_pin or not self.release():
             return None

@@ -60,12 +60,7 @@ def message_type(packet: type[pkt.Packet]) -> type[Any]:
 
 
 def sensor_message_type(kind: str) -> type[Any]:
-    """Return the message type of the packets that sensors of a kind yield.
-
-    Raises:
-        ValueError: There is no such kind.
-        TypeError: As `message_type`.
-    """
+    """Return the message type of the packets that sensors of a kind yield."""
     return message_type(find("sensor", kind).packet_type)  # type: ignore[attr-defined]
 
 
@@ -88,13 +83,8 @@ def _field_type(packet: type[pkt.Packet], field: pkt.FieldSchema) -> Any:
 def to_message(packet: pkt.Packet, *, frame_id: str = "", clock_ns: ClockNs | None = None) -> Any:
     """Return a packet as a message.
 
-    Args:
-        packet: Its NumPy arrays are not copied.
-        frame_id: Name of the sensor's frame, for messages that have one.
-        clock_ns: The sensor's clock; None: simulated time. Event times move by whole microseconds.
-
-    Raises:
-        TypeError: A message type cannot be derived.
+    `frame_id`: name of the sensor's frame, for messages that have one. `clock_ns`: the sensor's clock; None:
+    simulated time. Event times move by whole microseconds.
     """
     kind = message_type(type(packet))
     values: dict[str, Any] = {}
@@ -170,14 +160,8 @@ def setpoint_of(mode: str, command: Any) -> NDArray[np.float64]:
 def command_of(mode: str, setpoint: ArrayLike, *, stamp_ns: int, sequence: int = 0) -> Any:
     """Return the command for a row of setpoints; the inverse of `setpoint_of`.
 
-    Args:
-        mode: One of `topics.COMMANDS`.
-        setpoint: Row as in `control.modes.MODES`.
-        stamp_ns: Time of the state that the command answers [ns].
-        sequence: Counts the commands.
-
-    Raises:
-        ValueError: There is no such mode.
+    `mode`: one of `topics.COMMANDS`. `setpoint`: row as in `control.modes.MODES`. `stamp_ns`: time of the
+    state that the command answers [ns].
     """
     if mode not in COMMANDS:
         raise ValueError(f"unknown command mode {mode!r}, known: {', '.join(COMMANDS)}")

@@ -33,13 +33,9 @@ class Pacer:
     ) -> None:
         """Begin at stamp 0, now.
 
-        Args:
-            factor: Simulated over wall-clock time; 0: as fast as possible, without any wait.
-            clock_ns: The wall clock [ns]; must not go backwards.
-            sleep: Sleeps for a time [s] or less; `Event.wait` lets a wait end at once.
-
-        Raises:
-            ValueError: The factor is negative or not finite.
+        `factor`: simulated over wall-clock time; 0: as fast as possible, without any wait. `clock_ns`: the
+        wall clock [ns]; must not go backwards. `sleep`: sleeps for a time [s] or less; `Event.wait` lets a
+        wait end at once.
         """
         self._clock_ns = clock_ns
         self._sleep = sleep
@@ -72,12 +68,8 @@ class Pacer:
     def wait_until(self, stamp_ns: int, stop: Callable[[], bool] | None = None) -> int:
         """Wait until a simulated time is due.
 
-        Args:
-            stamp_ns: The simulated time [ns].
-            stop: Ends the wait when it returns true; called at least every 20 ms.
-
-        Returns:
-            How late it is on return [ns]; negative if `stop` ended the wait, 0 at factor 0.
+        `stamp_ns`: the simulated time [ns]. `stop`: ends the wait when it returns true; called at least every
+        20 ms. Returns how late it is on return [ns]; negative if `stop` ended the wait, 0 at factor 0.
         """
         self._stamp_ns = stamp_ns
         while (late_ns := self.lateness_ns(stamp_ns)) < 0 and not (stop is not None and stop()):
@@ -88,9 +80,7 @@ class Pacer:
         """Move the deadline of an overdue simulated time, and all later ones, so that it is due now.
 
         This is for a machine that cannot keep up; the next deadline makes up for a late wake-up by itself.
-
-        Returns:
-            By how much [ns]; 0 if it was not overdue.
+        Returns by how much [ns]; 0 if it was not overdue.
         """
         late_ns = max(self.lateness_ns(stamp_ns), 0)
         self._origin_wall_ns += late_ns
@@ -101,9 +91,6 @@ class Pacer:
         """Change the factor from now on; the simulated time of this moment stays what it is.
 
         Coming from factor 0, that is the time that was waited for last.
-
-        Raises:
-            ValueError: The factor is negative or not finite.
         """
         ratio = _exact(factor)
         now_ns = self._clock_ns()
@@ -127,11 +114,7 @@ class Timings:
     """Durations since the last `take`, in bounded memory."""
 
     def __init__(self, capacity: int = 4096) -> None:
-        """Make it empty.
-
-        Args:
-            capacity: Durations kept: the newest.
-        """
+        """Make it empty."""
         self._newest: deque[int] = deque(maxlen=capacity)
 
     def add(self, duration_ns: int) -> None:

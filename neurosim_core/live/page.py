@@ -13,7 +13,6 @@ import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from types import TracebackType
 from typing import Any
 
 from cortex import Node, latest
@@ -36,13 +35,7 @@ class ControlPage:
     def __init__(self, node: Node, viewer_url: str, *, port: int = 0) -> None:
         """Begin to serve.
 
-        Args:
-            node: Asks the simulator.
-            viewer_url: The page of Rerun's viewer.
-            port: Port of the page; 0: any that is free.
-
-        Raises:
-            OSError: The port is taken.
+        `port`: port of the page; 0: any that is free.
         """
         self._node = node
         self._viewer_url = viewer_url
@@ -67,9 +60,7 @@ class ControlPage:
     def __enter__(self) -> ControlPage:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def text(self) -> str:
@@ -98,12 +89,7 @@ class ControlPage:
     def request(self, what: str, values: Any) -> dict[str, Any]:
         """Ask the simulator for something, and return its answer.
 
-        Args:
-            what: pause, resume, step or reset.
-            values: `seed` of a reset, null or not there: as configured.
-
-        Raises:
-            ValueError: It is none of these, or the seed is none.
+        `values`: `seed` of a reset, null or not there: as configured.
         """
         if not isinstance(values, dict):
             raise ValueError(f"values must be a JSON object, got {values!r}")

@@ -74,9 +74,6 @@ def answer_images(
         warm_up_s: How long to fly before that [wall-clock s].
         check: Is called about five times a second while nothing comes.
         spin_s: How long to look for an image before sleeping (`Subscriber.look_out`) [s].
-
-    Raises:
-        ProbeError: No message arrived for a long time.
     """
     commands_sent: list[tuple[int, int]] = []
     images: list[tuple[int, int, int]] = []
@@ -206,13 +203,8 @@ class StreamProbe:
     def listen(self, seconds: float, *, resident: Callable[[], list[int]], check: Check) -> StreamTrace:
         """Note what arrives.
 
-        Args:
-            seconds: How long, from the first sample of the IMU on [wall-clock s].
-            resident: Returns the memory of the watched processes [bytes].
-            check: See `Check`.
-
-        Raises:
-            ProbeError: No message arrived for a long time.
+        `seconds`: how long, from the first sample of the IMU on [wall-clock s]. `resident`: returns the
+        memory of the watched processes [bytes]. `check`: see `Check`.
         """
         samples: list[tuple[int, int, int]] = []
         memory: list[list[int]] = []

@@ -36,12 +36,7 @@ SETTINGS = "settings.jsonl"
 
 
 def open_folders(folder: Path, vehicles: list[str], *, overwrite: bool) -> dict[str, Path]:
-    """Return the folder of each vehicle: that of the run, or one inside it for each of several vehicles.
-
-    Raises:
-        FileExistsError: There is a recording already, and it may not be replaced.
-        NotADirectoryError: A file is where a folder should be.
-    """
+    """Return the folder of each vehicle: that of the run, or one inside it for each of several vehicles."""
     folders = {name: folder if len(vehicles) == 1 else folder / name for name in vehicles}
     for path in (folder, *folders.values()):
         new_folder(path, overwrite=overwrite)
@@ -70,17 +65,7 @@ class Recorder:
     """
 
     def __init__(self, folders: Mapping[str, Path], models: Mapping[str, Model]) -> None:
-        """Make the folders, write config.yaml to each, and start the thread.
-
-        Args:
-            folders: Folder of each vehicle.
-            models: What is flown, by vehicle.
-
-        Raises:
-            OSError: A folder cannot be written to.
-            ImportError: h5py, or what another sink needs, is not installed.
-            ValueError: No sink of the settings takes part in live runs: nothing would be recorded.
-        """
+        """Make the folders, write config.yaml to each, and start the thread."""
         if not any(_live_sinks(model) for model in models.values()):
             raise ValueError("none of `sinks` records a live run: add one, such as {recording: {kind: hdf5}}")
         for model in models.values():
@@ -120,9 +105,7 @@ class Recorder:
     def begin(self, seeds: Mapping[str, int], *, replace: bool) -> None:
         """Begin a new file for each vehicle with its next packet.
 
-        Args:
-            seeds: Seed of each vehicle.
-            replace: Replace the last file: its run had not begun.
+        `replace`: replace the last file: its run had not begun.
         """
         self._run_count += 1
         self._file_count += not (replace and self._file_count)
@@ -137,14 +120,7 @@ class Recorder:
         """Note that settings have changed: in settings.jsonl, and in files that begin later.
 
         Each line of the file is a JSON object: `file`, `stamp_ns` from which on it holds, `key`, `value` and
-        `before`.
-
-        Args:
-            config: The settings that hold now.
-            stamp_ns: Simulated time [ns].
-
-        Raises:
-            OSError: The file cannot be written.
+        `before`. `stamp_ns`: simulated time [ns].
         """
         for vehicle, before in self._configs.items():
             now = self._configs[vehicle] = config.of(vehicle)
@@ -156,12 +132,7 @@ class Recorder:
             self._write_changes(vehicle)
 
     def write(self, vehicle: str, packet: Packet) -> None:
-        """Queue a packet; wait while too much is queued, unless the run is to end.
-
-        Raises:
-            OSError: The disk is full or gone.
-            ValueError: A packet could not be written.
-        """
+        """Queue a packet; wait while too much is queued, unless the run is to end."""
         with self._changed:
             while self._queue_bytes > QUEUE_BYTES and self._failure is None and not self.stop.is_set():
                 self._changed.wait(0.05)
@@ -172,12 +143,7 @@ class Recorder:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Write what is queued, close the files and end the thread; give up at a deadline. Once.
-
-        Raises:
-            TimeoutError: Packets were not written in time; the message says how many.
-            OSError, ValueError: As for `write`.
-        """
+        """Write what is queued, close the files and end the thread; give up at a deadline. Once."""
         limit_s = STOPPED_S if self.stop.is_set() else ENDED_S
         with self._changed:
             if self._deadline_s is not None:

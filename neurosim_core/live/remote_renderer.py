@@ -132,14 +132,7 @@ class RemoteScene:
     def ask(self, lens: PinholeConfig, positions: Any, orientations: Any, outputs: Collection[str]) -> Frames:
         """Return the frames of some poses.
 
-        Args:
-            lens: The camera.
-            positions: p_WC [m], shape [n, 3].
-            orientations: q_WC of the optical frame, xyzw, shape [n, 4].
-            outputs: Some of "radiance", "depth".
-
-        Raises:
-            RemoteRendererError: No answer came in time, or not the one that was asked for.
+        `positions`: p_WC [m], shape [n, 3]. `orientations`: q_WC of the optical frame, xyzw, shape [n, 4].
         """
         from neurosim_core.live.render_messages import RenderRequest
 

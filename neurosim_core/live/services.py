@@ -45,12 +45,7 @@ def change_parameters(
 ) -> SimulationConfig:
     """Return a configuration with other values.
 
-    Args:
-        config: The settings that hold.
-        values: New values by dotted key; see `CHANGEABLE`.
-
-    Raises:
-        ValueError: A key cannot be changed during a run, or a value is not allowed.
+    `values`: new values by dotted key; see `CHANGEABLE`.
     """
     for key, value in values.items():
         if not any(pattern.fullmatch(key) for pattern in _PATTERNS):
@@ -176,12 +171,8 @@ class Services:
     ) -> None:
         """Offer the services.
 
-        Args:
-            node: For all but `/step`.
-            step_node: For `/step`.
-            config: Returns the settings that hold.
-            state: Returns simulated time [ns] and phase.
-            on_request: Called from other threads when there is something to `take`.
+        `node`: for all but `/step`. `step_node`: for `/step`. `state`: returns simulated time [ns] and phase.
+        `on_request`: called from other threads when there is something to `take`.
         """
         self._config = config
         self._state = state

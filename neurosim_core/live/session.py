@@ -115,16 +115,7 @@ class LiveSession:
     ) -> None:
         """Subscribe, and open a recording.
 
-        Args:
-            node: Subscribes.
-            simulation: Announcement of the simulator.
-            target: Opens recordings.
-            options: What to show.
-            number: Numbers of recordings.
-            say: Called with what a user should know.
-
-        Raises:
-            ValueError: `options.only` names no sensor of this simulator, or its settings cannot be read.
+        `say`: called with what a user should know.
         """
         config = load_config(yaml.safe_load(simulation.config))
         self._vehicles = _shown(config, options.only)
@@ -310,11 +301,7 @@ def _load_scene(config: SimulationConfig, say: Callable[[str], None]) -> SceneSh
 
 
 def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tuple[SensorDescription, ...]]:
-    """Return the sensors to show of each vehicle; odometry, which every vehicle publishes, is always shown.
-
-    Raises:
-        ValueError: `only` names a sensor that no vehicle has.
-    """
+    """Return the sensors to show of each vehicle; odometry, which each vehicle publishes, is always shown."""
     sensors = {name: describe_sensors(config.of(name).sensors) for name in config.vehicles}
     known = list(dict.fromkeys(["odometry", *(s.name for own in sensors.values() for s in own)]))
     if unknown := [name for name in only or () if name not in known]:

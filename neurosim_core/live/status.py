@@ -74,13 +74,7 @@ class StatusPublisher:
     def publish_status(
         self, phase: str, make: Callable[[], SimulatorStatus], *, at_once: bool = False
     ) -> None:
-        """Publish a status, if it is time or the phase has changed, and there are subscribers.
-
-        Args:
-            phase: As in the message.
-            make: Makes the message.
-            at_once: It is time.
-        """
+        """Publish a status, if it is time or the phase has changed, and there are subscribers."""
         now_s = time.monotonic()
         if not at_once and phase == self._phase and now_s - self._published_s < STATUS_INTERVAL_S:
             return
@@ -110,8 +104,7 @@ class SubscriberMonitor:
     def settle(self, wait: Callable[[float], bool]) -> None:
         """Wait until no subscriber comes or goes: the sender of the first command may have just subscribed.
 
-        Args:
-            wait: Waits for a time [s]; ends the wait by returning True.
+        `wait`: waits for a time [s]; ends the wait by returning True.
         """
         give_up_s = time.monotonic() + SETTLE_MAX_S
         while time.monotonic() < give_up_s:
@@ -165,13 +158,8 @@ class RunStats:
     ) -> SimulatorStatus:
         """Return the message, and begin to measure anew.
 
-        Args:
-            vehicles: All vehicles.
-            dropped: Frames that were not rendered, by vehicle and sensor.
-            config: The settings that hold.
-            stamp_ns: Simulated time [ns].
-            phase: As in the message.
-            reason: As in the message; if empty, it names topics whose reliable readers hold up the run.
+        `dropped`: frames that were not rendered, by vehicle and sensor. `stamp_ns`: simulated time [ns].
+        `reason`: as in the message; if empty, it names topics whose reliable readers hold up the run.
         """
         now_ns = time.monotonic_ns()
         factor = max(stamp_ns - self._stamp_ns, 0) / max(now_ns - self._wall_ns, 1)

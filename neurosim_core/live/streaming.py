@@ -49,15 +49,8 @@ class StreamingLoop:
     ) -> None:
         """Connect the parts.
 
-        Args:
-            vehicles: All vehicles.
-            cameras: Renders what they fly.
-            pacer: Says when a stamp is due; sleeps on `wakeup`.
-            stats: Counts overruns.
-            live: Returns what gives way when the machine or the cameras are late.
-            stop: Ends all waits.
-            requested: Whether a request waits.
-            wakeup: Set when there are new packets or requests.
+        `pacer`: says when a stamp is due; sleeps on `wakeup`. `live`: returns what gives way when the machine
+        or the cameras are late. `wakeup`: set when there are new packets or requests.
         """
         self._vehicles = vehicles
         for vehicle in vehicles:
@@ -91,11 +84,7 @@ class StreamingLoop:
         return True
 
     def catch_up(self, stamp_ns: int) -> None:
-        """Wait for the cameras, and publish what arrives by a tick at which time stops [ns].
-
-        Raises:
-            RuntimeError: The cameras failed.
-        """
+        """Wait for the cameras, and publish what arrives by a tick at which time stops [ns]."""
         self._cameras.finish(self._stop)
         self.publish_rendered(stamp_ns)
 
@@ -108,8 +97,8 @@ class StreamingLoop:
     def publish_until(self, stamp_ns: int, end_ns: int) -> bool:
         """Publish what arrives in the period from one tick [ns] to the next, each packet when it is due.
 
-        Returns:
-            Whether the end was reached. A request ends the wait unless the end is near: call it again then.
+        Returns whether the end was reached. A request ends the wait unless the end is near: call it again
+        then.
         """
 
         def leave() -> bool:

@@ -46,18 +46,9 @@ def run_together(parts: Sequence[Part], *, console: Console, grace_s: float = GR
     Each process leads a session of its own, so that Ctrl-C reaches only this one. SIGINT, SIGTERM and SIGHUP
     end all: each process gets SIGINT, and is killed after a grace, or at a second signal. When a process has
     ended, what it left in its session is killed. If this process is killed, the others get SIGINT (on Linux).
-    For the main thread.
-
-    Args:
-        parts: What to run.
-        console: Where to print what they print, standard error included.
-        grace_s: How long a process may take to end [s].
-
-    Returns:
-        The exit status of the process that ended all, 1 if a signal killed it; 130 after a signal; else 0.
-
-    Raises:
-        OSError: A process cannot be started, or the console is gone. Those that run are ended.
+    For the main thread. `console`: where to print what they print, standard error included. `grace_s`: how
+    long a process may take to end [s]. Returns the exit status of the process that ended all, 1 if a signal
+    killed it; 130 after a signal; else 0.
     """
     children: list[_Child] = []
     with _caught_signals() as caught, selectors.DefaultSelector() as inputs:

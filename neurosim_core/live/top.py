@@ -42,12 +42,7 @@ class Dashboard:
 def top(*, once: bool = False, timeout_s: float = 10.0) -> int:
     """Show the status until Ctrl-C, or until the run has ended.
 
-    Args:
-        once: Print the screen after two statuses, and stop.
-        timeout_s: How long to wait for a simulator [s].
-
-    Raises:
-        RuntimeError: There is no simulator.
+    `once`: print the screen after two statuses, and stop. `timeout_s`: how long to wait for a simulator [s].
     """
     console, dashboard = Console(highlight=False), Dashboard()
     with Node("top") as node, node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses:

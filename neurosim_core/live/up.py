@@ -20,20 +20,10 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
 
     All end with the simulator. In lockstep the failure of the controller ends all; in streaming it is
     reported, and the fail-safe flies until another controller comes. The flight goes on without a viewer. The
-    processes use the Cortex domain of the environment, so that other tools can join.
-
-    Args:
-        config: What is simulated and flown.
-        viewer: native, web, none, a file that ends in .rrd, or auto: native where there is a display.
-        record: Folder to record to, as with `serve`.
-        overwrite: Replace a recording that exists.
-
-    Returns:
-        The exit status of the simulator, or of the controller whose failure ended all; 130 after a signal.
-
-    Raises:
-        ValueError: There is no such viewer.
-        OSError: The viewer cannot write its file, or it exists already.
+    processes use the Cortex domain of the environment, so that other tools can join. `viewer`: native, web,
+    none, a file that ends in .rrd, or auto: native where there is a display. `record`: folder to record to,
+    as with `serve`. Returns the exit status of the simulator, or of the controller whose failure ended all;
+    130 after a signal.
     """
     viewer_arguments = viewer_options(viewer)
     if viewer.endswith(".rrd"):
@@ -65,11 +55,7 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
 
 
 def viewer_options(viewer: str) -> list[str] | None:
-    """Return the arguments of `neurosim view` for a choice of viewer; None for none.
-
-    Raises:
-        ValueError: There is no such viewer.
-    """
+    """Return the arguments of `neurosim view` for a choice of viewer; None for none."""
     if viewer == "auto":
         viewer = "native" if has_display() else "web"
     if viewer == "none":

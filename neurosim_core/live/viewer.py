@@ -51,6 +51,8 @@ def view(
 ) -> int:
     """Show what a simulator publishes, until interrupted; wait for it, and for the next one when it is gone.
 
+    Returns 0 if the flight is over and saved, or the window was closed; 130 if interrupted.
+
     Args:
         web: Serve a page for the browsers of this machine instead of opening a window.
         save: File to write instead, which must not exist yet; after a reset NAME-2.rrd, ...
@@ -59,16 +61,6 @@ def view(
         image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
         port: Port of the page; 0: any.
         open_browser: Open the page.
-
-    Returns:
-        0 if the flight is over and saved, or the window was closed; 130 if interrupted.
-
-    Raises:
-        ValueError: An argument is not allowed, there is no display, or no such sensor.
-        FileExistsError: The file exists already.
-        OSError: The file cannot be written, or the port is taken.
-        ViewerEnded: The viewer failed.
-        ImportError: Rerun is not installed.
     """
     if save is not None:
         check_new_file(save)
@@ -123,20 +115,8 @@ def watch(
 ) -> int:
     """Show one simulator after another.
 
-    Args:
-        node: Subscribes.
-        target: Opens recordings.
-        options: What to show.
-        stop: Ends it.
-        say: Called with what a user should know.
-        to_the_end: Return when a simulator has left after the end of its flight.
-
-    Returns:
-        As `view`.
-
-    Raises:
-        ValueError: There is no such sensor.
-        ViewerEnded: The viewer failed.
+    `say`: called with what a user should know. `to_the_end`: return when a simulator has left after the end
+    of its flight. Returns as `view`.
     """
     announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
     number = itertools.count(1)

@@ -15,9 +15,6 @@ def read_rows(column: Any, begin: int, end: int) -> NDArray[Any]:
 
     The chunks of integers that are compressed as in recordings (shuffle, then gzip) are inflated here if
     ISA-L is installed. HDF5 reads all other datasets, and whatever is damaged: errors are its own.
-
-    Raises:
-        OSError: The file is damaged.
     """
     isal = import_isal()
     end = min(end, len(column))

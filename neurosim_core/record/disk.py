@@ -25,11 +25,7 @@ class Disk:
         self._held: dict[tuple[int, int], bytes] = {}
 
     def seal(self) -> None:
-        """Bring what was held back to disk.
-
-        Raises:
-            OSError: A write has failed.
-        """
+        """Bring what was held back to disk."""
         for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
             self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
         self._held.clear()

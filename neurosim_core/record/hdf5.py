@@ -43,13 +43,12 @@ import zlib
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType, TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, schema_of
 from neurosim_core.record.chunks import import_isal
 from neurosim_core.record.disk import Disk
@@ -63,21 +62,25 @@ DSEC_NAMES = {"t": "events/t", "x": "events/x", "y": "events/y", "polarity": "ev
 LARGE_ROW_BYTES = 4096
 """Rows of at least this size, such as pictures, are stored and read one at a time."""
 
-_FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache
+_FLAT_CHUNK = 65536
+"""Rows of a chunk of arrays of varying length; of events as many as there are pixels, at most 262,144."""
 _ROW_CHUNK = 1024
-_KEPT_ROWS = 16384
-"""Arrays of varying length are kept, not copied, from this length on. A shorter one may be a small part of a
-large block of memory, which it would hold."""
+_KEPT_BYTES = 65536
+"""Pictures and arrays of varying length are kept, not copied, from this size on. A smaller one may be part
+of a large block of memory, which it would hold."""
+_PARTS_MAX = 64
+"""Arrays that are kept apart in a chunk that is not full, when that is flushed."""
 _FIRST_FLUSH_BYTES = 65536
 _ATTRIBUTE_MAX_BYTES = 60000
-_DEFLATE_THREADS_MAX = 16
+_DEFLATE_THREADS = 8
+_scratch = threading.local()
 
 
 class RecordingWriter:
     """Writes packets to a file while they are measured. A context manager.
 
-    Packets of one sensor must come in the order of their stamps. Pictures and small arrays are copied; long
-    arrays of varying length, as those of events, are read later and must not change. The first flushes come
+    Packets of one sensor must come in the order of their stamps. Arrays of 64 kB and more, such as pictures
+    and columns of events, are read later and must not change; smaller ones are copied. The first flushes come
     early, so that a disk that is full soon still holds most of what came.
 
     Threads compress each chunk as soon as it is full (gzip with shuffle, by ISA-L where that is installed),
@@ -111,7 +114,7 @@ class RecordingWriter:
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, _Stream] = {}
-        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS_MAX, os.cpu_count() or 1), "deflate")
+        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS, os.cpu_count() or 1), "deflate")
         self._order = 0
         self._newest_ns = 0
         self.kept_ns = 0
@@ -202,9 +205,7 @@ class RecordingWriter:
     def __enter__(self) -> RecordingWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:  # keep what is there, but do not hide the error
@@ -269,15 +270,7 @@ class _Column:
     """One array of the file that grows by rows, with the rows that are not yet in it."""
 
     def __init__(
-        self,
-        group: Any,
-        name: str,
-        shape: tuple[int, ...],
-        dtype: Any,
-        *,
-        chunk: int,
-        compressed: bool,
-        pool: ThreadPoolExecutor,
+        self, group: Any, name: str, shape: tuple[int, ...], dtype: Any, *, chunk: int, compressed: bool
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
@@ -285,49 +278,56 @@ class _Column:
         self._dataset = group.create_dataset(
             name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
         )
+        self._h5s = import_h5py().h5s
         self._shape = shape
-        self._chunk = chunk
-        self._pool = pool
+        self.chunk = chunk
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
-        self._deflates = compressed and self._dtype.kind != "O" and 0 not in shape
+        self.deflates = compressed and self._dtype.kind != "O" and 0 not in shape
         self._rows: list[NDArray[Any]] = []
         """What came since the last flush; if that deflates, what the last chunk holds so far."""
         self._begin = self._end = self._flushed_end = 0
         """Where they begin and end, and where the last flush ended."""
-        self._deflated: list[tuple[int, Future[list[bytes]]]] = []
-        """Chunks that are not in the file, by their first row."""
-        self._taken: _Taken | None = None
+        self._deflated: list[_Chunks] = []
+        self._taken: tuple[list[NDArray[Any]], int, int, list[_Chunks]] | None = None
+        """Rows, begin, end and chunks for `write_rows`."""
 
-    def append(self, rows: Any) -> int:
-        """Add rows, and let the pool compress the chunks that are full; return their size [bytes]."""
-        is_copied = not self._deflates or len(rows) < _KEPT_ROWS
-        count = len(rows) if 0 in self._shape else -1
-        block = (
-            np.asarray(rows)
-            .astype(self._dtype, casting="same_kind", copy=is_copied)
-            .reshape(count, *self._shape)
-        )
+    def append(self, rows: NDArray[Any]) -> int:
+        """Add rows; return their size [bytes]."""
+        is_copied = not self.deflates or rows.nbytes < _KEPT_BYTES
+        block = rows.astype(self._dtype, casting="same_kind", copy=is_copied)
         self._rows.append(block)
         self._end += len(block)
-        left = (self._end - self._begin) % self._chunk
-        if self._deflates and self._end - self._begin >= self._chunk:
-            self._rows[-1], rest = np.split(block, [len(block) - left])
-            self._deflate()
-            self._rows = [rest.copy() if left < _KEPT_ROWS else rest]
-            self._begin = self._end - left
         return block.nbytes
+
+    def cut(self, *, partly: bool) -> tuple[int, list[NDArray[Any]]]:
+        """Return the first row and the rows of chunks to compress: those that are full, or the last one."""
+        first, count = self._begin, self._end - self._begin
+        if partly:
+            if self._end == self._flushed_end:
+                return first, []
+            if len(self._rows) > _PARTS_MAX:
+                self._rows = [np.concatenate(self._rows)]
+            return first, [*self._rows] if count else []
+        if count < self.chunk:
+            return first, []
+        left = count % self.chunk
+        *parts, block = self._rows
+        full, rest = np.split(block, [len(block) - left])
+        self._rows = [rest.copy() if rest.nbytes < _KEPT_BYTES else rest]
+        self._begin = self._end - left
+        return first, [*parts, full]
+
+    def note(self, chunks: _Chunks) -> None:
+        """Take chunks that are being compressed."""
+        self._deflated.append(chunks)
 
     def take(self) -> None:
         """Set aside for `write_rows` what came since the last flush."""
         if self._end == self._flushed_end:
             return
-        if self._deflates:
-            self._rows = [np.concatenate(self._rows)]  # lets go of what they are part of
-            if len(self._rows[0]):
-                self._deflate()
-        self._taken = _Taken(self._rows, self._begin, self._end, self._deflated)
+        self._taken = self._rows, self._begin, self._end, self._deflated
         self._deflated, self._flushed_end = [], self._end
-        if not self._deflates:
+        if not self.deflates:
             self._rows, self._begin = [], self._end
 
     def write_rows(self) -> None:
@@ -337,24 +337,29 @@ class _Column:
         rows, begin, end, deflated = self._taken
         self._taken = None
         self._dataset.id.set_extent((end, *self._shape))
-        for first, chunks in deflated:
-            for number, chunk in enumerate(chunks.result()):
-                place = (first + number * self._chunk, *[0] * len(self._shape))
+        for chunks in deflated:
+            for number, chunk in enumerate(chunks.future.result()[chunks.position]):
+                place = (chunks.first + number * self.chunk, *[0] * len(self._shape))
                 self._dataset.id.write_direct_chunk(place, chunk)
-        if not self._deflates and 0 not in self._shape:
-            self._dataset[begin:] = np.concatenate(rows)
+        if self.deflates or 0 in self._shape:
+            return
+        values = np.concatenate(rows)
+        if self._dtype.kind == "O":
+            self._dataset[begin:] = values
+            return
+        place = self._dataset.id.get_space()
+        place.select_hyperslab((begin, *[0] * len(self._shape)), values.shape)
+        self._dataset.id.write(self._h5s.create_simple(values.shape), place, values)  # saves 50 us
 
-    def _deflate(self) -> None:
-        self._deflated.append((self._begin, self._pool.submit(_deflate, (*self._rows,), self._chunk)))
 
+class _Chunks(NamedTuple):
+    """Chunks of one column that are being compressed."""
 
-class _Taken(NamedTuple):
-    """Rows of a column that are to be written, or those chunks of them that deflate."""
-
-    rows: list[NDArray[Any]]
-    begin: int
-    end: int
-    deflated: list[tuple[int, Future[list[bytes]]]]
+    first: int
+    """First row."""
+    future: Future[list[list[bytes]]]
+    position: int
+    """Of their list in its result."""
 
 
 class _Stream:
@@ -369,6 +374,8 @@ class _Stream:
         self._written = self._taken_count = 0
         schema = schema_of(self._type)
         self._fields = schema.fields
+        self._varying = {field.name: field.varying for field in schema.fields}
+        """Name of the length of each field that differs from packet to packet; empty if none does."""
         for name in (field.name for field in schema.fields):
             if name in (*HEADER_COLUMNS, "packet_count") or name.endswith("_end"):
                 raise ValueError(f"a field of a packet cannot be called {name!r}: recordings use this name")
@@ -376,6 +383,10 @@ class _Stream:
         self._fixed = self._fixed_part(values)
         group.attrs["packet"], group.attrs["schema"] = schema.name, schema.to_json()
         self._packet_count = group.create_dataset("packet_count", data=np.int64(0))
+        self._is_events = isinstance(first, Events)
+        self._flat_chunk = _FLAT_CHUNK
+        if isinstance(first, Events):
+            self._flat_chunk = 1 << min(max((first.width * first.height).bit_length() - 1, 16), 18)
         for name in HEADER_COLUMNS:
             self._add_rows(name, np.int64)
         for field in self._fields:
@@ -386,8 +397,10 @@ class _Stream:
         self._ends = {field.varying: 0 for field in self._fields if field.varying}
         for name in self._ends:
             self._add_rows(f"{name}_end", np.int64)
+        self._numbers: list[tuple[int, ...]] = []
+        """Of the packets since the last flush: stamp, sequence, order, ends."""
+        self._deflating = [column for column in self._columns.values() if column.deflates]
         self._ms_count = 0
-        self._is_events = isinstance(first, Events)
         if self._is_events:
             group.create_dataset("t_offset", data=np.int64(0))
             self._add_rows("ms_to_idx", np.uint64)
@@ -412,19 +425,23 @@ class _Stream:
         for field in self._fields:
             if not field.constant:
                 value = values[field.name]
-                size += self._columns[field.name].append(value if field.varying else value[None])
-        lengths = {field.varying: len(values[field.name]) for field in self._fields if field.varying}
-        for name, length in lengths.items():
-            self._ends[name] += length
-            size += self._columns[f"{name}_end"].append(self._ends[name])
-        for name, number in zip(HEADER_COLUMNS, (packet.stamp_ns, packet.sequence, order), strict=True):
-            size += self._columns[name].append(number)
+                size += self._columns[field.name].append(value if self._varying[field.name] else value[None])
+        for length, count in {v: len(values[name]) for name, v in self._varying.items() if v}.items():
+            self._ends[length] += count
+        self._numbers.append((packet.stamp_ns, packet.sequence, order, *self._ends.values()))
         self._last_ns = packet.stamp_ns
         self._written += 1
-        return size
+        self._deflate(partly=False)
+        return size + 8 * len(self._numbers[-1])
 
     def take(self) -> None:
         """Set aside for `write_rows` and `commit` what came since the last flush."""
+        self._deflate(partly=True)
+        if self._numbers:
+            names = (*HEADER_COLUMNS, *(f"{name}_end" for name in self._ends))
+            for name, numbers in zip(names, np.array(self._numbers, np.int64).T, strict=True):
+                self._columns[name].append(numbers)
+            self._numbers = []
         for column in self._columns.values():
             column.take()
         self._taken_count = self._written
@@ -442,10 +459,17 @@ class _Stream:
         if self._is_events:
             self._columns["ms_to_idx"].append(np.array([self._ends["event"]], dtype=np.uint64))
 
+    def _deflate(self, *, partly: bool) -> None:
+        """Let the pool compress chunks, those of all columns in one task."""
+        cut = [(column, *column.cut(partly=partly)) for column in self._deflating]
+        cut = [(column, first, parts) for column, first, parts in cut if parts]
+        if cut:
+            future = self._pool.submit(_deflate, [(parts, column.chunk) for column, _, parts in cut])
+            for position, (column, first, _) in enumerate(cut):
+                column.note(_Chunks(first, future, position))
+
     def _add_rows(self, name: str, dtype: Any) -> None:
-        self._columns[name] = _Column(
-            self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False, pool=self._pool
-        )
+        self._columns[name] = _Column(self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False)
 
     def _add_field(self, field: FieldSchema, value: NDArray[Any]) -> None:
         path = DSEC_NAMES.get(field.name, field.name) if issubclass(self._type, Events) else field.name
@@ -456,11 +480,11 @@ class _Stream:
         count = max(1, int(np.prod(shape)))
         chunk, compressed = _ROW_CHUNK, False
         if field.varying:
-            chunk, compressed = max(1, _FLAT_CHUNK // count), True
+            chunk, compressed = max(1, self._flat_chunk // count), True
         elif count * value.dtype.itemsize >= LARGE_ROW_BYTES:
             chunk, compressed = 1, True
         self._columns[field.name] = _Column(
-            self._group, path, shape, dtype, chunk=chunk, compressed=compressed, pool=self._pool
+            self._group, path, shape, dtype, chunk=chunk, compressed=compressed
         )
 
     def _values(self, packet: Packet) -> dict[str, NDArray[Any]]:
@@ -468,10 +492,9 @@ class _Stream:
         values = {field.name: as_numpy(getattr(packet, field.name)) for field in self._fields}
         lengths: dict[str, int] = {}
         for field in self._fields:
-            found, wanted = values[field.name].shape, field.shape
-            if field.varying and found:
-                lengths.setdefault(field.varying, found[0])
-                wanted = (lengths[field.varying], *wanted[1:])
+            found, wanted, varying = values[field.name].shape, field.shape, self._varying[field.name]
+            if varying and found:
+                wanted = (lengths.setdefault(varying, found[0]), *wanted[1:])
             fits = len(found) == len(wanted) or "..." in wanted
             if not fits or any(isinstance(n, int) and n != m for n, m in zip(wanted, found, strict=False)):
                 raise ValueError(
@@ -487,8 +510,8 @@ class _Stream:
             value = values[field.name]
             if field.constant:
                 fixed[field.name] = value.item()
-            elif field.shape:
-                fixed[field.name] = value.shape[1:] if field.varying else value.shape
+            elif field.dtype == "any" or any(isinstance(length, str) for length in field.shape):
+                fixed[field.name] = value.shape[1:] if self._varying[field.name] else value.shape
                 if field.dtype == "any":
                     fixed[field.name] = (*fixed[field.name], value.dtype.name)
         return fixed
@@ -546,32 +569,38 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
     return groups
 
 
-def import_h5py() -> ModuleType:
-    """Return the module `h5py`.
+def import_h5py() -> Any:
+    """Return the module `h5py`."""
+    return need("recordings need h5py", "record", "h5py")
 
-    Raises:
-        ImportError: It is not installed; the message says what to install.
+
+def _deflate(columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list[bytes]]:
+    """Return what HDF5's filters shuffle and gzip would make of the chunks of each column, faster.
+
+    Args:
+        columns: The parts of the rows of each, and how many rows a chunk has; zeros fill up the last.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError(f"recordings need h5py: {install_hint('record')}") from error
-    return h5py
+    return [_deflate_column(parts, length) for parts, length in columns]
 
 
-def _deflate(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
-    """Return what HDF5's filters shuffle and gzip would make of chunks of so many rows, faster.
-
-    The last chunk is filled up with zeros.
-    """
-    rows = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    octets = np.ascontiguousarray(rows).reshape(-1, 1).view(np.uint8)
-    size = length * (rows.size // len(rows))
+def _deflate_column(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
     compress = (import_isal() or zlib).compress
-    chunks = []
-    for first in range(0, len(octets), size):
-        chunk = octets[first : first + size]
-        planes = np.zeros((chunk.shape[1], size), np.uint8)
-        planes[:, : len(chunk)] = chunk.T
+    size, width = length * int(np.prod(parts[0].shape[1:])), parts[0].itemsize
+    # Memory that comes and goes is mapped under the interpreter's lock, on which the flight waits.
+    if getattr(_scratch, "octets", np.empty(0)).size < size * width:
+        _scratch.octets = np.empty(size * width, np.uint8)
+    planes = _scratch.octets[: size * width].reshape(width, size)
+    chunks, filled = [], 0
+    for part in parts:
+        octets = np.ascontiguousarray(part).reshape(-1, 1).view(np.uint8)
+        while len(octets):
+            taken = octets[: size - filled]
+            planes[:, filled : filled + len(taken)] = taken.T
+            octets, filled = octets[len(taken) :], filled + len(taken)
+            if filled == size:
+                chunks.append(compress(planes, 1))
+                filled = 0
+    if filled:
+        planes[:, filled:] = 0
         chunks.append(compress(planes, 1))
     return chunks

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.lighting import RefinedMesh, corner_normals
+from neurosim_core.render.refine import RefinedMesh
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Material
 
@@ -118,7 +118,7 @@ def upload_bodies(
         shading=shading,
         mesh=wp.array(np.array([mesh.id for mesh in meshes], np.uint64), dtype=wp.uint64, device=device),
         first_face=wp.array(first, dtype=int, device=device),
-        corner_normal=wp.array(corner_normals(joined.mesh).reshape(-1, 3), dtype=wp.vec3, device=device),
+        corner_normal=wp.array(joined.mesh.corner_normals.reshape(-1, 3), dtype=wp.vec3, device=device),
         sphere=wp.array(sphere, dtype=wp.vec4, device=device),
     )
 

@@ -15,10 +15,9 @@ view: `bake_light` computes it once, with shadows and ambient occlusion, and a r
 from __future__ import annotations
 
 import functools
-import logging
+import inspect
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,10 @@ from neurosim_core.render.config import LightingConfig
 from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_width
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.light_cache import cached_arrays
-from neurosim_core.scene.scene import Scene, extent
+from neurosim_core.render.refine import RefinedMesh
+from neurosim_core.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
-
-log = logging.getLogger(__name__)
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BURIED = 0.1  # occluders at 5 % of the ambient radius all around
@@ -65,120 +63,6 @@ def point_light(
 def reflect_light(albedo: wp.vec3, light: wp.vec3, emission: wp.vec3) -> wp.vec3:
     """Return the radiance of a surface, given what a white one would reflect."""
     return wp.cw_mul(albedo, light) + emission
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RefinedMesh:
-    """Triangles of a scene after `refine`."""
-
-    vertices: NDArray[np.float32]
-    """Positions [m], shape [V, 3]; the first are those of the scene."""
-    normals: NDArray[np.float32]
-    """Unit shading normals, shape [V, 3]."""
-    uv: NDArray[np.float32]
-    """Texture coordinates, shape [V, 2]."""
-    faces: NDArray[np.int32]
-    """Vertex indices, shape [F, 3]."""
-    origin: NDArray[np.int32]
-    """Face of the scene that each face is a part of, shape [F]."""
-
-
-def refine(scene: Scene, edge_max_m: float | None, *, added_count_max: int = 4_000_000) -> RefinedMesh:
-    """Split edges of triangles in halves until none is longer than `edge_max_m`; None: leave all as they are.
-
-    Where that would add more than `added_count_max` faces, `edge_max_m` grows by factors of sqrt(2) until it
-    does not, and a warning is logged. A face takes about 230 bytes.
-
-    Whether an edge is split, and where, depends on nothing but its two ends, so faces that share an edge
-    (also with vertices of their own at the same places) split it alike: no cracks, no T-junctions. Area is
-    preserved.
-    """
-    edge_m = edge_max_m
-    while (mesh := _refine(scene, edge_m, added_count_max)) is None:
-        assert edge_m is not None
-        edge_m *= math.sqrt(2.0)
-    if edge_m != edge_max_m:
-        log.warning(
-            "baked light: the scene is so large that triangles have edges of up to %.3g m instead of %g m "
-            "(render.lighting.edge_max_m), or they would be more than %d; shadows are as coarse",
-            edge_m,
-            edge_max_m,
-            len(scene.faces) + added_count_max,
-        )
-    return mesh
-
-
-def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> RefinedMesh | None:
-    """Return what `refine` returns; None if more faces are added than allowed."""
-    vertices, normals, uv = scene.vertices, scene.normals, scene.uv
-    faces, origin = scene.faces, np.arange(len(scene.faces), dtype=np.int32)
-    short: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
-    while edge_max_m is not None and len(faces):
-        tips = vertices.take(faces, axis=0)
-        sides = np.roll(tips, -1, axis=1) - tips  # side k goes from corner k to corner k + 1
-        long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
-        split = long[:, 0] | long[:, 1] | long[:, 2]
-        added_count_max -= int(long.sum())
-        if added_count_max < 0:
-            return None
-        short.append((faces[~split], origin[~split]))
-        chosen, chosen_long = faces[split], long[split]
-        one, other = (ends[chosen_long].astype(np.int64) for ends in (chosen, chosen[:, (1, 2, 0)]))
-        ends = np.minimum(one, other) * len(vertices) + np.maximum(one, other)
-        keys, index = np.unique(ends, return_inverse=True)
-        first, second = keys // len(vertices), keys % len(vertices)
-        middle = np.full(chosen.shape, -1, dtype=np.int32)
-        middle[chosen_long] = len(vertices) + index
-        halves = np.float32(0.5) * (normals[first] + normals[second])
-        length = np.linalg.norm(halves, axis=1, keepdims=True)
-        halves = np.where(length > 1e-3, halves / np.maximum(length, 1e-3), normals[first])
-        vertices = np.concatenate([vertices, np.float32(0.5) * (vertices[first] + vertices[second])])
-        normals = np.concatenate([normals, halves])
-        uv = np.concatenate([uv, np.float32(0.5) * (uv[first] + uv[second])])
-        faces, parents = _split_faces(vertices, chosen, middle)
-        origin = origin[split][parents]
-    faces, origin = (np.concatenate(each) for each in zip(*short, (faces, origin), strict=True))
-    order = np.argsort(origin, kind="stable")  # parts of a face stay together: neighbours in space and memory
-    return RefinedMesh(vertices=vertices, normals=normals, uv=uv, faces=faces[order], origin=origin[order])
-
-
-def _split_faces(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], middle: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Return the parts of faces [F, 3] and the row each comes from.
-
-    `middle` [F, 3] is the vertex in the middle of side k (from corner k to k + 1), -1 where it is not split.
-    """
-    parts: list[NDArray[np.int32]] = []
-    parents: list[NDArray[np.int64]] = []
-
-    def add(rows: NDArray[np.int64], *corners: NDArray[np.int32]) -> None:
-        parts.append(np.stack(corners, axis=1))
-        parents.append(rows)
-
-    count = (middle >= 0).sum(axis=1)
-    rows = np.flatnonzero(count == 3)
-    (a, b, c), (ab, bc, ca) = faces[rows].T, middle[rows].T
-    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        add(rows, *corners)
-    # Turned so that with one split side it is a-b, with two the whole side is c-a.
-    for turn in range(3):
-        turned, turned_middle = np.roll(faces, -turn, axis=1), np.roll(middle, -turn, axis=1)
-        rows = np.flatnonzero((count == 1) & (turned_middle[:, 0] >= 0))
-        (a, b, c), ab = turned[rows].T, turned_middle[rows, 0]
-        add(rows, a, ab, c)
-        add(rows, ab, b, c)
-        rows = np.flatnonzero((count == 2) & (turned_middle[:, 2] < 0))
-        (a, b, c), (ab, bc) = turned[rows].T, turned_middle[rows, :2].T
-        add(rows, ab, b, bc)
-        # The rest is a quadrangle a, ab, bc, c: cut along its shorter diagonal.
-        first, second = vertices[a] - vertices[bc], vertices[ab] - vertices[c]
-        from_a = np.linalg.norm(first, axis=1) <= np.linalg.norm(second, axis=1)
-        add(rows[from_a], a[from_a], ab[from_a], bc[from_a])
-        add(rows[from_a], a[from_a], bc[from_a], c[from_a])
-        add(rows[~from_a], a[~from_a], ab[~from_a], c[~from_a])
-        add(rows[~from_a], ab[~from_a], bc[~from_a], c[~from_a])
-    return np.concatenate(parts), np.concatenate(parents)
 
 
 @wp.kernel
@@ -334,45 +218,19 @@ def _sphere(count: int) -> NDArray[np.float32]:
     return np.stack(columns, axis=1, dtype=np.float32)
 
 
-def corner_normals(mesh: RefinedMesh) -> NDArray[np.float32]:
-    """Return the shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
-    tips = mesh.vertices.take(mesh.faces, axis=0)
-    front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-    normals = mesh.normals.take(mesh.faces, axis=0)
-    sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
-    return normals * sign[..., None]
-
-
-def _group_corners(
-    mesh: RefinedMesh, normals: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return a group number for each corner [3F] and one corner of each group: same place, same normal.
-
-    Places are told apart to 2^-20 of the scene's size, normals to 1/64.
-    """
-    low, high = extent(mesh.vertices)
-    quantum = max(float((high - low).max()) / (1 << 20), 1e-9)
-    place = np.rint((mesh.vertices - low) / quantum).astype(np.int64)
-    _, place_id = np.unique(place[:, 0] << 42 | place[:, 1] << 21 | place[:, 2], return_inverse=True)
-    facing = np.rint(normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
-    key = place_id[mesh.faces.reshape(-1)] << 24 | facing[:, 0] << 16 | facing[:, 1] << 8 | facing[:, 2]
-    _, example, group = np.unique(key, return_index=True, return_inverse=True)
-    order = np.argsort(example)  # in the order of faces: neighbours in space run after each other
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return rank[group], example[order]
-
-
 def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
     """Give buried points (a floor under a carpet) the mean light of the neighbours that are not, in place.
 
     They are not seen, but faces reach from them into the open, and would be dark there. Shapes: light of each
     group on each side [G, 2, 3], openness [G, 2], groups of the corners of each face [F, 3].
     """
-    a, b, c = np.ascontiguousarray(faces.T)
-    one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
+    corners = np.ascontiguousarray(faces.T)
     for side in range(2):
         buried = openness[:, side] < _BURIED
+        first, second, third = (buried.take(corner) for corner in corners)
+        some = (first | second | third) & ~(first & second & third)  # few faces
+        a, b, c = (corner[some] for corner in corners)
+        one, other = np.concatenate([a, b, c, b, c, a]), np.concatenate([b, c, a, a, b, c])
         rim = buried.take(one) & ~buried.take(other)
         inside, outside = one[rim], other[rim]
         count = np.bincount(inside, minlength=len(light))
@@ -417,10 +275,9 @@ def bake_light(
     def compute() -> dict[str, NDArray[Any]]:
         with ThreadPoolExecutor(max_workers=1) as aside:
             building = aside.submit(_build_occluders, scene, device, embree=embree)
-            normals = corner_normals(mesh)
-            group, example = _group_corners(mesh, normals)
+            group, _ = mesh.corner_groups
             occluders = building.result()
-        light, openness = _light_groups(scene, mesh, config, normals, group, example, occluders, device)
+        light, openness = _light_groups(scene, mesh, config, occluders, device)
         _unbury(light, openness, group.reshape(-1, 3))
         return {"light": light, "group": group.astype(np.int32)}
 
@@ -440,20 +297,18 @@ def _build_occluders(scene: Scene, device: str, *, embree: bool) -> wp.Mesh | Em
 
 @functools.cache
 def _source() -> bytes:
-    return Path(__file__).read_bytes()
+    return Path(__file__).read_bytes() + Path(inspect.getfile(RefinedMesh)).read_bytes()
 
 
 def _light_groups(
     scene: Scene,
     mesh: RefinedMesh,
     config: LightingConfig,
-    normals: NDArray[np.float32],
-    group: NDArray[np.int64],
-    example: NDArray[np.int64],
     occluders: wp.Mesh | EmbreeTree,
     device: str,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return light, shape [G, 2, 3], and openness, [G, 2], of each group of corners on both sides."""
+    group, example = mesh.corner_groups
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
@@ -477,7 +332,7 @@ def _light_groups(
             wp.array(_sphere(config.shadow_ray_count), dtype=wp.vec3, device=device),
             wp.array(mesh.vertices, dtype=wp.vec3, device=device),
             wp.array(mesh.faces, dtype=wp.vec3i, device=device),
-            wp.array(normals.reshape(-1, 3)[example], dtype=wp.vec3, device=device),
+            wp.array(mesh.corner_normals.reshape(-1, 3)[example], dtype=wp.vec3, device=device),
             wp.array(starts, dtype=int, device=device),
             wp.array(order, dtype=int, device=device),
         ],

@@ -23,7 +23,8 @@ from neurosim_core.install import install_hint
 from neurosim_core.render.body_arrays import join_bodies
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.render.lighting import RefinedMesh, bake_light, refine
+from neurosim_core.render.lighting import bake_light
+from neurosim_core.render.refine import RefinedMesh, refine
 from neurosim_core.render.scene_arrays import areas_m2, auto_exposure
 from neurosim_core.scene.bodies import Body, BodyPoses, body_poses
 from neurosim_core.scene.materials import mean_albedo, pack_textures

@@ -9,21 +9,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_width
-from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, shading_mesh
+from neurosim_core.render.lighting import bake_light, shading_mesh
 from neurosim_core.render.ray_intersection import face_normals
 from neurosim_core.render.ray_tree import make_ray_tree
+from neurosim_core.render.refine import RefinedMesh, refine
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.bodies import Body
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
-from neurosim_core.scene.normals import edge_keys
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import unique_name
 
@@ -31,7 +30,6 @@ _logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _MIDDLE_GREY = 0.2
 _BRIGHT = 0.6
-_PLANE_COSINE = 1.0 - 1e-5  # normals of a plane surface differ by less than a quarter of a degree
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,7 +78,9 @@ def upload_scene(
     wp.zeros(1, device=device)  # Warp makes a device's streams at its first use, which must be in one thread
     with ThreadPoolExecutor(max_workers=3) as aside:
         packing = aside.submit(pack_textures, materials)
-        connecting = aside.submit(connect_faces, scene) if config.samples_per_pixel == "adaptive" else None
+        connecting = (
+            aside.submit(lambda: scene.connections) if config.samples_per_pixel == "adaptive" else None
+        )
         embree_width = _embree_width(config, device)
         mesh = refine(scene, config.lighting.edge_max_m if baked else None)
         building = aside.submit(
@@ -225,7 +225,7 @@ def _upload_light(
         assert light is not None
         data.corner_light = wp.array(light.reshape(2, -1, 3), dtype=wp.vec3, device=device)
     else:
-        data.corner_normal = wp.array(corner_normals(mesh).reshape(-1, 3), dtype=wp.vec3, device=device)
+        data.corner_normal = wp.array(mesh.corner_normals.reshape(-1, 3), dtype=wp.vec3, device=device)
     if lamps:
         positions, intensities = [x.position_m for x in scene.lights], [x.intensity for x in scene.lights]
         data.light_position = wp.array(_rows(positions), dtype=wp.vec3, device=device)
@@ -271,49 +271,6 @@ def _upload_wholes(
     data.whole_neighbor = wp.array(neighbor, dtype=int, device=device)
     data.whole_surface = wp.array(surface, dtype=int, device=device)
     data.face_surface = wp.array(surface[mesh.origin], dtype=int, device=device)
-
-
-def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return which faces share edges, and which are parts of one surface.
-
-    Vertices at one place are one. Of several faces at an edge each has one of the others.
-
-    Returns:
-        The face beyond the edge opposite each corner, -1: none, shape [3 F]. The surface of each face, shape
-        [F]: a surface is plane, has one material, and its texture coordinates are continuous.
-    """
-    material, vertices = scene.face_material, np.ascontiguousarray(scene.vertices, dtype=np.float32)
-    mesh = scene
-    count = len(mesh.faces)
-    tips = mesh.vertices.take(mesh.faces, axis=0)
-    bits = (vertices + np.float32(0.0)).view(np.int32).astype(np.int64)  # + 0 makes -0 equal to 0
-    plan, up = bits[:, 0] << 32 | (bits[:, 1] & 0xFFFFFFFF), bits[:, 2]
-    order = np.lexsort((up, plan))
-    place = np.zeros(len(vertices), dtype=np.int64)
-    place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
-    corner = place.take(mesh.faces)
-    first, last = np.roll(corner, -1, axis=1).reshape(-1), np.roll(corner, 1, axis=1).reshape(-1)
-    key = edge_keys(first, last)
-    order = np.argsort(key, kind="stable")
-    same = key[order[1:]] == key[order[:-1]]
-    one, other = order[:-1][same], order[1:][same]
-    neighbor = np.full(3 * count, -1, dtype=np.int32)
-    neighbor[other], neighbor[one] = one // 3, other // 3
-
-    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    uv = mesh.uv.take(mesh.faces, axis=0)  # of the ends of each edge, the one of the lower number first:
-    ends = np.roll(uv, -1, axis=1).reshape(-1, 2), np.roll(uv, 1, axis=1).reshape(-1, 2)
-    turned = (first > last)[:, None]
-    joined = material[one // 3] == material[other // 3]
-    for end in (np.where(turned, *ends[::-1]), np.where(turned, *ends)):
-        u, v = (end.take(one, axis=0) == end.take(other, axis=0)).T
-        joined &= u & v
-    sides = (normal.take(edges // 3, axis=0) for edges in (one, other))
-    joined &= np.einsum("ec,ec->e", *sides) > _PLANE_COSINE
-    pairs = (one[joined] // 3, other[joined] // 3)
-    graph = scipy.sparse.coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
-    return neighbor, scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 def areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
 from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
@@ -200,7 +199,7 @@ class _Reader:
         matrix = np.eye(4)
         rotation = np.asarray(node.get("rotation", [0, 0, 0, 1]), dtype=np.float64)
         if np.linalg.norm(rotation) > 0.0:
-            matrix[:3, :3] = scipy.spatial.transform.Rotation.from_quat(rotation).as_matrix()
+            matrix[:3, :3] = _rotation(rotation)
         matrix[:3, :3] *= np.asarray(node.get("scale", [1, 1, 1]), dtype=np.float64)
         matrix[:3, 3] = node.get("translation", [0, 0, 0])
         return matrix
@@ -384,6 +383,21 @@ class _Reader:
         else:
             source.up_axis = "y"
             source.up_reason = "glTF is y up by specification"
+
+
+def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix of a quaternion (xyzw) of any length; SciPy's takes 0.2 ms for each."""
+    x, y, z, w = quaternion.tolist()
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x / length, y / length, z / length, w / length
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    return np.array(
+        [
+            [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww],
+        ]
+    )
 
 
 def _triangles(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:

@@ -1,10 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,return-value,assignment,operator"
-"""Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled.
-
-A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the
-codes like sRGB does, but is decoded with one multiplication and no table, and with 8 times (blue: 4 times)
-the levels of an 8-bit file, so the error is far below that of the file itself; and it is one load of 32 bits.
-"""
+"""Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled."""
 
 from __future__ import annotations
 
@@ -17,48 +12,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.scene.scene import Material, Texture
-from neurosim_core.scene.srgb import LINEAR
+from neurosim_core.scene.texels import LEVELS_B, LEVELS_RG
 
 wp.set_module_options({"enable_backward": False})
 
-_LEVELS_RG = 2047
-_LEVELS_B = 1023
-_TEXEL_UNIT = wp.constant(wp.vec3(1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_RG**2, 1.0 / _LEVELS_B**2))
+_TEXEL_UNIT = wp.constant(wp.vec3(1.0 / LEVELS_RG**2, 1.0 / LEVELS_RG**2, 1.0 / LEVELS_B**2))
 """Linear light of a texel whose roots are coded by 1."""
-
-
-def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    """Return a linear picture [H, W, C] and its averages at half, a quarter, … of the resolution.
-
-    Each level is the exact box average of the one before (odd sizes too), so all levels have the same mean.
-    """
-    levels = [linear]
-    while max(levels[-1].shape[:2]) > 1:
-        levels.append(_halve(_halve(levels[-1], axis=0), axis=1))
-    return levels
-
-
-def _halve(picture: NDArray[np.float32], *, axis: int) -> NDArray[np.float32]:
-    rows = np.moveaxis(picture, axis, 0)
-    size = rows.shape[0]
-    if size == 1:
-        return picture
-    half = size // 2
-    if size % 2 == 0:
-        result = 0.5 * (rows[0::2] + rows[1::2])
-    else:  # each of the `half` results covers 2 + 1 / half texels
-        k = np.arange(half, dtype=np.float32).reshape(-1, *[1] * (rows.ndim - 1))
-        result = ((half - k) * rows[0:-1:2] + half * rows[1::2] + (k + 1.0) * rows[2::2]) / size
-    return np.moveaxis(result.astype(np.float32), 0, axis)
-
-
-def encode_texels(linear: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Return packed texels of linear light [..., 3] in [0, 1] (values outside are clipped)."""
-    root = np.sqrt(np.clip(linear, 0.0, 1.0))
-    red = np.rint(root[..., 0] * _LEVELS_RG).astype(np.uint32)
-    green = np.rint(root[..., 1] * _LEVELS_RG).astype(np.uint32)
-    blue = np.rint(root[..., 2] * _LEVELS_B).astype(np.uint32)
-    return np.asarray(red | (green << np.uint32(11)) | (blue << np.uint32(22)), dtype=np.uint32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +44,7 @@ def pack_textures(materials: Sequence[Material]) -> PackedTextures:
     """
     textures = list({id(m.texture): m.texture for m in materials if m.texture is not None}.values())
     with ThreadPoolExecutor() as pool:
-        chains = dict(zip(map(id, textures), pool.map(_packed_levels, textures), strict=True))
+        chains = dict(zip(map(id, textures), pool.map(Texture.take_levels, textures), strict=True))
     chunks: list[NDArray[np.uint32]] = []
     levels: list[tuple[int, int, int]] = []
     rows: dict[int, tuple[int, int]] = {}
@@ -105,16 +64,6 @@ def pack_textures(materials: Sequence[Material]) -> PackedTextures:
     )
 
 
-def _packed_levels(texture: Texture) -> list[NDArray[np.uint32]]:
-    """Return the packed texels of all levels of a texture, shape [H, W] each."""
-    codes = encode_texels(np.repeat(LINEAR[:, None], 3, axis=1))  # each channel alone, as a table
-    masks = np.array([_LEVELS_RG, _LEVELS_RG << 11, _LEVELS_B << 22], np.uint32)
-    red, green, blue = (codes & mask for mask in masks)
-    srgb = texture.srgb
-    finest = red[srgb[..., 0]] | green[srgb[..., 1]] | blue[srgb[..., 2]]
-    return [finest, *(encode_texels(level) for level in mip_chain(LINEAR[srgb])[1:])]
-
-
 def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArray[np.float32]:
     """Return the albedo of each material averaged over its texture, linear, shape [M, 3]."""
     albedo = np.array([m.base_color for m in materials], dtype=np.float32).reshape(-1, 3)
@@ -122,9 +71,9 @@ def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArra
         if count:
             code = int(packed.texels[packed.levels[first + count - 1, 0]])
             root = np.array([code & 2047, (code >> 11) & 2047, code >> 22]) / (
-                _LEVELS_RG,
-                _LEVELS_RG,
-                _LEVELS_B,
+                LEVELS_RG,
+                LEVELS_RG,
+                LEVELS_B,
             )
             albedo[index] *= (root**2).astype(np.float32)
     return albedo

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -29,8 +28,6 @@ from neurosim_core.scene.source import (
 from neurosim_core.scene.srgb import linear_to_srgb8
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
-
-_log = logging.getLogger(__name__)
 
 _GLTF = frozenset({"gltf", "glb"})
 _EXTENT_MAX_M = 20_000.0

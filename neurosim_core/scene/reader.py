@@ -6,6 +6,7 @@ a name, which is mapped into memory.
 
 from __future__ import annotations
 
+import gc
 import json
 import mmap
 import os
@@ -14,8 +15,12 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
+
+from neurosim_core.signals import end_with_parent
 
 if TYPE_CHECKING:
     from neurosim_core.scene.config import SceneConfig
@@ -27,20 +32,23 @@ _ALIGNMENT = 64
 class SceneReader:
     """A process that reads a scene. A context manager, which ends it."""
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: Mapping[str, Any]) -> None:
         """Start the process.
 
         Args:
-            settings: Of the scene, unchecked; relative files are looked up from the working directory.
+            settings: Unchecked; of them `scene` and `render` count. Relative files are looked up from the
+                working directory.
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
-        number = self._file.fileno()
+        read = {key: settings.get(key, {}) for key in ("scene", "render")}
+        # `-m` would look for modules in the working directory first, where a yaml.py may lie
+        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, json.dumps(settings, default=str), str(number)],
-            pass_fds=[number],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-c", program, json.dumps(read, default=str)],
+            stdin=self._file,  # which is to be written: its number may be 0 here, and is there
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
     def scene(self, config: SceneConfig) -> Scene:
@@ -77,25 +85,41 @@ class SceneReader:
         self._file.close()
 
 
-def _write(settings: Any, number: int) -> None:
-    """Read a scene and write it to an open file."""
+def main() -> None:
+    """Be the process: read the scene of the settings in the first argument, and write it to file 0."""
+    gc.disable()  # it ends soon
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
+    _write(json.loads(sys.argv[1]))
+
+
+def _write(settings: Mapping[str, Any]) -> None:
+    """Read a scene, compute what its light and its pictures need, and write all to standard input."""
     from neurosim_core.registry import find
+    from neurosim_core.render.config import RenderConfig
+    from neurosim_core.render.refine import refine_within
     from neurosim_core.scene.mesh import scene_kind
 
-    settings = {"kind": settings} if isinstance(settings, str) else settings
-    kind = scene_kind(settings)
-    config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **settings})  # type: ignore[attr-defined]
+    given = settings["scene"]
+    given = {"kind": given} if isinstance(given, str) else given
+    kind = scene_kind(given)
+    config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
+    scene = config.load()
+    with ThreadPoolExecutor() as aside:
+        for texture in {id(m.texture): m.texture for m in scene.materials if m.texture is not None}.values():
+            aside.submit(texture.__getstate__)
+        render = RenderConfig.model_validate(settings["render"])
+        edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
+        if (mesh := refine_within(scene, edge_m)) is not None:
+            scene.refined[edge_m] = mesh
+            _ = mesh.corner_groups, mesh.corner_normals
+        if render.samples_per_pixel == "adaptive":
+            _ = scene.connections
     buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps((config, config.load()), protocol=5, buffer_callback=buffers.append)
+    body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
     views = [buffer.raw() for buffer in buffers]
-    with os.fdopen(number, "wb") as file:
+    with open(0, "wb") as file:
         pickle.dump(([view.nbytes for view in views], body), file)
         for view in views:
             file.write(bytes(-file.tell() % _ALIGNMENT))
             file.write(view)
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    _write(json.loads(sys.argv[1]), int(sys.argv[2]))

@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurosim_core.scene.connections import connect_faces
+from neurosim_core.scene.texels import packed_levels
+
 LinearRgb = tuple[float, float, float]
 """Linear-light red, green, blue (Rec. 709 primaries)."""
 
@@ -43,9 +46,19 @@ class Texture:
         """Look at the texels now: raises what is wrong with their picture."""
         self.srgb  # noqa: B018
 
+    @cached_property
+    def _levels(self) -> list[NDArray[np.uint32]]:
+        return packed_levels(self.srgb)
+
+    def take_levels(self) -> list[NDArray[np.uint32]]:
+        """Return the packed texels of all mip levels, shape [H, W] each; they are not kept."""
+        levels = self._levels
+        self.__dict__.pop("_levels", None)
+        return levels
+
     def __getstate__(self) -> dict[str, Any]:
-        """Return what another process gets: the texels, in place of what paints them."""
-        return {"name": self.name, "_source": self.srgb}
+        """Return what another process gets: the texels and their levels, in place of what paints them."""
+        return {"name": self.name, "_source": self.srgb, "_levels": self._levels}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,6 +88,49 @@ class Ambient:
 
     up: LinearRgb = (0.35, 0.35, 0.36)
     down: LinearRgb = (0.22, 0.21, 0.20)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedMesh:
+    """Triangles of a scene after `render.refine`."""
+
+    vertices: NDArray[np.float32]
+    """Positions [m], shape [V, 3]; the first are those of the scene."""
+    normals: NDArray[np.float32]
+    """Unit shading normals, shape [V, 3]."""
+    uv: NDArray[np.float32]
+    """Texture coordinates, shape [V, 2]."""
+    faces: NDArray[np.int32]
+    """Vertex indices, shape [F, 3]."""
+    origin: NDArray[np.int32]
+    """Face of the scene that each face is a part of, shape [F]."""
+
+    @cached_property
+    def corner_normals(self) -> NDArray[np.float32]:
+        """Shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
+        tips = self.vertices.take(self.faces, axis=0)
+        front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
+        normals = self.normals.take(self.faces, axis=0)
+        sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
+        return np.asarray(normals * sign[..., None])
+
+    @cached_property
+    def corner_groups(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Group number of each corner [3F] and one corner of each group: same place, same normal.
+
+        Places are told apart to 2^-20 of the scene's size, normals to 1/64.
+        """
+        low, high = extent(self.vertices)
+        quantum = max(float((high - low).max()) / (1 << 20), 1e-9)
+        place = np.rint((self.vertices - low) / quantum).astype(np.int64)
+        _, place_id = np.unique(place[:, 0] << 42 | place[:, 1] << 21 | place[:, 2], return_inverse=True)
+        facing = np.rint(self.corner_normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
+        key = place_id[self.faces.reshape(-1)] << 24 | facing[:, 0] << 16 | facing[:, 1] << 8 | facing[:, 2]
+        _, example, group = np.unique(key, return_index=True, return_inverse=True)
+        order = np.argsort(example)  # in the order of faces: neighbours in space run after each other
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        return rank[group], example[order]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,10 +173,18 @@ class Scene:
     """What was subtracted from the coordinates of the file, in metres and with z up, as float32 could not
     tell places apart so far from its zero [m]."""
 
+    refined: dict[float | None, RefinedMesh] = field(default_factory=dict)
+    """Meshes that `render.refine` has made of it beforehand, by their longest edge [m]."""
+
     def __post_init__(self) -> None:
         """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""
         if len(self.faces) == 0:
             raise ValueError(f"a scene must have triangles, and {self.name!r} has none")
+
+    @cached_property
+    def connections(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """What `connect_faces` returns."""
+        return connect_faces(self)
 
     @cached_property
     def bounds_m(self) -> NDArray[np.float64]:

@@ -348,8 +348,11 @@ class FrameSensor(Protocol):
     def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
         """Launch what it makes of the frames of a batch, device array, shape [>= K, H, W]."""
 
-    def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
-        """Wait for the oldest batch, and return the packets that end in it, at most at a stamp."""
+    def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
+        """Wait for the oldest batch; return what gives the packets that end in it, at most at a stamp.
+
+        It is called next, or after the `see` of one more batch.
+        """
 
     def flush(self, *, until_ns: int) -> list[Packet]:
         """Return the packet that has begun and not ended."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
@@ -193,16 +193,16 @@ class EventChannel:
         if stamps_ns:
             self.camera.feed_device(frames[first:] if first else frames, stamps_ns)
 
-    def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
-        """Wait for the oldest batch, and return the packets whose windows end in it, at most at a stamp."""
+    def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
+        """Wait for the oldest batch; return what gives the packets whose windows end in it."""
         begun_ns = self.camera.window_start_ns
         ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
         ends = [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
         fed = stamps_ns[-1] > self.camera.stamp_ns
         self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
-        packets: list[Events] = self.camera.collect_windows(ends, scan_count=int(fed))
+        hand_out = self.camera.begin_windows(ends, scan_count=int(fed))
         self._sequence += len(ends)
-        return self._labelled(packets)
+        return lambda: self._labelled(hand_out())
 
     def flush(self, *, until_ns: int) -> list[Packet]:
         """Return the packet whose window has begun and not ended, cut at the last instant until a stamp."""

@@ -4,7 +4,7 @@
 Keys are as in `event_levels`. What no window has taken yet stays, and its time goes on from the last cut.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -53,6 +53,10 @@ def roomy_keys(count: int, touched_count: int) -> wp.array[wp.int64]:
     keys: wp.array[wp.int64] = wp.empty(count, dtype=wp.int64, device="cpu")
     keys.numpy()[:touched_count] = 0
     return keys
+
+
+Cut = Callable[[], tuple[list[Any], list[int]]]
+"""Waits for keys to be sorted; returns them as columns, and the index of the first one after each window."""
 
 
 class Labeller(Protocol):
@@ -180,14 +184,14 @@ class EventKeys:
         )
         self.count = first + read
 
-    def cut(self, ends_ns: Sequence[int], end_bit: int) -> tuple[list[Any], list[int]]:
-        """Sort the keys and return them as columns, and the index of the first event after each window.
+    def begin_cut(self, ends_ns: Sequence[int], end_bit: int) -> Cut:
+        """Launch the sort of the keys; no others may come until what is returned has been called.
 
         There is one end of a window at least [ns]; `end_bit` is beyond the highest bit that a key may have.
         """
         count = self.count
         if count == 0:
-            return [], [0] * len(ends_ns)
+            return lambda: ([], [0] * len(ends_ns))
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
         copied = count + count % 2  # columns in a block begin where they may
@@ -195,7 +199,7 @@ class EventKeys:
         told[:_TOLD] = count, copied, self.origin_us
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
-            return self._cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
+            return self._begin_cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
         self._told.upload()
         prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
         self._launch(event_cut.prepare, count, prepared, [self.keys])
@@ -213,14 +217,15 @@ class EventKeys:
         if self._labels is not None:
             self._labels.launch(count, *columns[:3])
         self._read.set()
-        self._read.wait()
-        if self._on_host:
-            columns = [column.numpy() for column in columns]
-        return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
-    def _cut_to_host(
-        self, blocks: BufferPool, copied: int, window_count: int, end_bit: int
-    ) -> tuple[list[Any], list[int]]:
+        def end_cut() -> tuple[list[Any], list[int]]:
+            self._read.wait()
+            found = [column.numpy() for column in columns] if self._on_host else columns
+            return found, self._found_on_host.rows(0, len(ends_ns)).tolist()
+
+        return end_cut
+
+    def _begin_cut_to_host(self, blocks: BufferPool, copied: int, window_count: int, end_bit: int) -> Cut:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
         # a graph sorts up to half as many more; launches, of which there are many, take the host far longer
         room = min(max(_ROOM_MIN, size_class(self.count)), self._order.shape[0] // 2)
@@ -242,13 +247,17 @@ class EventKeys:
         block = blocks.acquire(_EVENT_BYTES * copied)
         wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()
-        self._read.wait()
-        rows = blocks.hand_out(block, _EVENT_BYTES * copied)
-        columns = []
-        for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
-            size = np.dtype(dtype).itemsize
-            columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
-        return columns, self._found_on_host.rows(0, window_count).tolist()
+
+        def end_cut() -> tuple[list[Any], list[int]]:
+            self._read.wait()
+            rows = blocks.hand_out(block, _EVENT_BYTES * copied)
+            columns = []
+            for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
+                size = np.dtype(dtype).itemsize
+                columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
+            return columns, self._found_on_host.rows(0, window_count).tolist()
+
+        return end_cut
 
     def no_events(self) -> list[Any]:
         """Return columns without an event."""

@@ -11,7 +11,7 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 
 import functools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -326,9 +326,7 @@ class EventCamera:
         with use_stream(self._reader):
             while self._under_way:
                 self._take_over()
-            packets = self._cut([self._require_reset()])
-            self._taken.set()
-            return packets[0]
+            return self._begin_cut([self._require_reset()])()[0]
 
     def collect_windows(self, ends_ns: Sequence[int], *, scan_count: int | None = None) -> list[Events]:
         """Return the events fed so far as one packet per window, and wait for them.
@@ -349,6 +347,15 @@ class EventCamera:
             ValueError: If `ends_ns` is wrong; also if a value of the frames was not finite or beyond +-1000,
                 in which case the camera must be reset.
         """
+        return self.begin_windows(ends_ns, scan_count=scan_count)()
+
+    def begin_windows(
+        self, ends_ns: Sequence[int], *, scan_count: int | None = None
+    ) -> Callable[[], list[Events]]:
+        """Do what `collect_windows` does, but for the wait for events that are sorted: what is returned does.
+
+        With a `scan_count_max` above 1, `feed_device` may come before that is called, and nothing else.
+        """
         ends = [int(end) for end in ends_ns]
         under_way = len(self._under_way)
         count = under_way if scan_count is None else min(scan_count, under_way)
@@ -358,22 +365,20 @@ class EventCamera:
             for _ in range(count):
                 self._take_over()
             self._require_reset()
-            return []
+            return list
         with use_stream(self._reader):
             for _ in range(count):
                 self._take_over()
             self._taken.set()
             now_ns = self._require_reset()
             if not ends:
-                return []
+                return list
             if not event_input.are_ends(ends, self._window_start_ns, now_ns):
                 raise ValueError(
                     f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
                     f" and not pass {now_ns}, got {ends}"
                 )
-            packets = self._cut(ends)
-            self._taken.set()
-            return packets
+            return self._begin_cut(ends)
 
     def _forget(self) -> None:
         scans = [*self._idle, *self._under_way]
@@ -459,17 +464,24 @@ class EventCamera:
         self._scan_again(scan)
         return True
 
-    def _cut(self, ends: list[int]) -> list[Events]:
-        """Sort the keys, hand out those of the windows that end so, and carry the others over."""
+    def _begin_cut(self, ends: list[int]) -> Callable[[], list[Events]]:
+        """Sort the keys; what is returned hands out those of the windows, and carries the others over."""
         if self._readout is not None:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
         # with a readout events may be read later than now
         end_bit = self._time_shift + (span_us + 1).bit_length() if self._readout is None else 63
-        columns, cuts = self._keys.cut(ends, end_bit)
-        packets = self._packets(ends, columns, cuts)
-        self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
-        return packets
+        end_cut = self._keys.begin_cut(ends, end_bit)
+
+        def hand_out() -> list[Events]:
+            with use_stream(self._reader):
+                columns, cuts = end_cut()
+                packets = self._packets(ends, columns, cuts)
+                self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
+                self._taken.set()
+            return packets
+
+        return hand_out
 
     def _packets(self, ends: list[int], columns: list[Any], cuts: list[int]) -> list[Events]:
         """Return the packets of windows, each of which ends at a place in the columns."""

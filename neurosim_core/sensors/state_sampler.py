@@ -271,9 +271,9 @@ class StateSampler(Sampler):
         """Allocate what it needs.
 
         `packet` makes a packet of header and rows: its class, if its fields are named as the `outputs`, an
-        array of shape [slot, world] each; if they `are_stacked`, the kernel writes one array [output, slot,
-        world]. `group_count`: groups of errors of three axes. `late`: before the first sample the state was
-        that of it.
+        array of shape [slot, world] each, or of more axes, (type, length, ...); if they `are_stacked`, the
+        kernel writes one array [output, slot, world]. `group_count`: groups of errors of three axes. `late`:
+        before the first sample the state was that of it.
         """
         vehicle = context.vehicle
         self.terms, self._packet = terms, packet
@@ -283,7 +283,8 @@ class StateSampler(Sampler):
             written = [self._zeros(next(iter(outputs.values())), len(outputs), *shape)]
             self.arrays = {name: written[0][index] for index, name in enumerate(outputs)}
         else:
-            self.arrays = {name: self._zeros(dtype, *shape) for name, dtype in outputs.items()}
+            kinds = {name: kind if isinstance(kind, tuple) else (kind,) for name, kind in outputs.items()}
+            self.arrays = {name: self._zeros(kind, *shape, *more) for name, (kind, *more) in kinds.items()}
             written = list(self.arrays.values())
         at = Sampling()
         at.seeds, at.active = context.seeds, context.active

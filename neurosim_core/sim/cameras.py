@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
@@ -14,12 +14,12 @@ from neurosim_core.sim.render_group import RenderGroupState
 from neurosim_core.sim.render_job import (
     RenderJob,
     acquire_room,
+    begin_frames,
     choose_ticks,
     disable_frame_sensors,
     is_due,
     launch_key,
     plan_render,
-    read_frames,
     read_images,
     scan_frames,
 )
@@ -123,10 +123,13 @@ def _is_late(batch: Batch) -> bool:
     )
 
 
-def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
+def read_cameras(
+    state: State, batch: Batch, *, borrow: bool, meanwhile: Callable[[], None] | None = None
+) -> list[Packet]:
     """Wait until the cameras have seen a batch, and return what they yield.
 
-    With `borrow` pictures are views of the buffers of the batch.
+    With `borrow` pictures are views of the buffers of the batch. `meanwhile` is called while a device sorts
+    events; the next batch with the same buffers may be launched there.
     """
     packets: list[Packet] = []
     with timed(state.wall_s, "camera read-back"):
@@ -137,14 +140,16 @@ def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
         state.counts["ticks left out"] += choice.left_out_count
         state.counts["coarse ticks"] += choice.coarse_count
     with timed(state.wall_s, "events"):
-        for group, instants in batch.seen:
-            events = read_frames(group, instants, until_ns=batch.until_ns)
-            state.counts["events dropped"] += sum(getattr(packet, "dropped_count", 0) for packet in events)
-            packets += events
+        seen = [begin_frames(*each, until_ns=batch.until_ns) for each in batch.seen]
     with timed(state.wall_s, "camera read-back"):
         for group, instants in batch.seen:
             packets += read_images(group, instants, borrow=borrow)
-    return packets
+    if meanwhile is not None:
+        meanwhile()
+    with timed(state.wall_s, "events"):
+        events = [packet for sensors in seen for hand_out in sensors for packet in hand_out()]
+        state.counts["events dropped"] += sum(getattr(packet, "dropped_count", 0) for packet in events)
+    return packets + events
 
 
 def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:

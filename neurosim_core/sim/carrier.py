@@ -23,6 +23,7 @@ from neurosim_core.frames import quaternion_exp
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, find_place, upload_paths
 from neurosim_core.vehicle import MultirotorConfig, MultirotorState
 from neurosim_core.vehicle.arrays import allocate_arrays
+from neurosim_core.vehicle.integrator import Batch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,21 +98,6 @@ def _evaluate_turn(path: PathArrays, attitude: AttitudeArrays, index: int, stamp
     return _turn(phi, d1, d2, attitude.knots[place.knot])
 
 
-@wp.struct
-class _Carried:
-    """The state of the bodies, of shape [world]."""
-
-    position: wp.array[wp.vec3d]
-    velocity: wp.array[wp.vec3d]
-    orientation: wp.array[wp.quatd]
-    body_rate: wp.array[wp.vec3d]
-    acceleration: wp.array[wp.vec3d]
-    angular_acceleration: wp.array[wp.vec3d]
-    stamp_ns: wp.array[wp.int64]
-    rotor_speed: wp.array2d[wp.float64]
-    rotor_speed_command: wp.array2d[wp.float64]
-
-
 @wp.kernel
 def _carry(
     # Model:
@@ -122,7 +108,7 @@ def _carry(
     mask: wp.array[wp.int32],
     duration_ns: wp.int64,
     # In/out:
-    body: _Carried,
+    body: Batch,
 ) -> None:
     world = wp.tid()
     if mask.shape[0] > 0:
@@ -167,9 +153,9 @@ class Carrier:
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
-        self._body = _Carried()
-        for name in _Carried.vars:
-            setattr(self._body, name, getattr(self.arrays, name))
+        self._body = Batch()
+        for name, array in vars(self.arrays).items():
+            setattr(self._body, name, array)
         attitudes = [path.attitude for path in paths if path.attitude is not None]
         knots = np.concatenate([attitude.knots for attitude in attitudes])
         vectors_of_pieces = np.concatenate([attitude.rotation_vectors for attitude in attitudes])

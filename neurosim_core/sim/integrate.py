@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -23,7 +23,7 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
-from neurosim_core.vehicle import DynamicsError
+from neurosim_core.vehicle import DynamicsError, Multirotor
 from neurosim_core.vehicle.host_vehicle import Vehicle
 from neurosim_core.vehicle.status import STATUS_COLLISION
 
@@ -171,26 +171,36 @@ def integrate(state: State, batch: Batch) -> None:
     elapsed_ns = 0
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
-    for slot, (boundary, span_ns) in enumerate(
-        zip(batch.boundaries, batch.elapsed_ns, strict=True), batch.slot
-    ):
-        if span_ns > 0:
-            state.vehicle.advance(span_ns)
-        elapsed_ns += span_ns
+    vehicle, trace, slot = state.vehicle, state.trace, batch.slot
+    for boundary, span_ns, count in _stretches(batch, joined=isinstance(vehicle, Multirotor)):
+        end = slot + count
+        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
+        if isinstance(vehicle, Multirotor) and span_ns > 0:
+            trace.fly(vehicle, state.surfaces, state.fleet, slot, elapsed_ns, span_ns, count, **record)
+        else:
+            if span_ns > 0:
+                vehicle.advance(span_ns)
+            trace.record(state.surfaces, state.fleet, slot, elapsed_ns + span_ns, **record)
+        slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
-        place = slot - batch.slot
-        state.trace.record(
-            state.surfaces,
-            state.fleet,
-            slot,
-            elapsed_ns,
-            first=place == 0,
-            last=place == len(batch.boundaries) - 1,
-        )
-        if batch.closed_loop and boundary.control and not isinstance(state.vehicle, Carrier):
-            state.path_controller.update(state.vehicle.arrays)
+        if batch.closed_loop and boundary.control and not isinstance(vehicle, Carrier):
+            state.path_controller.update(vehicle.arrays)
+
+
+def _stretches(batch: Batch, *, joined: bool) -> Iterator[tuple[Boundary, int, int]]:
+    """Yield spans between boundaries: the boundary at the end, the length [ns] and how many are `joined`.
+
+    Those are joined that are equal, and between which nothing is due.
+    """
+    count = 0
+    following = [*batch.elapsed_ns[1:], 0]
+    for boundary, span_ns, next_ns in zip(batch.boundaries, batch.elapsed_ns, following, strict=True):
+        count += 1
+        if not joined or boundary.samplers or boundary.control or next_ns != span_ns:
+            yield boundary, span_ns, count
+            count = 0
 
 
 def _fetch(state: State, batch: Batch) -> None:

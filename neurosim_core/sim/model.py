@@ -24,7 +24,7 @@ from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
 from neurosim_core.sim.schedule import Schedule
-from neurosim_core.trajectory import CollisionFreeConfig, Path, make_path
+from neurosim_core.trajectory import CollisionFreeConfig, Path, load_scipy, make_path
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.warp_start import start_warp
 
@@ -133,8 +133,11 @@ def make_fleet(
         with phase("scene"):
             members = {name: config.of(name) for name in config.vehicles}
             seeing = any(plan_render_groups(member.sensors) for member in members.values())
-            if not isinstance(scene, Scene):
-                scene = config.scene.load(pictures=seeing) if scene is None else scene()
+            if scene is None:
+                scene = config.scene.load(pictures=seeing)
+            elif not isinstance(scene, Scene):
+                load_scipy()  # while another process reads
+                scene = scene()
             bodies = make_bodies(config.bodies) if seeing else ()
         beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
         light = functools.partial(  # needs no path: both at once

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -45,11 +45,13 @@ from neurosim_core.sensors.base import (
     WorldFrameContext,
     WorldFrameSensor,
 )
-from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings, lens_tables
 from neurosim_core.sim.scene_table import SceneTable
+
+if TYPE_CHECKING:
+    from neurosim_core.sensors.displacement import DisplacementRule
 
 MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
@@ -415,6 +417,8 @@ def _make_rule(
             f"max_displacement_px of {', '.join(group.frame_sensors)} needs a lens of kind pinhole, got "
             f"{getattr(group.lens, 'kind', 'none')}: leave it out, and all ticks are rendered"
         )
+    from neurosim_core.sensors.displacement import DisplacementRule  # whose kernels few runs need
+
     return DisplacementRule(
         scene,
         group.lens,

@@ -232,12 +232,11 @@ def scan_frames(group: RenderGroupState, instants: Instants) -> None:
         group.frames[name].see(frames, instants.stamps_ns)
 
 
-def read_frames(group: RenderGroupState, instants: Instants, *, until_ns: int) -> list[Packet]:
-    """Return the packets of frame sensors that end in the batch, at most at a stamp."""
-    packets: list[Packet] = []
-    for name in instants.frames:
-        packets += group.frames[name].read(instants.stamps_ns, until_ns=until_ns)
-    return packets
+def begin_frames(
+    group: RenderGroupState, instants: Instants, *, until_ns: int
+) -> list[Callable[[], list[Packet]]]:
+    """Return what gives the packets of each frame sensor that end in the batch, at most at a stamp."""
+    return [group.frames[name].begin_read(instants.stamps_ns, until_ns=until_ns) for name in instants.frames]
 
 
 def flush_frames(group: RenderGroupState, *, until_ns: int) -> list[Packet]:

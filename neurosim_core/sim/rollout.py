@@ -56,12 +56,16 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
     """
     if state.launched_count == 0:
         yield from start(model, state)
-    while not state.ended:
+
+    def launch_ahead() -> None:
         while len(state.in_flight) < len(state.batch_done) and state.launched_ns < model.duration_ns:
             launch_until(model, state, batch_end_ns(model.schedule, state.launched_ns, model.duration_ns))
+
+    while not state.ended:
+        launch_ahead()
         if not state.in_flight:
             break
-        yield from read(model, state)
+        yield from read(model, state, meanwhile=launch_ahead if len(state.batch_done) > 1 else None)
         if state.failure is not None:
             raise state.failure
     yield from finish(state)

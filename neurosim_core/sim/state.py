@@ -250,7 +250,7 @@ def make_state(
         world_count=count,
         rotor_count=model.airframe.rotor_count,
         device=device,
-        history_length=_history_length(model, slot_count),
+        history_length=_history_length(model, slot_count + worlds.slot_count),
     )
     if on_host:
         trace.bring_to_host()

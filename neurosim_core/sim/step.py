@@ -14,7 +14,7 @@ changes no result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.timing import timed
@@ -76,18 +76,20 @@ def launch_first(model: Model, state: State, batch: Batch) -> None:
         job.render()
 
 
-def read(model: Model, state: State, *, last: bool = False) -> list[Packet]:
+def read(
+    model: Model, state: State, *, last: bool = False, meanwhile: Callable[[], None] | None = None
+) -> list[Packet]:
     """Wait for the oldest batch in flight and return what the sensors yield in it, in the order of time.
 
     `state.stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or the
     integration failed (`failure`). If it is the `last`, nothing is launched before the pictures have been
-    used: they may be borrowed, if that is wanted.
+    used: they may be borrowed, if that is wanted. `meanwhile`: see `read_cameras`.
     """
     batch = state.in_flight.popleft()
     with timed(state.wall_s, "read-back"):
         flown = state.flown if state.overlaps else state.batch_done  # one graph has one end
         flown[batch.number % len(flown)].wait()
     packets = read_flight(model, state, batch)  # may end the run before the end of the batch
-    packets += read_cameras(state, batch, borrow=last and state.borrow_pictures)
+    packets += read_cameras(state, batch, borrow=last and state.borrow_pictures, meanwhile=meanwhile)
     state.rendered_count += 1
     return in_order(model, packets, batch.until_ns)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.vehicle import Multirotor
 from neurosim_core.vehicle.arrays import BLOCK_DIM
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
@@ -69,22 +70,24 @@ class Rows:
     entries: wp.array2d[wp.int64]  # Number of the entry of each slot in `history`; empty without one
 
 
-@wp.kernel
-def _record(
-    # Model:
-    surfaces: Surfaces,
-    # In/out:
-    fleet: Fleet,
-    # Out:
-    rows_out: Rows,
-    # In:
-    slot: int,
-    elapsed_ns: wp.int64,
-    is_first: int,
-    is_last: int,
+@wp.struct
+class Log:
+    """Where states are recorded, and what vehicles touch meanwhile."""
+
+    surfaces: Surfaces
+    fleet: Fleet
+    rows: Rows
+
+
+@wp.func
+def note_state(
+    log: Log, world: int, slot: int, elapsed_ns: wp.int64, is_first: wp.bool, is_last: wp.bool
 ) -> None:
-    world = wp.tid()
-    if is_first != 0:  # touches of the batch before are forgotten, except of vehicles that are held by one
+    """Do for one vehicle what `Trace.record` does."""
+    surfaces = log.surfaces
+    fleet = log.fleet
+    rows_out = log.rows
+    if is_first:  # touches of the batch before are forgotten, except of vehicles that are held by one
         fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
     position = fleet.position[world]
     for axis in range(3):
@@ -118,8 +121,13 @@ def _record(
         fleet.collided[world] = 1
         if surfaces.holds != 0:
             fleet.status[world] = STATUS_COLLISION
-    if is_last != 0:
+    if is_last:
         fleet.clock_ns[world] += elapsed_ns
+
+
+@wp.kernel
+def _record(log: Log, slot: int, elapsed_ns: wp.int64, is_first: int, is_last: int) -> None:
+    note_state(log, wp.tid(), slot, elapsed_ns, is_first != 0, is_last != 0)
 
 
 @wp.kernel
@@ -267,6 +275,8 @@ class Trace:
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
         self._record = RecordedLaunch(_record, device, block_dim=BLOCK_DIM)
+        self._flights: dict[int, tuple[RecordedLaunch, list[Any]]] = {}
+        self._log: tuple[Any, Any, Any] = (None, None, None)
         self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
 
     def record(
@@ -278,9 +288,43 @@ class Trace:
         from the beginning of the batch. At the `first` slot of a batch vehicles touch nothing yet; at the
         `last` clocks of worlds move on to it.
         """
-        self._record.launch(
-            self.states.shape[1], [surfaces, fleet, self._rows, slot, elapsed_ns, int(first), int(last)]
-        )
+        log = self._log_of(surfaces, fleet)
+        self._record.launch(self.states.shape[1], [log, slot, elapsed_ns, int(first), int(last)])
+
+    def fly(
+        self,
+        vehicle: Multirotor,
+        surfaces: Any,
+        fleet: Any,
+        slot: int,
+        elapsed_ns: int,
+        span_ns: int,
+        count: int,
+        *,
+        first: bool,
+        last: bool,
+    ) -> None:
+        """Move all vehicles through `count` equal spans; `record` the state after each, in one launch.
+
+        Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. `first`: a batch
+        begins with it; `last`: a batch ends with the last span.
+        """
+        if span_ns not in self._flights:
+            if len(self._flights) >= _LAUNCHES_MAX:
+                self._flights.clear()
+            kernel, model = vehicle.flight(span_ns, note_state)
+            self._flights[span_ns] = RecordedLaunch(kernel, vehicle.device, block_dim=BLOCK_DIM), model
+        launch, model = self._flights[span_ns]
+        log = self._log_of(surfaces, fleet)
+        launch.launch(vehicle.count, [*model, log, count, slot, elapsed_ns, int(first), int(last)])
+
+    def _log_of(self, surfaces: Any, fleet: Any) -> Any:
+        """Return the log of vehicles, the same each time."""
+        if self._log[:2] != (surfaces, fleet):
+            log = Log()
+            log.surfaces, log.fleet, log.rows = surfaces, fleet, self._rows
+            self._log = surfaces, fleet, log
+        return self._log[2]
 
     def camera_poses(
         self,

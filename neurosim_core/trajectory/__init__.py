@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import scipy  # which imports its parts when they are used
 from pydantic import Field
 
 from neurosim_core.scene.freespace import FreeSpace
@@ -45,7 +46,15 @@ PathConfig = Annotated[
 ]
 """Where to fly, as a user says it."""
 
-__all__ = ["CollisionFreeConfig", "Path", "PathConfig", "PosesConfig", "TourConfig", "make_path"]
+__all__ = [
+    "CollisionFreeConfig",
+    "Path",
+    "PathConfig",
+    "PosesConfig",
+    "TourConfig",
+    "load_scipy",
+    "make_path",
+]
 
 
 def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, *, duration_s: float) -> Path:
@@ -82,6 +91,11 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
             return lissajous(config, center=space.seed_m)
         case PosesConfig():
             return pose_path(config)
+
+
+def load_scipy() -> None:
+    """Import what free space, paths and light take from SciPy, so that it is there when they need it."""
+    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.sparse.csgraph, scipy.spatial
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:

@@ -58,8 +58,8 @@ class Batch:
 class Kernels(NamedTuple):
     """The kernels of one set of terms."""
 
-    advance: Any
-    """Moves every vehicle by a duration."""
+    move: Any
+    """Device function that moves one vehicle by an interval, unless it is held."""
     accelerate: Any
     """Evaluates linear and angular acceleration at the current state."""
     begin: Any
@@ -103,8 +103,7 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
     forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
     fly_fixed = make_rkmk4(equations)
     fly_adaptive = make_dormand_prince(equations)
-    name = "_".join(sorted(terms)) or "rigid"
-    module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}")
+    module = _module(terms)
 
     @wp.func
     def fly(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
@@ -182,17 +181,9 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
                 airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0)
             )
 
-    @wp.kernel(module=module, enable_backward=False)
-    def advance(
-        # Model:
-        airframes: wp.array[Airframe],
-        around: Surroundings,
-        interval: Interval,
-        # In/out:
-        batch: Batch,
-    ):
-        vehicle = wp.tid()
-        airframe = airframes[vehicle]
+    @wp.func
+    def move(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
+        """Move one vehicle by an interval, unless it is held."""
         if batch.status[vehicle] != STATUS_OK:
             return
         for rotor in range(batch.rotor_speed_command.shape[1]):
@@ -268,4 +259,73 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
                 airframes[vehicle], around.wind, vehicle, wp.int64(0), wp.float64(0.0)
             )
 
-    return Kernels(advance, accelerate, begin if windy else None)
+    return Kernels(move, accelerate, begin if windy else None)
+
+
+@functools.cache
+def make_advance(terms: frozenset[str]) -> Any:
+    """Return the kernel that moves every vehicle by an interval."""
+    move = make_kernels(terms).move
+
+    @wp.kernel(module=_module(terms, "advance"), enable_backward=False)
+    def advance(
+        # Model:
+        airframes: wp.array[Airframe],
+        around: Surroundings,
+        interval: Interval,
+        # In/out:
+        batch: Batch,
+    ):
+        vehicle = wp.tid()
+        move(airframes[vehicle], around, interval, batch, vehicle)
+
+    return advance
+
+
+@functools.cache
+def make_flight(terms: frozenset[str], note: Any) -> Any:
+    """Return the kernel that moves every vehicle by equal intervals, and notes its state after each.
+
+    Args:
+        terms: As of `make_kernels`.
+        note: Warp function of a `log` of any type; the vehicle; the slot; time since the beginning of the
+            batch [ns]; whether the state is the first and the last of the batch.
+    """
+    move = make_kernels(terms).move
+    log_type = next(iter(note.input_types.values()))
+
+    @wp.kernel(module=_module(terms, note.key), enable_backward=False)
+    def fly(
+        # Model:
+        airframes: wp.array[Airframe],
+        around: Surroundings,
+        interval: Interval,
+        # In/out:
+        batch: Batch,
+        log: log_type,
+        # In:
+        interval_count: wp.int32,
+        slot: wp.int32,
+        elapsed_ns: wp.int64,
+        is_first: wp.int32,
+        is_last: wp.int32,
+    ):
+        vehicle = wp.tid()
+        airframe = airframes[vehicle]
+        for index in range(interval_count):
+            move(airframe, around, interval, batch, vehicle)
+            note(
+                log,
+                vehicle,
+                slot + index,
+                elapsed_ns + wp.int64(index + 1) * interval.duration_ns,
+                is_first != 0 and index == 0,
+                is_last != 0 and index == interval_count - 1,
+            )
+
+    return fly
+
+
+def _module(terms: frozenset[str], *more: str) -> wp.Module:
+    """Return the module of kernels with some terms."""
+    return wp.get_module(".".join((__name__, "_".join(sorted(terms)) or "rigid", *more)))

@@ -14,7 +14,7 @@ from neurosim_core.frames import as_rows, normalised
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
 from neurosim_core.vehicle.arrays import BLOCK_DIM, allocate_arrays
 from neurosim_core.vehicle.ground import make_ground
-from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
+from neurosim_core.vehicle.integrator import Batch, Interval, make_advance, make_flight, make_kernels
 from neurosim_core.vehicle.motor import lag_constants
 from neurosim_core.vehicle.rotors import Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
@@ -291,6 +291,16 @@ class Multirotor:
         launch.launch()
         self._stamp_ns += duration_ns
 
+    def flight(self, duration_ns: int, note: Any) -> tuple[Any, list[Any]]:
+        """Return the kernel that moves all vehicles by equal intervals, and its first parameters.
+
+        Args:
+            duration_ns: Length of an interval [ns].
+            note: Notes the state of a vehicle after each; see `integrator.make_flight`.
+        """
+        model = [self.airframes, self._around, self._interval(duration_ns), self._batch]
+        return make_flight(frozenset(self.terms), note), model
+
     def begin(self, mask: Any) -> None:
         """Take up the wind at time 0 for some vehicles, whose state was set in `arrays`; device form.
 
@@ -382,18 +392,19 @@ class Multirotor:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
         if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
             raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
-        launch = self._record_interval(duration_ns)
+        model = (self.airframes, self._around, self._interval(duration_ns), self._batch)
+        launch = self._record(make_advance(frozenset(self.terms)), *model)
         if len(self._launches) >= _LAUNCH_COUNT_MAX:
             del self._launches[next(iter(self._launches))]
         self._launches[duration_ns] = launch
         return launch
 
-    def _record_interval(self, duration_ns: int) -> wp.Launch:
+    def _interval(self, duration_ns: int) -> Any:
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lag = lag_constants(step_s, self.config.motor_time_constant_s)
         is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
-        interval = _struct(
+        return _struct(
             Interval,
             duration_ns=duration_ns,
             max_step_ns=self.max_step_ns,
@@ -408,7 +419,6 @@ class Multirotor:
             atol=atol,
             evaluation_count_max=evaluation_count_max,
         )
-        return self._record(self._kernels.advance, self.airframes, self._around, interval, self._batch)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

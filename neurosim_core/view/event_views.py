@@ -103,10 +103,8 @@ class EventCloud:
     def add(self, events: EventArrays, end_ns: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Add a window; return all points and their colours.
 
-        Every n-th event is kept, so that a window has at most its share of the points.
-
-        Returns:
-            Positions, shape [n, 3]: x to the right [px], time (now is 0), y up [px]; sRGB, shape [n, 3].
+        Every n-th event is kept, so that a window has at most its share of the points. Returns positions,
+        shape [n, 3]: x to the right [px], time (now is 0), y up [px]; sRGB, shape [n, 3].
         """
         step = max(1, -(-len(events.t) * _WINDOWS // _POINTS_MAX))
         self._windows.append(events.rows(slice(None, None, step)))

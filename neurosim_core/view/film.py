@@ -28,14 +28,7 @@ _PATH_SRGB = (240, 110, 20)
 def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
     """Draw the first colour camera and the first event camera of a recording side by side, with the path.
 
-    Args:
-        recorded: flight.h5.
-        out: File to write, .webp or .gif.
-        rate_hz: Pictures a second of simulated time, and of the film [Hz].
-
-    Raises:
-        ValueError: The recording has no colour camera.
-        OSError: The file cannot be written.
+    `rate_hz`: pictures a second of simulated time, and of the film [Hz].
     """
     with Recording(recorded) as flight:
         scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()
@@ -76,12 +69,9 @@ def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:
 
 
 def _beside(panels: list[Pillow.Image]) -> Pillow.Image:
-    width = sum(panel.width + _GAP_PX for panel in panels) - _GAP_PX
-    frame, left = Pillow.new("RGB", (width, _HEIGHT_PX), (255, 255, 255)), 0
-    for panel in panels:
-        frame.paste(panel, (left, 0))
-        left += panel.width + _GAP_PX
-    return frame
+    gap = np.full((_HEIGHT_PX, _GAP_PX, 3), 255, np.uint8)
+    parts = [part for panel in panels for part in (gap, np.asarray(panel.convert("RGB")))]
+    return Pillow.fromarray(np.hstack(parts[1:]))
 
 
 class _Way:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import base64
-import html
 import importlib.util
 import io
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from neurosim_core import registry
 from neurosim_core.config import load_config
 from neurosim_core.flight import saved_flight
+from neurosim_core.install import need
 from neurosim_core.learn.pilot import fly_policy
 from neurosim_core.packets import Events, Packet, PointCloud, as_numpy, join_events, schema_of
 from neurosim_core.sensors.corners import Corners
@@ -59,29 +59,26 @@ _SCENES = (
 )
 _NUMBERS_MAX = 6
 _FILM_S = 4.0
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:75rem;
-padding:0 1rem;color:#222}
-h1,h2{font-weight:300}section{display:grid;grid-template-columns:repeat(auto-fill,minmax(16rem,1fr));gap:1.2rem}
-figure:has(img[src^='data:image/webp']){grid-column:1 / -1}
-figure{margin:0;border:1px solid #ddd;border-radius:4px;overflow:hidden}figure img{width:100%;display:block}
-figcaption{padding:.4rem .7rem;font-weight:600}pre{margin:0;padding:.5rem .7rem;background:#f5f5f5;
-font-size:12px;white-space:pre-wrap;overflow-wrap:anywhere}
-.numbers{padding:.7rem;font:12px/1.6 monospace;min-height:5rem}"""
+
+
+class Figure(NamedTuple):
+    """What is shown of one thing."""
+
+    title: str
+    text: str
+    """The settings or the command that make it."""
+    picture: str = ""
+    """Inside of the page: an address of kind `data:`; empty: there is none."""
+    lines: Sequence[str] = ()
+    """Numbers, where there is no picture."""
 
 
 def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -> None:
     """Write the page; pictures are inside of it.
 
-    Args:
-        path: File to write.
-        device: Where to compute.
-        only: Name of a section; None: all.
-
-    Raises:
-        OSError: The file cannot be written.
-        ValueError: There is no such section.
+    `only`: name of a section; None: all.
     """
-    made: dict[str, Callable[[], list[str]]] = {
+    made: dict[str, Callable[[], list[Figure]]] = {
         "sensors": lambda: _show_rig(sensors(), device),
         "pixels": lambda: _show_rig(_pixels(), device),
         "lenses": lambda: _show_rig(_views(), device),
@@ -90,16 +87,11 @@ def save_gallery(path: Path, *, device: str = "auto", only: str | None = None) -
     }
     if only is not None and only not in made:
         raise ValueError(f"unknown section {only!r}, known: {', '.join(made)}")
+    jinja2 = need("the gallery needs jinja2", "view", "jinja2")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string((Path(__file__).parent / "gallery.html.j2").read_text("utf-8"))
     sections = {name: make() for name, make in made.items() if only in (None, name)}
-    body = "".join(
-        f"<h2>{title.capitalize()}</h2><section>{''.join(items)}</section>"
-        for title, items in sections.items()
-    )
-    page = f"<!doctype html><meta charset=utf-8><title>Neurosim</title><style>{_STYLE}</style>"
-    intro = (
-        "<h1>Neurosim: gallery</h1><p>Each picture is above the settings or the commands that make it.</p>"
-    )
-    path.write_text(f"{page}{intro}{body}", encoding="utf-8")
+    path.write_text(template.render(sections=sections), encoding="utf-8")
 
 
 def sensors() -> dict[str, Any]:
@@ -121,7 +113,7 @@ def _views() -> dict[str, Any]:
     return {str(lens["kind"]): {"kind": "rgb", "lens": lens} for lens in _LENSES}
 
 
-def _show_scene(scene: Mapping[str, Any], device: str) -> str:
+def _show_scene(scene: Mapping[str, Any], device: str) -> Figure:
     """Return a figure of one look into a scene."""
     scene = {"kind": "apartment", **scene}
     rig = {"rgb": {"kind": "rgb", "lens": _LENS}}
@@ -130,58 +122,48 @@ def _show_scene(scene: Mapping[str, Any], device: str) -> str:
     return _figure(title, {"scene": scene}, list(run(load_config(given))))
 
 
-def _films(device: str) -> list[str]:
+def _films(device: str) -> list[Figure]:
     """Return figures of films: the default flight, and a throw that the policy of the package ends."""
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.webp"
-
-        def shown(title: str, command: str) -> str:
-            return _framed(title, _image(title, film.read_bytes(), "webp"), command)
-
         model = make_model(load_config({"duration_s": _FILM_S, "device": device}))
         with saved_flight(film, model) as write:
             for packet in run_model(model, make_state(model)):
                 write(packet)
         command = f"neurosim run --duration {_FILM_S:g} && neurosim view flight --save film.webp"
-        figures = [shown("the default flight", command)]
+        figures = [Figure("the default flight", command, _inside(film.read_bytes(), "webp"))]
         if importlib.util.find_spec("onnxruntime") is not None:
             overrides = {"device": device}
             fly_policy("hover", duration_s=_FILM_S, overrides=overrides, save=film, say=lambda line: None)
             command = f"neurosim fly --policy hover --duration {_FILM_S:g} --save film.webp"
-            figures.append(shown("hover, learnt from events", command))
+            figures.append(Figure("hover, learnt from events", command, _inside(film.read_bytes(), "webp")))
     return figures
 
 
-def _show_rig(rig: Mapping[str, Any], device: str) -> list[str]:
+def _show_rig(rig: Mapping[str, Any], device: str) -> list[Figure]:
     """Move a rig for a moment; return a figure for each sensor, those with pictures first."""
     packets = list(run(load_config({**_BASE, "sensors": rig, "device": device})))
     figures = [
         _figure(name, {"sensors": {name: settings}}, [p for p in packets if p.sensor == name])
         for name, settings in rig.items()
     ]
-    return sorted(figures, key=lambda figure: "<img" not in figure)
+    return sorted(figures, key=lambda figure: not figure.picture)
 
 
-def _figure(title: str, settings: Mapping[str, Any], packets: list[Packet]) -> str:
-    text = yaml.safe_dump(dict(settings), default_flow_style=None, sort_keys=False, width=36)
+def _figure(title: str, settings: Mapping[str, Any], packets: list[Packet]) -> Figure:
+    from PIL import Image
+
+    text = yaml.safe_dump(dict(settings), default_flow_style=None, sort_keys=False, width=36).rstrip()
     drawn = _picture(packets)
-    shown = f'<div class="numbers">{_numbers(packets)}</div>'
-    if drawn is not None:
-        from PIL import Image
-
-        file = io.BytesIO()
-        Image.fromarray(drawn).save(file, format="png")
-        shown = _image(title, file.getvalue(), "png")
-    return _framed(title, shown, text)
+    if drawn is None:
+        return Figure(title, text, lines=_numbers(packets))
+    file = io.BytesIO()
+    Image.fromarray(drawn).save(file, format="png")
+    return Figure(title, text, _inside(file.getvalue(), "png"))
 
 
-def _image(title: str, content: bytes, kind: str) -> str:
-    """Return a picture that is inside of the page."""
-    return f'<img alt="{title}" src="data:image/{kind};base64,{base64.b64encode(content).decode()}">'
-
-
-def _framed(title: str, shown: str, text: str) -> str:
-    return f"<figure>{shown}<figcaption>{title}</figcaption><pre>{html.escape(text.rstrip())}</pre></figure>"
+def _inside(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _picture(packets: list[Packet]) -> NDArray[np.uint8] | None:
@@ -192,53 +174,42 @@ def _picture(packets: list[Packet]) -> NDArray[np.uint8] | None:
         recent = joined.rows(slice(np.searchsorted(joined.t, packets[-1].stamp_ns // 1000 - 20_000), None))
         return event_picture(recent, width=events[0].width, height=events[0].height)
     if packets and isinstance(packets[-1], PointCloud):
-        return _from_above(as_numpy(packets[-1].points))
+        points = as_numpy(packets[-1].points)
+        scale = 0.48 * _SIZE["height"] / max(1e-3, float(np.quantile(np.abs(points[:, :2]), 0.99)))
+        middle = np.array([_SIZE["width"] / 2, _SIZE["height"] / 2])
+        return _dots(middle + scale * points[:, :2] * (1.0, -1.0), _colored(points[:, 2]))
     if packets and isinstance(packets[-1], Corners):
-        column, row = as_numpy(packets[-1].pixels).astype(int).T
-        return _dots(row, column, np.array([30, 60, 150], np.uint8))
+        return _dots(as_numpy(packets[-1].pixels), np.array([30, 60, 150], np.uint8))
     try:
         kind, data = picture_of(packets[-1])
     except (ValueError, IndexError):
         return None
-    if kind not in ("depth", "values"):
-        return color_picture(kind, data)
-    low, high = np.nanquantile(np.where(np.isfinite(data), data, np.nan), [0.01, 0.99])
-    share = np.nan_to_num(np.clip((data - low) / max(high - low, 1e-9), 0.0, 1.0))
-    colors: NDArray[np.uint8] = (255 * _turbo(share)).round().astype(np.uint8)
-    return colors
+    return _colored(data) if kind in ("depth", "values") else color_picture(kind, data)
 
 
-def _turbo(share: NDArray[Any]) -> NDArray[Any]:
-    """Return colours from blue over green to red, shape [..., 3]."""
-    centres = np.array([0.85, 0.5, 0.15])
-    colors: NDArray[np.float64] = np.clip(1.6 - 4.0 * np.abs(share[..., None] - centres), 0.05, 1.0)
-    return colors
+def _colored(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return values as colours from blue to red, shape [..., 3]."""
+    from matplotlib import colormaps
+
+    low, high = np.nanquantile(np.where(np.isfinite(values), values, np.nan), [0.01, 0.99])
+    share = np.nan_to_num((values - low) / max(high - low, 1e-9))
+    return np.asarray(colormaps["turbo"](np.clip(share, 0.0, 1.0), bytes=True)[..., :3])
 
 
-def _from_above(points: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return points in the plan, dark on white, coloured by height."""
-    scale = 0.48 * _SIZE["height"] / max(1e-3, float(np.quantile(np.abs(points[:, :2]), 0.99)))
-    row = (_SIZE["height"] / 2 - scale * points[:, 1]).astype(int)
-    column = (_SIZE["width"] / 2 + scale * points[:, 0]).astype(int)
-    height = np.clip((points[:, 2] + 1.3) / 2.6, 0.0, 1.0)
-    return _dots(row, column, (230 * _turbo(height)).astype(np.uint8))
-
-
-def _dots(row: NDArray[Any], column: NDArray[Any], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a white picture with dots of two by two pixels."""
+def _dots(pixels: NDArray[Any], colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a white picture with dots of two by two pixels, at columns and rows, shape [n, 2]."""
     picture = np.full((_SIZE["height"], _SIZE["width"], 3), 255, np.uint8)
+    column, row = pixels.astype(int).T
     for down, right in np.ndindex(2, 2):
         place = (row + down).clip(0, _SIZE["height"] - 1), (column + right).clip(0, _SIZE["width"] - 1)
         picture[place] = colors
     return picture
 
 
-def _numbers(packets: list[Packet]) -> str:
+def _numbers(packets: list[Packet]) -> list[str]:
     """Return the fields of the last packet as text."""
-    if not packets:
-        return "nothing within this time"
     lines = []
-    for field in schema_of(type(packets[-1])).fields[:_NUMBERS_MAX]:
+    for field in schema_of(type(packets[-1])).fields[:_NUMBERS_MAX] if packets else ():
         value = np.array2string(as_numpy(getattr(packets[-1], field.name)), precision=4, threshold=6)
-        lines.append(f"{field.name}: {html.escape(value)}")
-    return "<br>".join(lines)
+        lines.append(f"{field.name}: {value}")
+    return lines or ["nothing within this time"]

@@ -17,6 +17,10 @@ from neurosim_core.view.rerun_layout import PICTURES
 
 _ROWS_MAX = 20_000
 _LINES_MAX = 12
+_CONSIDER_NS = 200_000_000
+"""A moment is compared with the best so far if the one compared before is that long ago, or at the end."""
+_STEP_PX = 4
+"""Every so many rows and columns tell how much there is to see in a picture."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,9 +87,8 @@ class FlightSummary:
     ) -> None:
         """Start empty.
 
-        Args:
-            sensors: Sensors of the flight; the orientation of the first camera is used.
-            event_window_ns: Length of the window of events that is shown [ns].
+        `sensors`: sensors of the flight; the orientation of the first camera is used. `event_window_ns`:
+        length of the window of events that is shown [ns].
         """
         self._window_ns = event_window_ns
         cameras = [s for s in sensors if s.intrinsics is not None]
@@ -93,8 +96,9 @@ class FlightSummary:
         self._latest: dict[str, Packet] = {}
         self._recent: dict[str, deque[Events]] = {}
         self._waiting_ns: int | None = None
+        self._next_ns = 0
         self._best: tuple[float, Snapshot] | None = None
-        self._series: dict[tuple[str, FieldSchema], _Rows] = {}
+        self._series: dict[str, list[tuple[FieldSchema, _Rows]]] = {}
         self._pose = _Rows()
         self._pose_sensor = ""
         self._stamp_ns = 0
@@ -125,14 +129,15 @@ class FlightSummary:
             texts = (str(getattr(packet, f.name)) for f in schema.fields if f.dtype == "str")
             self.texts.append(f"{packet.stamp_ns * 1e-9:.2f} s  {packet.sensor}: {' '.join(texts)}")
         elif schema.display == "time series":
-            for number in schema.fields:
-                if number.is_number:
-                    rows = self._series.setdefault((packet.sensor, number), _Rows())
-                    rows.add(packet.stamp_ns, as_numpy(getattr(packet, number.name)).ravel())
+            if packet.sensor not in self._series:
+                self._series[packet.sensor] = [(f, _Rows()) for f in schema.fields if f.is_number]
+            for number, rows in self._series[packet.sensor]:
+                rows.add(packet.stamp_ns, as_numpy(getattr(packet, number.name)).ravel())
 
     def snapshot(self) -> Snapshot:
         """Return the moment to show; the last one if there is no picture."""
         if self._waiting_ns is not None:
+            self._next_ns = 0
             self._consider(self._waiting_ns)
         return self._look(self._stamp_ns) if self._best is None else self._best[1]
 
@@ -149,9 +154,10 @@ class FlightSummary:
     def series(self) -> list[Series]:
         """Return the numbers that sensors measured so far, at no more than 20 000 times each."""
         found = []
-        for (sensor, number), rows in self._series.items():
-            stamp_ns, values = rows.arrays()
-            found.append(Series(sensor=sensor, field=number, stamp_ns=stamp_ns, values=values))
+        for sensor, plotted in self._series.items():
+            for number, rows in plotted:
+                stamp_ns, values = rows.arrays()
+                found.append(Series(sensor=sensor, field=number, stamp_ns=stamp_ns, values=values))
         return found
 
     def _log_pose(self, packet: Any) -> None:
@@ -177,23 +183,27 @@ class FlightSummary:
     def _consider(self, stamp_ns: int) -> None:
         """Keep the moment if there is more to see than at the best one so far."""
         self._waiting_ns = None
-        snapshot = self._look(stamp_ns)
+        if stamp_ns < self._next_ns:
+            return
+        self._next_ns = stamp_ns + _CONSIDER_NS
         contrast, depth_m, covered = 0.0, 3.0, 0.0
-        for packet in snapshot.packets.values():
+        for packet in self._latest.values():
             if schema_of(type(packet)).display in PICTURES:
                 kind, data = picture_of(packet)
                 if kind == "colour":
-                    contrast = max(contrast, float(data.std()))
+                    contrast = max(contrast, float(data[::_STEP_PX, ::_STEP_PX].std()))
                 elif kind == "depth":
-                    depth_m = min(depth_m, float(np.median(data)))
-        for view in snapshot.events.values():
-            seen = np.zeros(view.height * view.width, dtype=np.bool_)
-            seen[np.multiply(view.events.y, view.width, dtype=np.intp) + view.events.x] = True
+                    depth_m = min(depth_m, float(np.median(data[::_STEP_PX, ::_STEP_PX])))
+        for recent in self._recent.values():
+            width, height = recent[-1].width, recent[-1].height
+            seen = np.zeros(height * width, dtype=np.bool_)
+            for _, x, y, _ in (packet.numpy() for packet in recent):
+                seen[np.multiply(y, width, dtype=np.intp) + x] = True
             covered = max(covered, float(seen.mean()))
         # most at a third: more is a thicket
         interest = (1.0 + contrast) * (0.01 + covered * (1.0 - covered) ** 2) * (0.1 + depth_m)
         if self._best is None or interest >= self._best[0]:
-            self._best = (interest, snapshot)
+            self._best = (interest, self._look(stamp_ns))
 
 
 class _Rows:

@@ -53,9 +53,6 @@ def picture_of(packet: Packet) -> tuple[PictureKind, NDArray[Any]]:
 
     The packet's class declares it by `display`; "image" goes by the field `encoding` if there is one, else
     uint8 is a picture in colour or grey, and numbers of other types are values.
-
-    Raises:
-        ValueError: The packet has no picture, or one of an unknown encoding.
     """
     schema = schema_of(type(packet))
     names = [f.name for f in schema.fields if len(f.shape) >= 2 and not f.varying]
@@ -108,13 +105,8 @@ def _on_nothing(colors: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.ui
 def event_classes(events: EventArrays, *, width: int, height: int) -> NDArray[np.uint8]:
     """Draw events as class numbers of `PALETTE`.
 
-    Args:
-        events: Events in the order of time; those of one pixel must lie inside the picture.
-        width: Columns of the sensor [px].
-        height: Rows of the sensor [px].
-
-    Returns:
-        Classes, shape [H, W].
+    `events`: events in the order of time; those of one pixel must lie inside the picture. `width`: columns of
+    the sensor [px]. `height`: rows of the sensor [px]. Returns classes, shape [H, W].
     """
     pixel = events.y.astype(np.int64) * width + events.x
     count = np.bincount(pixel, minlength=width * height)
@@ -139,8 +131,7 @@ class EventWindow:
     def __init__(self, *, length_ns: int) -> None:
         """Make an empty collector.
 
-        Args:
-            length_ns: Length of a window [ns]; window k covers (k length, (k + 1) length].
+        `length_ns`: length of a window [ns]; window k covers (k length, (k + 1) length].
         """
         self._length_ns = length_ns
         self._parts: list[EventArrays] = []
@@ -149,10 +140,8 @@ class EventWindow:
     def add(self, events: EventArrays, *, start_ns: int, stamp_ns: int) -> list[tuple[int, EventArrays]]:
         """Add the events of a packet; return each window that it completes, as (end [ns], events).
 
-        Args:
-            events: Events of the packet; copied.
-            start_ns: Start of the packet's window [ns].
-            stamp_ns: End of the packet's window [ns].
+        `events`: events of the packet; copied. `start_ns`: start of the packet's window [ns]. `stamp_ns`: end
+        of the packet's window [ns].
         """
         if self._end_ns is None or not self._end_ns - self._length_ns <= start_ns < self._end_ns:
             self._end_ns = (start_ns // self._length_ns + 1) * self._length_ns

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.materials import mip_chain
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.srgb import linear_to_srgb8, srgb_to_linear
+from neurosim_core.scene.texels import mip_chain
 
 _SAMPLES = np.array([[i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3] for i in range(4) for j in range(4 - i)]) / 4
 """Barycentric coordinates at which a face's texture is averaged."""

@@ -16,9 +16,8 @@ class RateLimit:
     def __init__(self, period_ns: int, *, burst_ns: int = 0) -> None:
         """Let the first one pass.
 
-        Args:
-            period_ns: Mean time between those that pass, at least [ns].
-            burst_ns: How far ahead of the mean rate they may be, when they come at once [ns].
+        `period_ns`: mean time between those that pass, at least [ns]. `burst_ns`: how far ahead of the mean
+        rate they may be, when they come at once [ns].
         """
         self._period_ns = period_ns
         self._burst_ns = burst_ns
@@ -42,10 +41,8 @@ class Table:
     def __init__(self, entity: str, send: Callable[..., None], *, span_ns: int | None) -> None:
         """Start empty.
 
-        Args:
-            entity: Where the rows go.
-            send: Called with the entity, the stamps [ns], and an array of rows for each column, by its name.
-            span_ns: Longest simulated time that rows wait [ns]; None: until there are 1024, or `send`.
+        `send`: called with the entity, the stamps [ns], and an array of rows for each column, by its name.
+        `span_ns`: longest simulated time that rows wait [ns]; None: until there are 1024, or `send`.
         """
         self._entity = entity
         self._send = send

@@ -68,11 +68,8 @@ def overlays(sensors: Sequence[SensorDescription]) -> dict[str, str]:
 def picture_panel(vehicle: str, sensor: str, kind: str = "", *, below: str = "") -> Panel:
     """Return the panel of a camera.
 
-    Args:
-        vehicle: Name of the vehicle.
-        sensor: Name of the camera.
-        kind: What it shows, a key of `PICTURES`; empty: not yet known.
-        below: The camera over whose picture it is drawn.
+    `kind`: what it shows, a key of `PICTURES`; empty: not yet known. `below`: the camera over whose picture
+    it is drawn.
     """
     rank = PICTURES.index(kind) if kind else len(PICTURES)
     if below:
@@ -89,13 +86,8 @@ def sensor_panels(
 ) -> list[Panel]:
     """Return the panels in which the packets of a sensor are shown.
 
-    Args:
-        vehicle: Name of the vehicle.
-        sensor: Name of the sensor.
-        schema: Schema of its packets.
-        kind: The display, or what a picture shows.
-        live: The clearance, which only a flight in this process knows, is not plotted.
-        below: The camera over whose picture that of the sensor is drawn.
+    `kind`: the display, or what a picture shows. `live`: the clearance, which only a flight in this process
+    knows, is not plotted. `below`: the camera over whose picture that of the sensor is drawn.
     """
     at = f"plots/{vehicle}/{sensor}"
     numbers = [field for field in schema.fields if field.is_number]
@@ -148,11 +140,9 @@ def make_blueprint(
 ) -> Any:
     """Lay the viewer out; see `rerun_log` for the entities.
 
-    Args:
-        panels: What is shown of each vehicle.
-        bounds_m: Lowest and highest corner of the scene [m], shape [2, 3]; None: there is none.
-        live: The plots of commands and of the simulator are there, and its status.
-        rolling: Follow the newest data; plots show the last seconds only.
+    `bounds_m`: lowest and highest corner of the scene [m], shape [2, 3]; None: there is none. `live`: the
+    plots of commands and of the simulator are there, and its status. `rolling`: follow the newest data; plots
+    show the last seconds only.
     """
     rrb = import_rerun().blueprint
     many = len(panels) > 1

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -120,10 +119,6 @@ class RerunLogger:
             live: This is a stream that may go on for hours.
             keep_layout: Leave the layout as the viewer has it now, if it has one.
             clock_ns: The wall clock [ns].
-
-        Raises:
-            ImportError: Rerun is not installed.
-            ValueError: There is no vehicle.
         """
         if not vehicles:
             raise ValueError("there must be at least one vehicle to log")
@@ -163,12 +158,7 @@ class RerunLogger:
     def log(self, packet: Packet, *, vehicle: str | None = None) -> None:
         """Log one packet.
 
-        Args:
-            packet: What a sensor yielded.
-            vehicle: Name of the vehicle; None: the first one.
-
-        Raises:
-            ValueError: The packet's class declares an unknown display, or its picture has no known encoding.
+        `vehicle`: name of the vehicle; None: the first one.
         """
         schema = schema_of(type(packet))
         if schema.display not in DISPLAYS:
@@ -184,9 +174,7 @@ class RerunLogger:
     def log_path(self, position: NDArray[np.float64], *, vehicle: str | None = None) -> None:
         """Show where a vehicle is meant to fly.
 
-        Args:
-            position: Planned p_WB [m], shape [n, 3].
-            vehicle: Name of the vehicle; None: the first one.
+        `position`: planned p_WB [m], shape [n, 3]. `vehicle`: name of the vehicle; None: the first one.
         """
         if len(position) > 1:
             path = self._rr.LineStrips3D(
@@ -197,10 +185,8 @@ class RerunLogger:
     def log_values(self, entity: str, stamp_ns: int, values: Mapping[str, ArrayLike]) -> None:
         """Plot quantities that no packet carries.
 
-        Args:
-            entity: Their plot, as in the list above, such as plots/drone/clearance or simulator/timing.
-            stamp_ns: Time [ns].
-            values: One value for each line, by its name; the same names every time.
+        `entity`: their plot, as in the list above, such as plots/drone/clearance or simulator/timing.
+        `stamp_ns`: time [ns]. `values`: one value for each line, by its name; the same names every time.
         """
         self._plot(entity, stamp_ns, list(values.values()), tuple(values))
 
@@ -209,11 +195,8 @@ class RerunLogger:
     ) -> None:
         """Plot rotor speeds that do not come in a packet.
 
-        Args:
-            sensor: Name of the odometry that they belong to.
-            stamp_ns: Time [ns].
-            speed: Speeds [rad/s], shape [R].
-            vehicle: Name of the vehicle; None: the first one.
+        `sensor`: name of the odometry that they belong to. `stamp_ns`: time [ns]. `speed`: speeds [rad/s],
+        shape [R]. `vehicle`: name of the vehicle; None: the first one.
         """
         entity = f"plots/{vehicle or self._first}/{sensor}/rotor_speed"
         self._plot(entity, stamp_ns, speed, _rotors(len(speed)))
@@ -223,11 +206,9 @@ class RerunLogger:
     ) -> None:
         """Plot what a vehicle is told to do.
 
-        Args:
-            mode: motor_speeds, rates, attitude, velocity or position; see `control.modes`.
-            stamp_ns: Time of the state that the command answers [ns].
-            setpoint: Row of setpoints, laid out as in `control.modes`.
-            vehicle: Name of the vehicle; None: the first one.
+        `mode`: motor_speeds, rates, attitude, velocity or position; see `control.modes`. `stamp_ns`: time of
+        the state that the command answers [ns]. `setpoint`: row of setpoints, laid out as in `control.modes`.
+        `vehicle`: name of the vehicle; None: the first one.
         """
         row = np.asarray(setpoint, dtype=np.float64)
         names = _SETPOINT_NAMES.get(mode) or _rotors(len(row))
@@ -238,9 +219,7 @@ class RerunLogger:
     def log_status(self, stamp_ns: int, text: str) -> None:
         """Show a text beside the pictures.
 
-        Args:
-            stamp_ns: From when on it holds [ns].
-            text: Markdown.
+        `stamp_ns`: from when on it holds [ns].
         """
         self._set_time(stamp_ns)
         self._recording.log("status", self._rr.TextDocument(text, media_type="text/markdown"))
@@ -253,28 +232,18 @@ class RerunLogger:
             table.send()
 
     def check(self) -> None:
-        """See whether all that has left so far could be written; wait for nothing.
-
-        Raises:
-            OSError: The file cannot be written, such as on a full disk.
-        """
+        """See whether all that has left so far could be written; wait for nothing."""
         self._stream.check()
 
     def close(self) -> None:
-        """Flush and disconnect from the file or viewer.
-
-        Raises:
-            OSError: As `check`.
-        """
+        """Flush and disconnect from the file or viewer."""
         self.send()
         self._stream.close()
 
     def __enter__(self) -> RerunLogger:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _log_meshes(self) -> None:

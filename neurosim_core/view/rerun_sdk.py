@@ -6,10 +6,9 @@ import os
 import sys
 import threading
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from neurosim_core.install import install_hint
+from neurosim_core.install import need
 
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
@@ -18,24 +17,16 @@ _QUIET = "warn,re_log_encoding::rrd::file_sink=error"
 _PIPE_BYTES = 1 << 20
 
 
-def import_rerun() -> ModuleType:
-    """Return the module `rerun`.
-
-    Raises:
-        ImportError: It is not installed; the message says what to install.
-    """
+def import_rerun() -> Any:
+    """Return the module `rerun`."""
     quiet = "rerun" not in sys.modules and "RUST_LOG" not in os.environ
     if quiet:
         os.environ["RUST_LOG"] = _QUIET  # read once, at the import
     try:
-        import rerun
-        import rerun.blueprint
-    except ImportError as error:
-        raise ImportError(f"the viewer needs Rerun: {install_hint('view')}") from error
+        return need("the viewer needs Rerun", "view", "rerun", "rerun.blueprint")
     finally:
         if quiet:
             del os.environ["RUST_LOG"]
-    return rerun
 
 
 class RerunStream:
@@ -50,20 +41,12 @@ class RerunStream:
         self._file = file
 
     def check(self) -> None:
-        """See whether all that has left so far could be written; wait for nothing.
-
-        Raises:
-            OSError: The file cannot be written, such as on a full disk.
-        """
+        """See whether all that has left so far could be written; wait for nothing."""
         if self._file is not None:
             self._file.check()
 
     def close(self) -> None:
-        """Disconnect from the file or viewer.
-
-        Raises:
-            OSError: As `check`.
-        """
+        """Disconnect from the file or viewer."""
         self.recording.disconnect()
         if self._file is not None:
             self._file.join()
@@ -101,15 +84,9 @@ class _FileWriter:
 def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool = True) -> RerunStream:
     """Open a recording of its own, independent of others in this process.
 
-    Args:
-        path: Write it to this .rrd file; None: the caller connects it (`connect_grpc`, ...).
-        name: What the viewer calls it; empty: by the time of its beginning.
-        footer: End the file with a table of its chunks, which makes it quick to open. It is collected in
-            memory, so what may go on for hours does without.
-
-    Raises:
-        OSError: The file cannot be written.
-        ImportError: Rerun is not installed.
+    `path`: write it to this .rrd file; None: the caller connects it (`connect_grpc`, ...). `name`: what the
+    viewer calls it; empty: by the time of its beginning. `footer`: end the file with a table of its chunks,
+    which makes it quick to open. It is collected in memory, so what may go on for hours does without.
     """
     rr = import_rerun()
     recording = rr.RecordingStream("neurosim")

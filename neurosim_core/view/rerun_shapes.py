@@ -26,8 +26,7 @@ _ARROW_COLOR = (29, 37, 48)
 def flow_arrows(flow: NDArray[np.float32]) -> Any:
     """Return flow as arrows on a grid of pixels, the longest of them a step and a half of the grid.
 
-    Args:
-        flow: Shape [H, W, 2]; nan: not known.
+    `flow`: shape [H, W, 2]; nan: not known.
     """
     step = max(8, flow.shape[1] // 16)
     rows, columns = np.mgrid[step // 2 : flow.shape[0] : step, step // 2 : flow.shape[1] : step]
@@ -51,15 +50,9 @@ def encode_picture(packet: Packet, *, compress: bool = True, opacity: float = 1.
 
     Colours and greys become JPEG. Depth becomes a depth image in millimetres up to 65 m, 0 where nothing is
     hit. Labels, normals and flow become colours without loss; labels that are not compressed keep their
-    numbers.
-
-    Args:
-        packet: A packet that `picture_of` finds a picture in.
-        compress: Make it small. What is not, a viewer shows without delay.
-        opacity: Of labels, normals and flow, which are drawn over other pictures if they can be seen through.
-
-    Raises:
-        ValueError: There is no picture, or one of an unknown encoding.
+    numbers. `packet`: a packet that `picture_of` finds a picture in. `compress`: make it small. What is not,
+    a viewer shows without delay. `opacity`: of labels, normals and flow, which are drawn over other pictures
+    if they can be seen through.
     """
     rr = import_rerun()
     kind, data = picture_of(packet)
@@ -100,9 +93,7 @@ def encode_classes(classes: NDArray[np.uint8], palette: NDArray[np.uint8], *, co
 def class_colors(palette: NDArray[np.uint8], shades: Sequence[str]) -> Any:
     """Return names and colours of the classes of events.
 
-    Args:
-        palette: Colours: of no event, then of the shades of darker pixels, then of brighter ones.
-        shades: Names of the shades.
+    `palette`: colours: of no event, then of the shades of darker pixels, then of brighter ones.
     """
     names = ["no event", *(f"{way}, {shade}" for way in ("darker", "brighter") for shade in shades)]
     classes = zip(names, palette.tolist(), strict=True)

@@ -17,13 +17,7 @@ CLOSE_S = 0.3
 
 
 def check_new_file(path: Path) -> None:
-    """Check that a Rerun file of this name can be written without replacing anything.
-
-    Raises:
-        ValueError: The name does not end in .rrd.
-        FileExistsError: The file exists.
-        OSError: There is no such folder, or the path is a folder.
-    """
+    """Check that a Rerun file of this name can be written without replacing anything."""
     if path.is_dir():
         raise OSError(f"cannot write {path}: it is a folder")
     if path.suffix != ".rrd":
@@ -69,15 +63,7 @@ class FileTarget:
     compress = True
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        """Refuse at once what cannot be written.
-
-        Args:
-            path: The first file.
-            say: Told what has been written.
-
-        Raises:
-            ValueError, OSError: As `check_new_file`.
-        """
+        """Refuse at once what cannot be written."""
         check_new_file(path)
         self._say = say
         numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))

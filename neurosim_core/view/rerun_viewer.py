@@ -19,7 +19,6 @@ import urllib.parse
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import end_with_parent, stop_at_signals
@@ -50,16 +49,9 @@ class RerunViewer:
     ) -> None:
         """Start the viewer and wait until it listens.
 
-        Args:
-            web: Serve a page instead of opening a window.
-            port: Port of the page; 0: any that is free.
-            file: A Rerun file to show from the beginning.
-            waiting: Asked now and then whether to go on waiting.
-
-        Raises:
-            ImportError: Rerun is not installed.
-            OSError: The port is taken.
-            ViewerEnded: It ended at once, or does not listen in time.
+        `web`: serve a page instead of opening a window. `port`: port of the page; 0: any that is free.
+        `file`: a Rerun file to show from the beginning. `waiting`: asked now and then whether to go on
+        waiting.
         """
         import_rerun()
         page_port, data_port = _free_ports(port if web else 0, 0)
@@ -95,11 +87,7 @@ class RerunViewer:
             raise
 
     def open(self, name: str) -> RerunStream:
-        """Open a recording in the viewer, which shows it at once.
-
-        Args:
-            name: What the viewer calls it.
-        """
+        """Open a recording in the viewer, which shows it at once."""
         stream = open_rerun(name=name)
         stream.recording.connect_grpc(self.data_url)
         return stream
@@ -110,11 +98,7 @@ class RerunViewer:
         return self._process.poll() is not None
 
     def check(self) -> None:
-        """See whether the viewer is still there.
-
-        Raises:
-            ViewerEnded: It failed.
-        """
+        """See whether the viewer is still there."""
         if self._process.poll():
             raise ViewerEnded(f"the viewer ended with status {self._process.poll()}:\n{self._last_words()}")
 
@@ -131,9 +115,7 @@ class RerunViewer:
     def __enter__(self) -> RerunViewer:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _wait_for(self, port: int, waiting: Callable[[], bool]) -> None:
@@ -162,11 +144,7 @@ def has_display() -> bool:
 
 @contextlib.contextmanager
 def naming_port(port: int) -> Iterator[None]:
-    """Name the port in the error of a block that cannot listen on it.
-
-    Raises:
-        OSError: The port is taken, or not allowed.
-    """
+    """Name the port in the error of a block that cannot listen on it."""
     try:
         yield
     except OSError as error:
@@ -176,18 +154,8 @@ def naming_port(port: int) -> Iterator[None]:
 def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True) -> int:
     """Show a Rerun file until the window is closed or this process is interrupted.
 
-    Args:
-        file: A file that ends in .rrd.
-        web: Serve a page instead of opening a window.
-        port: Port of the page; 0: any that is free.
-        open_browser: Open the page.
-
-    Returns:
-        0 if the window was closed, 130 if interrupted.
-
-    Raises:
-        ValueError: There is no display to open a window on.
-        OSError, ImportError, ViewerEnded: As `RerunViewer`.
+    `web`: serve a page instead of opening a window. `port`: port of the page; 0: any that is free. Returns 0
+    if the window was closed, 130 if interrupted.
     """
     if not web and not has_display():
         raise ValueError("there is no display to open a window on: `neurosim view FILE --web` serves a page")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import threading
 import time
 from pathlib import Path
 
@@ -45,11 +42,7 @@ class RerunSink:
         self._logger.log_path(context.header.path_position)
 
     def write(self, packet: Packet) -> None:
-        """Log a packet.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Log a packet."""
         self._logger.log(packet)
         if isinstance(packet, Odometry):
             self._positions.append(packet.stamp_ns, position=packet.position)
@@ -58,11 +51,7 @@ class RerunSink:
             self._logger.check()
 
     def close(self, *, complete: bool = True) -> None:
-        """Complete the file.
-
-        Raises:
-            OSError: It cannot be written.
-        """
+        """Complete the file."""
         if not self._closed:
             self._closed = True
             if complete:
@@ -85,8 +74,6 @@ class OverviewSink:
         self._begun_s = time.perf_counter()
         self._stamp_ns = 0
         self._has_pose = self._closed = False
-        self._loading = threading.Thread(target=_load_matplotlib, daemon=True)
-        self._loading.start()  # beside the flight
 
     def write(self, packet: Packet) -> None:
         """Take a packet."""
@@ -95,18 +82,13 @@ class OverviewSink:
         self._has_pose |= isinstance(packet, Odometry)
 
     def close(self, *, complete: bool = True) -> None:
-        """Draw what was flown, if that is complete.
-
-        Raises:
-            OSError: The picture cannot be written.
-        """
+        """Draw what was flown, if that is complete."""
         if self._closed:
             return
         self._closed = True
         if not complete:
             return
         factor = self._stamp_ns / NS_PER_S / (time.perf_counter() - self._begun_s)
-        self._loading.join()
         save_overview(
             self._file,
             self._summary,
@@ -124,8 +106,3 @@ class OverviewSink:
             velocity=samples.velocity,
             heading=np.stack([np.cos(samples.yaw), np.sin(samples.yaw)], axis=1),
         )
-
-
-def _load_matplotlib() -> None:
-    with contextlib.suppress(ImportError):
-        importlib.import_module("matplotlib.figure")

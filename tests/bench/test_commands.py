@@ -24,8 +24,8 @@ def asked(monkeypatch):
     """Questions that are answered at once; returns the options that each was asked with."""
     told = {}
 
-    def measure(self, options, progress):
-        progress("something")
+    def measure(self, options):
+        options.progress("something")
         told[self.name] = options
         if self.name == "fails":
             raise ValueError("no events to divide by")
@@ -110,7 +110,7 @@ def test_stages_that_an_interrupted_question_left(asked, tmp_path, monkeypatch, 
             raise KeyboardInterrupt
         return {"first": np.float64(name[0]), "none": np.nan}
 
-    def measure(self, options, progress):
+    def measure(self, options):
         found = [options.stage(name, partial(value_of, name)) for name in ("1 m/s", "2 m/s")]
         return Chapter(name="one", title="", summary=f"{found[0]['first']:g} {found[1]['first']:g}")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurosim_core.bench import dynamics, rotorpy_peer
+from neurosim_core.bench import dynamics, dynamics_oracle
 from neurosim_core.bench.dynamics import RKMK4
 from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, short_flight
 from neurosim_core.bench.dynamics_oracle import Equations, compare, make_reference, solve
@@ -14,8 +14,8 @@ from neurosim_core.bench.options import Options
 
 
 @pytest.fixture(scope="module")
-def rotor_step():
-    flight = FLIGHTS["rotor step"]()
+def flip():
+    flight = FLIGHTS["flip"]()
     return flight, make_reference(flight)
 
 
@@ -48,7 +48,7 @@ def test_a_fall_is_a_parabola():
 def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
     """Steps that are longer than they say miss the precision of an extreme flight."""
     cases = {"light": EXTREMES["mass 30 g, 100 m/s wind, quadratic drag"]}
-    right = dynamics._hard(cases, Options(quick=True), lambda _: None)
+    right = dynamics._hard(cases, Options(quick=True))
     limit_m = 2.0 * next(row["position [m]"] for row in right if row["method"] == RKMK4)
     assert dynamics._hard_claim("light", right, limit_m).met
 
@@ -57,7 +57,7 @@ def test_a_wrong_integrator_of_the_vehicle_is_seen(monkeypatch):
             super().__init__(config, **{**options, "max_step_ns": HOLD_NS})
 
     monkeypatch.setattr(dynamics, "Multirotor", Coarse)
-    wrong = dynamics._hard(cases, Options(quick=True), lambda _: None)
+    wrong = dynamics._hard(cases, Options(quick=True))
     assert not dynamics._hard_claim("light", wrong, limit_m).met
 
 
@@ -66,7 +66,7 @@ def test_stiff_flights_are_judged_and_refusals_kept():
         "1e-6 s": (lambda: short_flight("hummingbird", motor_time_constant_s=1e-6), False),
         "slender": EXTREMES["inertia 1:10:100, 200 rad/s"],
     }
-    rows = dynamics._hard(cases, Options(quick=True), lambda _: None)
+    rows = dynamics._hard(cases, Options(quick=True))
     outcome = {(row["flight"], row["method"]): row["outcome"] for row in rows}
     assert outcome["1e-6 s", RKMK4] == "flown"
     assert outcome["slender", RKMK4].startswith("refused: Value error")
@@ -80,14 +80,14 @@ def test_stiff_flights_are_judged_and_refusals_kept():
     assert refused[RKMK4].startswith("refused")
 
 
-@pytest.mark.skipif(rotorpy_peer.rotorpy_version() is None, reason="RotorPy is not installed")
-def test_rotorpy_flies_the_same_equations(rotor_step):
+@pytest.mark.skipif(dynamics_oracle.rotorpy_version() is None, reason="RotorPy is not installed")
+def test_rotorpy_flies_the_same_equations(flip):
     """Its RK45 at 1 ms is at rounding where motors are slow: the equations are the same."""
-    flight, reference = rotor_step
-    states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3)
+    flight, reference = flip
+    states, cpu_s = dynamics_oracle.fly_rotorpy(flight, 1e-3)
     assert compare(states, reference.states).position_m < 1e-12
     assert cpu_s > 0.0
-    stopped, _ = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=0.0)
+    stopped, _ = dynamics_oracle.fly_rotorpy(flight, 1e-3, cpu_max_s=0.0)
     assert np.isnan(stopped[1:]).all()
 
 

@@ -126,10 +126,3 @@ def test_panels_of_rows_leave_gaps_and_take_further_series():
     assert (a.x, a.y) == ([1, 2], [0.5, None])
     assert b.x == []
     assert (law, drawn.x_label, drawn.y_label, drawn.y_min) == (further, "x", "y", 0.0)
-
-
-@pytest.mark.parametrize("make", [lambda n: Table(n, "", []), lambda n: Plot(n, "", []), chapter])
-@pytest.mark.parametrize("name", ["", "A", "a/b", "../a", "a.csv", "-a"])
-def test_names_that_are_no_files_are_refused(make, name):
-    with pytest.raises(ValueError, match="name must be of lower-case letters"):
-        make(name)

@@ -358,7 +358,7 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
             "dark_floor is given twice: --dark-floor and --set",
         ),
         (["--slow-motion", "0"], "slow_motion: Input should be greater than 0, got 0.0"),
-        (["--set", "seed.x=1", "--seed", "3"], "seed.x: seed is 3, and has no keys"),
+        (["--set", "seed.x=1", "--seed", "3"], "seed: Input should be a valid integer, got {'x': 1}"),
         (["--size", "9x9000"], "size must be at most 16 times the 24x10 pixels there are, got 9x9000"),
     ],
 )

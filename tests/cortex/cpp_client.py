@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import zmq
 from cpp_messages import Mode, Point, Rich, Scan
-from processes import SOON_S, Lines
+from processes import SOON_S, Beside, Lines
 
 from cortex import records, wire
 from cortex.host import host_id
@@ -138,8 +137,7 @@ class Impostor:
         self.welcome = wire.control_frame(records.Welcome(1, 1, [record.node], [record.revision]))
         self.record = wire.control_frame(records.Changed(1, record))
         self.stopping = False
-        self.thread = threading.Thread(target=self._answer)
-        self.thread.start()
+        self._answering = Beside(self._answer)
 
     def _answer(self) -> None:
         """Say who we are, between frames of nonsense, to whoever asks."""
@@ -165,7 +163,7 @@ class Impostor:
 
     def close(self) -> None:
         self.stopping = True
-        self.thread.join()
+        self._answering.join()
         self.context.destroy(linger=0)
 
 

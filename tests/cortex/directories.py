@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import secrets
-import threading
 import time
 
 import pytest
 import zmq
-from processes import SOON_S
+from processes import SOON_S, Beside
 
 from cortex.control import LEASE_NS, control_types, make_control_socket
 from cortex.discovery import Directory
@@ -97,9 +96,7 @@ def drive(nodes, condition, timeout_s=SOON_S):
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, [(n.record.name, n.names, n.directory.connected) for n in nodes]
-        next_ns = min((node.directory.deadline_ns for node in nodes), default=0)
-        wait_ms = (next_ns - time.monotonic_ns()) // 1_000_000
-        for socket, _ in poller.poll(min(max(wait_ms, 0), 20)):
+        for socket, _ in poller.poll(2):
             owner[socket].directory.handle()
         for node in nodes:
             node.directory.tick()
@@ -135,14 +132,12 @@ def make(runtime, context):
 def serving(domain=0, **options):
     """A registry in a thread."""
     registry = Registry(domain, **options)
-    thread = threading.Thread(target=registry.run)
-    thread.start()
+    serving = Beside(registry.run)
     try:
         yield registry
     finally:
         registry.stop()
-        thread.join(SOON_S)
-        assert not thread.is_alive()
+        serving.join()
         registry.close()
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from itertools import pairwise
 
 import pytest
 from peer import Number
-from processes import SOON_S, wait_for
+from processes import SOON_S, Beside, wait_for
 
 from cortex import keep_last, latest, reliable
 from cortex.fast_receive import PAUSE_COUNT
@@ -32,10 +31,8 @@ def test_async_iteration_until_close(numbers):
         for value in range(1000):
             publisher.publish(Number(0, value))
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    assert asyncio.run(asyncio.wait_for(collect(), SOON_S)) == list(range(1000))
-    thread.join()
+    with Beside(publish):
+        assert asyncio.run(asyncio.wait_for(collect(), SOON_S)) == list(range(1000))
 
 
 def test_two_subscribers_on_one_loop(node):
@@ -69,12 +66,8 @@ def test_two_subscribers_on_one_loop(node):
         assert ticks > 10  # a turn after `PAUSE_COUNT` messages at the latest
         return results
 
-    threads = [threading.Thread(target=publish, args=(publisher,)) for publisher in publishers]
-    for thread in threads:
-        thread.start()
-    assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [list(range(STREAM))] * 2
-    for thread in threads:
-        thread.join()
+    with Beside(publish, publishers[0]), Beside(publish, publishers[1]):
+        assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [list(range(STREAM))] * 2
 
 
 def test_two_tasks_on_one_subscriber(numbers):

@@ -248,10 +248,12 @@ def test_case(tiny_run, name):
         if contestant.peer in OPTIONAL and (row["absent"] or row.get("error")):  # said in words
             continue
         assert not row.get("error"), contestant.name
-        # Memory may shrink, too: the ring that one with more room has replaced is let go.
-        figures = [row[metric] for metric in case.metrics if row[metric] and metric != "grown_kb"]
-        assert figures, contestant.name
-        assert min(map(float, figures)) >= 0.0, contestant.name
+        # Memory may shrink: the ring that one with more room has replaced is let go. On a busy machine a
+        # publisher that is held up may go on before its reader is killed.
+        signed = ("grown_kb", "known_ms")
+        figures = [row[metric] for metric in case.metrics if row[metric] and metric not in signed]
+        assert figures or any(row[metric] for metric in signed), contestant.name
+        assert min(map(float, figures), default=0.0) >= 0.0, contestant.name
         faults = {row[count] for count in ("lost", "misordered", "corrupt")}
         assert faults <= {"0", ""}, contestant.name
         if row["rate"]:

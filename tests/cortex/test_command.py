@@ -25,7 +25,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from peer import Number, Scan
-from processes import ROOT, SOON_S, wait_for
+from processes import ROOT, SOON_S, Beside, wait_for
 
 from cortex import Array, Node, Publisher, Unit, keep_last, reliable
 from cortex.cli import main
@@ -149,13 +149,11 @@ def publishing(publisher: Publisher[Number], period_s: float) -> Iterator[None]:
             if done.wait(max(0.0, began_s + (number + 1) * period_s - time.monotonic())):
                 return
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join(SOON_S)
+    with Beside(run):
+        try:
+            yield
+        finally:
+            done.set()
 
 
 def column(output: str, name: str, line: int = -1) -> str:

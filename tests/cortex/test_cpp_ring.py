@@ -28,32 +28,24 @@ __all__ = ["programs", "start"]
 
 pytestmark = needs_compiler
 
-SIZES = "10,20000,4000,0,50000"
+SIZES = [10, 20_000, 4000, 0, 50_000]
+"""Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
 """Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
 
 
-def rings_of(pid: int | str) -> set[str]:
-    """The rings, and pages of their readers, that a process has mapped."""
-    lines = Path(f"/proc/{pid}/maps").read_text(encoding="ascii").splitlines()
-    return {line.split()[4] for line in lines if "/memfd:cortex (" in line}
-
-
 def share_a_ring(peer: Peer, other: int) -> bool:
-    """Whether a C++ program and another process have a ring in common."""
-    return bool(rings_of(peer.process.pid) & rings_of(other))
+    """Whether a C++ program and another process have a ring, or a page of a reader, in common."""
+    maps = [Path(f"/proc/{pid}/maps").read_text("ascii").splitlines() for pid in (peer.process.pid, other)]
+    rings = [{line.split()[4] for line in lines if "/memfd:cortex (" in line} for lines in maps]
+    return bool(rings[0] & rings[1])
 
 
 def result_of(peer: Peer) -> dict[str, int]:
-    result: dict[str, int] = json.loads(peer.line())
-    return result
+    return json.loads(peer.line())
 
 
 def scan(number: int, size: int) -> Scan:
     return Scan(number, np.full(size, number, np.float32))
-
-
-def sizes() -> list[int]:
-    return [int(size) for size in SIZES.split(",")]
 
 
 @pytest.mark.parametrize("direction", ["Python to C++", "C++ to Python", "C++ to C++"])
@@ -62,14 +54,14 @@ def test_all_sizes_in_one_order(start, make_node, direction):
     node = make_node()
     counting = start("count", "/scan", "reliable", 0, 3, 3000) if reader == "C++" else None
     scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) if reader == "Python" else None
-    publishing = start("publish", "/scan", 3000, SIZES) if writer == "C++" else None
+    publishing = start("publish", "/scan", 3000, ",".join(map(str, SIZES))) if writer == "C++" else None
     if writer == "Python":
         publisher = node.publisher("/scan", Scan)
         assert publisher.wait_for_subscribers(1, SOON_S)
-        assert all(publisher.publish(scan(number, sizes()[number % 5])) for number in range(3000))
+        assert all(publisher.publish(scan(number, SIZES[number % 5])) for number in range(3000))
     if scans is not None:
         for number in range(3000):
-            assert scans.recv(SOON_S) == scan(number, sizes()[number % 5])
+            assert scans.recv(SOON_S) == scan(number, SIZES[number % 5])
         assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
         assert scans.carriers == ["ipc, shared memory"]
     if counting is not None:
@@ -306,7 +298,6 @@ def impostor(runtime, monkeypatch):
 
 def body_of(number: int, size: int = 4) -> bytes:
     body = codec_of(Scan).encode(scan(number, size), 100_000)
-    assert body is not None
     return body
 
 

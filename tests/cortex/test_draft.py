@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from cortex.codec import codec_of
-from cortex.message import Array, message
+from cortex.message import Array, Int8, message
 from cortex.messages import Events, Image
 
 
 @message
 class Mixed:
     stamp_ns: int
+    small: Int8
     text: str
     large: Array["uint8", 40, 40]
     a: Array["float32", "n"]
@@ -90,10 +91,12 @@ def test_drafts_refuse_what_does_not_fit():
 @pytest.mark.parametrize("dims", [{}, {"n": 5}])
 def test_arrays_of_unknown_size_go_into_the_reserve_of_a_draft(dims):
     large, ones = np.arange(1600, dtype=np.uint8).reshape(40, 40), np.ones(5, np.float32)
-    mixed = Mixed(1, "text", large, ones, np.arange(15.0).reshape(5, 3), [1, 2], ones)
+    mixed = Mixed(1, -2, "text", large, ones, np.arange(15.0).reshape(5, 3), [1, 2], ones)
     drafter = codec_of(Mixed).drafter
-    memory = np.zeros(drafter.size(), np.uint8)
+    memory = np.full(drafter.size(), 0xAA, np.uint8)
     draft = drafter.draft(memory, dims)
     for field in dataclasses.fields(Mixed):
         setattr(draft, field.name, getattr(mixed, field.name))
-    assert codec_of(Mixed).decode(memory[: drafter.finish(draft)].tobytes()) == mixed
+    body = memory[: drafter.finish(draft)].tobytes()
+    assert codec_of(Mixed).decode(body) == mixed
+    assert body[9:12] == bytes(3)  # behind the small number

@@ -27,7 +27,6 @@ from cortex import records, reliable, wire
 from cortex.codec import codec_of
 from cortex.host import host_id
 from cortex.node import Node
-from cortex.overview import subscriber_stats
 from cortex.schema import schema_of
 
 __all__ = ["programs"]
@@ -67,7 +66,6 @@ CASES = [
 def message(number: int, source: int) -> bytes:
     """A message of a publisher as a frame."""
     body = codec_of(Scan).encode(Scan(number, np.full(2, number, np.float32)), 1000)
-    assert body is not None
     return make_frame(b"M", number, body, source=source)
 
 
@@ -138,7 +136,7 @@ def test_python_reports_what_it_has_not_heard_the_end_of(leavers, monkeypatch):
             take_all(reader)
             counted = {name: getattr(reader.counters, name) for name in COUNTERS}
             assert counted == expected(number), number
-            assert subscriber_stats(reader).cut_off == reader.counters.cut_off
+            assert reader.stats().cut_off == reader.counters.cut_off
 
 
 @needs_compiler

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import mmap
-import threading
 import time
 import tracemalloc
 from collections import deque
@@ -432,12 +431,9 @@ def test_a_loan_is_published_when_it_ends(node, size):
     message, info = subscriber.recv_with_info(SOON_S)
     assert (message.stamp_ns, info.stamp_ns, info.sequence) == (5, 5, 0)
     np.testing.assert_array_equal(message.ranges, np.arange(size, dtype=np.float32))
-    loan, sent = publisher.try_loan(n=size), []
+    loan = publisher.try_loan(n=size)
     loan.draft.stamp_ns, loan.draft.ranges[:] = 4, 4.0
-    thread = threading.Thread(target=lambda: sent.append(loan.publish()))
-    thread.start()
-    thread.join()
-    assert sent == [True]
+    assert Beside(loan.publish).join() == [True]
     assert subscriber.recv(SOON_S) == scan(4, size)
     with pytest.raises(RuntimeError, match="published or dropped before"):
         loan.publish()

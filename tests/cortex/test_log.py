@@ -22,7 +22,7 @@ from processes import SOON_S, wait_for
 from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
 from cortex.log import Log, LogError, LogWriter, Player, Recorder, TopicStats, open_log
 from cortex.log.format import CHUNK_BYTES
-from cortex.log.sink import Sink
+from cortex.log.writer import Sink
 from cortex.schema import Schema, schema_of
 
 MakeNode = Callable[..., Node]
@@ -47,7 +47,6 @@ def write_numbers(path: Path, values: range, *, gap_ns: int = 10_000_000, chunk_
         channel = writer.register_channel("/number", "cortex", schema, metadata)
         for value in values:
             body = codec_of(Number).encode(Number(-value, value), 1000)
-            assert body is not None
             at_ns = 10**18 + value * gap_ns
             writer.add_message(channel, at_ns, body, at_ns, value)
         writer.finish()
@@ -142,8 +141,10 @@ def test_all_topics_are_recorded_also_those_that_come_later(make_node, tmp_path)
 
     robot.publisher("/first", Number)
     with Recorder(logger, path) as recorder:
-        publish(robot, "/first", Number(1, 1)).close()
+        first = publish(robot, "/first", Number(1, 1))
         publish(make_node("late"), "/second", Scan(2, np.ones(3, np.float32)))
+        wait_for(lambda: recorder.stats.written == 2)
+        first.close()
         publish(robot, "/first", Number(3, 3))  # has another number, and counts from 0 again
         publish(robot, "/first", OtherNumber(4, 0.5))
         wait_for(lambda: recorder.stats.written == 4)

@@ -19,10 +19,10 @@ from processes import ROOT, SOON_S, Beside, wait_for
 
 from cortex import latest, reliable
 from cortex.context import new_socket
+from cortex.control import control_types
 from cortex.host import runtime_dir
 from cortex.publisher import Closed
 from cortex.records import StatsReply, StatsRequest
-from cortex.registry import control_types
 from cortex.schema import schema_of
 from cortex.wire import control_frame, pack_header, parse_control, unpack_header
 

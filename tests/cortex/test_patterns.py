@@ -75,8 +75,8 @@ def test_a_callback_for_publishers_that_come_and_die(make_node, start_child):
     own = node.publisher("/a/number", Number)
     stop = node.watch("/*/number", lambda change: seen.append((change.topic, change.node_name, change.alive)))
     wait_for(lambda: seen == [("/a/number", "here", True)])
-    took_s = []
-    for _ in range(3):
+
+    def took_s() -> float:
         child = start_child("peer", name="there")
         seen.clear()
         child.ask(do="publisher", topic="/b/number", type="Number")
@@ -85,9 +85,10 @@ def test_a_callback_for_publishers_that_come_and_die(make_node, start_child):
         child.kill()
         begin_s = time.monotonic()
         wait_for(lambda: len(seen) == 2)
-        took_s.append(time.monotonic() - begin_s)
         assert seen[1] == ("/b/number", "there", False)
-    assert min(took_s) < 0.5  # a busy machine makes some of them late, but not each
+        return time.monotonic() - begin_s
+
+    wait_for(lambda: took_s() < 0.5)  # a busy machine makes some of them late, but not each
     own.close()
     wait_for(lambda: seen[-1] == ("/a/number", "here", False))
     stop()

@@ -7,13 +7,14 @@ import os
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block, take_all
-from processes import ROOT, SOON_S, Beside, Lines
+from processes import ROOT, SOON_S, Beside, Lines, wait_for
 from test_end_of_stream import expected, leavers
 from wire_vectors import message_to_plain
 
@@ -43,7 +44,7 @@ def _cargo(*arguments: str, timeout_s: float = PATIENCE_S) -> subprocess.Complet
     if any(DEBIAN.glob("zmq-*")):
         command += ["--offline", "--config", 'source.crates-io.replace-with="debian"']
         command += ["--config", f'source.debian.directory="{DEBIAN}"']
-    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET)}
+    environment = os.environ | {"CARGO_TARGET_DIR": str(TARGET), "CARGO_PROFILE_DEV_DEBUG": "0"}
     return subprocess.run(
         command, cwd=CRATE, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False
     )
@@ -182,19 +183,38 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     count = 2_000  # of a kilobyte: more than lies between the two
     for number in range(count):
         publishing.publish(make_block(number, 1_000))
-    received = 0
-    while received + subscriber.counters.lost < count:
+    numbers: list[int] = []
+    while len(numbers) + subscriber.counters.lost < count:
         blocks = take_all(subscriber)
         assert all(map(is_whole, blocks))
-        received += len(blocks)
+        numbers += [block.number for block in blocks]
     lost = subscriber.counters.lost
     assert lost > 0
-    publishing.publish(make_block(count, 5))
-    assert subscriber.recv(SOON_S).number == count
+    for number in range(count, count + 20):
+        publishing.publish(make_block(number, 5))
+        assert subscriber.recv(SOON_S).number == number
     counted = publishing.close()
-    assert counted["published"] == count + 1
-    assert lost <= counted["timeouts"] <= lost + 1  # it may not have heard yet that we read again
+    assert counted["published"] == count + 20
+    # Once it has lost a message, all may be lost until the publisher hears that it reads again.
+    first = next(index for index, number in enumerate([*numbers, count]) if index != number)
+    assert lost <= counted["timeouts"] < count + 20 - first
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
+
+
+def test_a_reader_that_rust_passed_over_learns_of_it_whenever_it_reads(start, make_node):
+    """It is told again and again how many messages there were."""
+    publishing = Publishing(start("pub", "/blocks"), Block)
+    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
+    publishing.await_subscribers(1)
+    count = 2_000
+    for number in range(count):
+        publishing.publish(make_block(number, 1_000))
+    time.sleep(0.5)  # several times the silence after which it is told first
+    received: list[Block] = []
+    wait_for(
+        lambda: received.extend(take_all(subscriber)) or len(received) + subscriber.counters.lost == count
+    )
+    assert subscriber.counters.lost > 0
 
 
 def test_several_subscribers_of_rust(start, make_node):

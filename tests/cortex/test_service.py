@@ -15,8 +15,10 @@ from cortex import Closed, ServiceFailed, ServiceTimeout, ServiceUnavailable
 from cortex.codec import codec_of
 from cortex.context import new_socket
 from cortex.message import message
+from cortex.places import Reach
+from cortex.records import Endpoint
 from cortex.schema import TypeMismatch
-from cortex.service import PENDING_MAX, Client, Place
+from cortex.service import PENDING_MAX, Client
 from cortex.wire import CONTROL_LIMIT, REPLY, pack_header, unpack_header
 
 
@@ -27,6 +29,11 @@ class Bulk:
 
 def double(request):
     return Number(request.stamp_ns, 2 * request.value)
+
+
+def reach(address, *, local=False):
+    """Where the service of a node is whose control socket has an address."""
+    return Reach(1, Endpoint("tcp", "", "", address, ""), local, None)
 
 
 class Holding:
@@ -134,7 +141,7 @@ def test_a_request_has_a_limit(node, excess):
     size = CONTROL_LIMIT - 8 + excess  # the block of the body
     with node.client("/bulk", Bulk, Number) as client:
         if excess > 0:
-            with pytest.raises(ValueError, match="over the limit"):
+            with pytest.raises(ValueError, match="exceeds the limit"):
                 client.call(Bulk(bytes(size)), timeout_s=SOON_S)
         else:
             assert client.call(Bulk(bytes(size)), timeout_s=SOON_S).value == size
@@ -178,7 +185,7 @@ def test_the_deadline_goes_along_within_a_host(runtime, local):
     with new_socket(zmq.ROUTER) as socket:
         socket.bind("tcp://127.0.0.1:*")
         address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
-        client = Client("/double", Number, Number, lambda: Place(1, address, local, None))
+        client = Client("/double", Number, Number, lambda: reach(address, local=local))
 
         def ask():
             """When a call began and had ended, and what came: nothing, if it was stopped before it sent."""
@@ -234,7 +241,7 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
                 reply = header._replace(body_size=len(body), **change)
                 socket.send_multipart([identity, pack_header(reply) + body])
 
-        with Client("/double", Number, Number, lambda: Place(1, address, False, None)) as client:
+        with Client("/double", Number, Number, lambda: reach(address)) as client:
             for _ in range(2):
                 with Beside(answer):
                     assert client.call(Number(0, 0), timeout_s=SOON_S).value == 3

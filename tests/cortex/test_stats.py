@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cortex.stats import BUCKETS, SubscriberCounters, array_of, quantile_ns
+from cortex.stats import BUCKETS, SubscriberCounters, quantile_ns
 
 
 def histogram(latencies_ns):
@@ -34,11 +33,3 @@ def test_the_extremes():
     assert quantile_ns(histogram([0]), 0.5) <= 1.0
     assert quantile_ns(histogram([2**60]), 0.5) >= 2.0 ** (BUCKETS - 2)
     assert quantile_ns([0, 0, 0, 4] + [0] * 36, 0.5) == pytest.approx(6.0)  # the middle of [4, 8)
-
-
-def test_it_travels_as_an_array():
-    counters = SubscriberCounters()
-    counters.latency[3] = 7
-    array = array_of(counters.latency)
-    assert (array.dtype, array.shape) == (np.dtype("uint64"), (BUCKETS,))
-    assert array[3] == array.sum() == 7

@@ -16,9 +16,8 @@ from peer import Number, OtherNumber, Scan, connect
 from processes import SOON_S, Beside, in_time, wait_for
 
 from cortex import keep_last, receive_lock, reliable
-from cortex.codec import codec_of
+from cortex.codec import RawMessage, codec_of
 from cortex.publisher import Closed
-from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
 
 LARGE = 100_000

@@ -119,10 +119,7 @@ def test_what_the_environment_says_of_other_hosts_can_be_overridden(runtime, mon
     keys = new_keys(tmp_path / "keys")
     for name, value in (("LISTEN", "127.0.0.1"), ("REGISTRY", "tcp://127.0.0.1:9"), ("KEYS", "~/keys")):
         monkeypatch.setenv(f"CORTEX_{name}", value)
-    found = network(None, None, None)
-    assert (found.registry, found.listen) == ("tcp://127.0.0.1:9", "127.0.0.1")
-    assert found.keys is not None
-    assert found.keys.public == keys.public
+    assert network(None, None, None) == ("tcp://127.0.0.1:9", "127.0.0.1", load_keys(tmp_path / "keys"))
     assert network("auto", "", keys) == ("auto", None, keys)
 
 
@@ -160,7 +157,7 @@ def test_a_record_cannot_lead_to_plain_tcp_beyond_this_host(tmp_path):
     assert reach(record_at(FAR, keys.public), "here", keys).secure is not None
     assert reach(record_at(FAR, keys.public), "here", None, insecure=True) is None
     matcher = Matcher("here", None, insecure=False)
-    assert matcher.reach_control(record_at(NEAR)).address == NEAR
+    assert matcher.reach_control(record_at(NEAR)).endpoint.control == NEAR
     with pytest.raises(ConnectionError, match="cannot be asked"):
         matcher.reach_control(record_at(NEAR, control=""))
     assert reach(record_at(NEAR, control=""), "here", None) is not None

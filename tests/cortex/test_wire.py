@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cortex.codec import MalformedMessage
+from cortex.control import control_types
 from cortex.message import message
 from cortex.records import Heartbeat, Leave
-from cortex.registry import control_types
 from cortex.wire import (
     ATTACH,
     CONTROL,

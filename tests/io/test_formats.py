@@ -159,7 +159,7 @@ def test_dv_processing_reads_aedat4(tmp_path):
 
 def test_evt2_words():
     """By hand: 4101 us = 64 * 64 + 5; column 7, row 3, brighter."""
-    from neurosim_core.io.evt2 import Evt2Encoder
+    from neurosim_core.io.raw import Evt2Encoder
 
     events = EventArrays(*(np.array([v], k) for v, k in ((4101, "i8"), (7, "u2"), (3, "u2"), (1, "u1"))))
     words = Evt2Encoder().encode(events).view("<u4").tolist()

@@ -34,7 +34,7 @@ from neurosim_core.learn.dense_train import (  # noqa: E402
     windows_of,
 )
 from neurosim_core.learn.dense_worlds import world_windows  # noqa: E402
-from neurosim_core.learn.depth import DepthErrorSums, depth_loss  # noqa: E402
+from neurosim_core.learn.heads import DepthErrorSums, depth_loss  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

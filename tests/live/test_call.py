@@ -160,10 +160,10 @@ def test_settings_are_read_as_yaml():
 @pytest.mark.parametrize(
     ("setting", "text"),
     [
-        ("nothing", "a setting is KEY=VALUE, got 'nothing'"),
-        ("=3", "a setting is KEY=VALUE, got '=3'"),
-        ("a=", "a takes a number, true, false, text or a list, got ''"),
-        ("a=[1", r"a takes a number, true, false, text or a list, got '\[1'"),
+        ("nothing", "set takes KEY=VALUE, got 'nothing'"),
+        ("=3", "set takes KEY=VALUE, got '=3'"),
+        ("a=", "a takes a number, true, false, text or a list, got None"),
+        ("a=[1", r"set a: the value '\[1' is not YAML"),
     ],
 )
 def test_settings_that_are_none_are_refused(setting, text):

@@ -20,7 +20,14 @@ from hypothesis import strategies as st
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.live.links import Link
 from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
-from neurosim_core.record import Intrinsics, Recording, RecordingHeader, RecordingWriter, SensorDescription
+from neurosim_core.record import (
+    Intrinsics,
+    Recording,
+    RecordingHeader,
+    RecordingWriter,
+    SensorDescription,
+    hdf5,
+)
 from neurosim_core.record.disk import Disk
 
 HEADER = RecordingHeader(config_yaml="duration_s: 1.0\n", seed=7, version="0.1.0", scene="flat")
@@ -425,7 +432,7 @@ def test_memory_is_bounded(tmp_path):
     assert held_bytes < 20_000_000
 
 
-def test_caller_may_reuse_the_arrays_of_pictures(tmp_path):
+def test_caller_may_reuse_small_arrays(tmp_path):
     data = np.zeros((4, 4), dtype=np.float32)
     with RecordingWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9) as writer:
         for k in range(3):
@@ -504,6 +511,24 @@ except OSError as error:
     with Recording(tmp_path / "f.h5") as flight:
         assert not flight.clean
         assert len(list(flight.packets())) == int(kept_ns) + 1
+
+
+def test_a_thread_that_fails_is_reported_once_and_leaves_what_was_flushed(tmp_path, monkeypatch):
+    writer = RecordingWriter(tmp_path / "f.h5", HEADER)
+    writer.write(image(stamp_ns=1, shape=(90, 90)))
+    writer.flush()
+
+    def fail(*_: object) -> list[bytes]:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(hdf5, "_deflate", fail)
+    writer.write(image(stamp_ns=2, shape=(90, 90)))
+    with pytest.raises(MemoryError, match="no room"):
+        writer.flush()
+    writer.close()
+    with Recording(tmp_path / "f.h5") as flight:
+        assert not flight.clean
+        assert_same(list(flight.packets()), [image(stamp_ns=1, shape=(90, 90))])
 
 
 def test_files_that_are_not_ours_are_refused(tmp_path):

@@ -18,8 +18,8 @@ from neurosim_core.render import embree
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_caster, packet_width
-from neurosim_core.render.lighting import refine
 from neurosim_core.render.outputs import OUTPUTS
+from neurosim_core.render.refine import refine
 from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene

@@ -12,7 +12,8 @@ from render_scenes import plane, point_light, scene_of
 
 from neurosim_core.render import light_cache, lighting
 from neurosim_core.render.config import LightingConfig
-from neurosim_core.render.lighting import bake_light, refine
+from neurosim_core.render.lighting import bake_light
+from neurosim_core.render.refine import refine
 
 
 @pytest.fixture

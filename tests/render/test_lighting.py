@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from render_scenes import DARK, box, plane, point_light, scene_of
 
 from neurosim_core.render.config import LightingConfig
-from neurosim_core.render.lighting import bake_light, refine
+from neurosim_core.render.lighting import bake_light
+from neurosim_core.render.refine import refine
 from neurosim_core.scene.scene import Ambient, Material
 
 AMBIENT = Ambient(up=(0.4, 0.5, 0.6), down=(0.1, 0.2, 0.3))

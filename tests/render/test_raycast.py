@@ -27,8 +27,8 @@ from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
 from neurosim_core.render.scene_arrays import upload_scene
-from neurosim_core.scene.materials import encode_texels
 from neurosim_core.scene.scene import Ambient, Material, Texture
+from neurosim_core.scene.texels import encode_texels
 
 LENS = PinholeConfig(width=45, height=34, fx=40.0, fy=38.0, cx=21.0, cy=18.5)  # no multiples of a tile
 BAKED = RenderConfig(lighting=LightingConfig(edge_max_m=0.5, ambient_ray_count=4), exposure=1.0)

@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.scene.materials import (
-    encode_texels,
     mean_albedo,
-    mip_chain,
     pack_textures,
     sample_finest,
     sample_nearest,
@@ -18,6 +16,7 @@ from neurosim_core.scene.materials import (
 )
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.scene.srgb import srgb_to_linear
+from neurosim_core.scene.texels import encode_texels, mip_chain
 
 
 @wp.kernel

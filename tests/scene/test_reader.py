@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import trimesh
 from small_room import room_scene
 
 import neurosim_core as ns
+from neurosim_core.render.refine import refine
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.scene.scene import Scene
@@ -33,37 +37,90 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     config = MeshSceneConfig(file=file)
     loaded = config.load()
     monkeypatch.setattr(MeshSceneConfig, "load", None)
-    with SceneReader({"file": str(file)}) as reader:
+    with SceneReader({"scene": {"file": str(file)}}) as reader:
         scene = reader.scene(config)
     for name, values in arrays_of(loaded).items():
         np.testing.assert_array_equal(getattr(scene, name), values, strict=True)
+    (mesh,), wanted = scene.refined.values(), refine(loaded, 0.5)
+    for field in dataclasses.fields(wanted):
+        np.testing.assert_array_equal(getattr(mesh, field.name), getattr(wanted, field.name), strict=True)
+    assert len(mesh.faces) > len(loaded.faces)
+    for found, expected in zip(mesh.corner_groups, wanted.corner_groups, strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
+    for found, expected in zip(scene.connections, loaded.connections, strict=True):
+        np.testing.assert_array_equal(found, expected, strict=True)
+    assert refine(scene, 0.5) is mesh
     assert scene.notes == loaded.notes
     assert (scene.lights, scene.instance_names) == (loaded.lights, loaded.instance_names)
-    textures = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
-    assert any(one is not None for one, _ in textures)
-    for one, other in textures:
+    pairs = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
+    assert any(one is not None for one, _ in pairs)
+    for one, other in pairs:
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             np.testing.assert_array_equal(one.srgb, other.srgb)
+            levels = one.take_levels()
+            assert len(levels) == 3  # of 4 x 4 texels
+            for found, expected in zip(levels, other.take_levels(), strict=True):
+                np.testing.assert_array_equal(found, expected, strict=True)
 
 
 @pytest.mark.parametrize("settings", [{"kind": "mesh", "file": "elsewhere.ply"}, "hall", 3, {"kind": "no"}])
 def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
-    with SceneReader(settings) as reader:
+    with SceneReader({"scene": settings}) as reader:
         assert reader.scene(config).name == "room"
 
 
 def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
     with (
-        SceneReader({"file": "no.glb"}) as reader,
+        SceneReader({"scene": {"file": "no.glb"}}) as reader,
         pytest.raises(SceneError, match=r"no\.glb: no such file"),
     ):
         reader.scene(MeshSceneConfig(file=Path("no.glb")))
 
 
+def test_modules_of_the_working_directory_are_left_alone(tmp_path, monkeypatch):
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    (tmp_path / "pickle.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(MeshSceneConfig, "load", None)
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert reader.scene(config).name == "room"
+    assert not (tmp_path / "imported").exists()
+
+
+def test_it_reads_where_standard_input_is_closed(tmp_path):
+    program = f"""
+from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.scene.reader import SceneReader
+settings = {MeshSceneConfig.model_validate(room_scene(tmp_path)).model_dump(mode="json")}
+config, MeshSceneConfig.load = MeshSceneConfig.model_validate(settings), None
+with SceneReader({{"scene": settings}}) as reader:
+    assert reader._file.fileno() == 0
+    assert reader.scene(config).name == "room"
+"""
+    command = [sys.executable, "-c", program]
+    subprocess.run(["sh", "-c", 'exec "$@" <&-', "sh", *command], check=True, timeout=120)
+
+
+def test_its_process_ends_with_the_one_that_asks():
+    program = """
+import os, signal
+from neurosim_core.scene.reader import SceneReader
+reader = SceneReader({"scene": "apartment"})
+print(reader._process.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    state = Path("/proc", done.stdout.strip(), "stat")
+    deadline = time.monotonic() + 1.0  # to read the scene takes longer
+    while state.exists() and state.read_text().split()[2] != "Z":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 def test_a_scene_that_nobody_waits_for_is_given_up():
-    with SceneReader("apartment") as reader:
+    with SceneReader({"scene": "apartment"}) as reader:
         process = reader._process
     assert process.returncode is not None
 

@@ -19,6 +19,7 @@ from neurosim_core.sim.trace import (
     Trace,
     make_surfaces,
 )
+from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.status import STATUS_COLLISION
 
 
@@ -157,3 +158,30 @@ def test_who_touches_the_floor_is_marked_and_held_if_asked(device, holds):
     assert fleet.collided.numpy().tolist() == [1, 0, 0], "a touch lasts as long as its batch"
     trace.record(surfaces, fleet, 0, 0, first=True, last=False)
     assert fleet.collided.numpy().tolist() == [int(holds), 0, 0]
+
+
+def test_one_launch_flies_and_records_what_single_ones_do(device):
+    """Bit for bit, also where a vehicle is held from the third of five spans on."""
+    field, _floor = floor_field(device, np.broadcast_to(0.5 * np.arange(4, dtype=np.float32), (4, 4, 4)))
+    surfaces, found = surfaces_of(field, device, 2, holds=True), []
+    for joined in (False, True):
+        vehicle = Multirotor(preset("hummingbird"), count=2, device=device)
+        vehicle.reset(position=[[0.0, 0.0, 0.6], [0.0, 0.0, 0.2025]], velocity=[0.0, 0.0, -1.0])
+        fleet = fleet_of(np.zeros((2, 3)), device, clock_ns=[7, 9])
+        for name in set(Fleet.vars) & set(vars(vehicle.arrays)):
+            setattr(fleet, name, getattr(vehicle.arrays, name))
+        trace = Trace(capacity=6, world_count=2, rotor_count=4, device=device)
+        if joined:
+            trace.fly(vehicle, surfaces, fleet, 1, 0, 1_000_000, 5, first=True, last=True)
+        for step in () if joined else range(5):
+            vehicle.advance(1_000_000)
+            elapsed_ns = 1_000_000 * (step + 1)
+            trace.record(surfaces, fleet, 1 + step, elapsed_ns, first=step == 0, last=step == 4)
+        arrays = (trace.states, trace.status, trace.stamps, trace.clearance, fleet.clock_ns, fleet.collided)
+        found.append([array.numpy() for array in arrays])
+    for single, one in zip(*found, strict=True):
+        np.testing.assert_array_equal(single, one)
+    states, status, stamps, _, clock_ns, _ = found[1]
+    assert status[:, 1].tolist() == [0, 0, 0, 0, *2 * [int(STATUS_COLLISION)]], "noted before it is held"
+    assert len(np.unique(states[1:, 0, 2])) == 5
+    assert stamps[5].tolist() == clock_ns.tolist() == [5_000_007, 5_000_009]

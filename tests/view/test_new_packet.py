@@ -290,7 +290,7 @@ def test_it_is_drawn_in_the_overview(tmp_path):
     save_overview(tmp_path / "o.png", summary, scene=room)
     with PIL.Image.open(tmp_path / "o.png") as image:
         found = np.asarray(image.convert("RGB"))
-    assert found.shape == (900 + 2 * 396, 1600, 3)
+    assert found.shape == (900 + 2 * 400, 1600, 3)
     for row in range(4):
         for x in (40, 520):
             panel = found[124 + 396 * row : 436 + 396 * row, x : x + 416]

@@ -149,11 +149,12 @@ class HostilePublisher {
   void take_in() {
     zmq::message_t event;
     while (socket_.recv(event, zmq::recv_flags::dontwait)) {
-      cortex::wire::AttachKey key;
       const auto bytes = cortex::net::bytes(event);
-      if (bytes.empty() || bytes[0] != 1 || !cortex::wire::read_key({bytes.data() + 1, bytes.size() - 1}, key)) continue;
+      if (bytes.empty() || bytes[0] != 1) continue;
+      const cortex::wire::Key key = cortex::wire::read_key({bytes.data() + 1, bytes.size() - 1});
+      if (key.kind != 'A') continue;
       CortexHello hello{};
-      if (key.shared_memory) {
+      if (key.has(cortex::wire::Key::shared_memory)) {
         int fd = -1;
         while ((fd = cortex_accept(listener_)) >= 0) {
           if (cortex_hear(fd, &hello) == 0 && hello.reader == key.reader) break;
@@ -292,7 +293,7 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
     cortex::detail::Link link(context, "ipc://" + directory + "/1.strict", source, type, policy, true, [](zmq::socket_t&) {},
                               counters, complaints);
     std::deque<cortex::detail::Item> queue, held;
-    std::uint64_t accepted = 0;
+    std::uint64_t accepted = 0, begin = 0;
     for (int idle = 0; link.bell_fd() >= 0 && !publisher.done && idle < 500;) {
       const bool none = in_time([&] { return link.drain(queue, 1); });
       publisher.steps.count();
@@ -303,7 +304,8 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
       decoded += !held.empty() && in_time([&] { return look(held.back()); });  // once more: it may have changed
       while (!queue.empty()) {
         ++accepted;
-        const std::uint64_t uncounted = queue.front().sequence + 1 - accepted - counters->lost;
+        if (accepted == 1 && !link.attached()) begin = queue.front().sequence;  // it came before the answer: what was before it is not ours
+        const std::uint64_t uncounted = queue.front().sequence + 1 - begin - accepted - counters->lost;
         expect(uncounted <= counters->rejected, "every message is received, lost or rejected");
         held.push_back(std::move(queue.front()));
         queue.pop_front();
@@ -316,7 +318,8 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
   thread.join();
   std::cout << "publisher: " << publisher.sessions << " sessions, " << taken << " messages, " << decoded << " of " << looks
             << " decoded, " << rejected << " frames rejected" << std::endl;
-  expect(taken > 0 && decoded > 0 && decoded < looks && rejected > 0, "some messages are good, and some are not");
+  const bool are_few = writes < 100'000;  // of which one in 10,000 has a frame rejected
+  expect(taken > 0 && decoded > 0 && decoded < looks && (rejected > 0 || are_few), "some messages are good, and some are not");
 }
 
 // A message that says itself whether it is whole: all its words are its number.

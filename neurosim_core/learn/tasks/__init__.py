@@ -1,5 +1,5 @@
 """The tasks that come with the simulator; importing this registers them."""
 
-from neurosim_core.learn.tasks import avoid, dodge, gates, hover, hover_paper, throw_recover
+from neurosim_core.learn.tasks import avoid, dodge, gates, hover
 
-__all__ = ["avoid", "dodge", "gates", "hover", "hover_paper", "throw_recover"]
+__all__ = ["avoid", "dodge", "gates", "hover"]

@@ -13,11 +13,8 @@ def hall_settings(
 ) -> dict[str, Any]:
     """Return settings of a hall as a scene.
 
-    Args:
-        size_m: Length, width and height [m].
-        boxes: Middle [m], size [m] and yaw [rad] of each, in W, [n, 7].
-        seed: Of its textures.
-        inside_m: A free point [m].
+    `size_m`: length, width and height [m]. `boxes`: middle [m], size [m] and yaw [rad] of each, in W, [n, 7].
+    `inside_m`: a free point [m].
     """
     rows = np.asarray(boxes, dtype=np.float64).tolist()
     settings = [{"position_m": row[:3], "size_m": row[3:6], "yaw_rad": row[6]} for row in rows]

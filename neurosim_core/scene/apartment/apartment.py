@@ -53,28 +53,12 @@ def make_apartment(config: ApartmentConfig) -> Scene:
     World frame: the middle of the flat is the origin, its floor is z = 0. Objects are named `sofa_1`,
     `floor_2` and so on; without `ceiling_*` and `roof_1` one looks into the flat from above.
     """
-    plan = make_floor_plan(
-        seed=config.seed,
-        rooms=config.rooms,
-        door_width_m=config.door_width_m,
-        door_height_m=config.door_height_m,
-        ceiling_m=config.ceiling_m,
-    )
-    palette = Palette(config.seed)
+    plan, palette = make_floor_plan(config), Palette(config.seed)
     finishes = [palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)]
-    pieces = make_shell(plan, finishes, palette.common, ceiling_m=config.ceiling_m)
+    pieces = make_shell(plan, finishes, palette.common, config)
     points = []
-    for index, room in enumerate(plan.rooms):
-        furnisher = Furnisher(
-            room,
-            index,
-            palette,
-            finishes[index],
-            seed=config.seed,
-            density=config.furniture,
-            ceiling_m=config.ceiling_m,
-        )
-        space = furnisher.furnish()
+    for index, (room, finish) in enumerate(zip(plan.rooms, finishes, strict=True)):
+        space = Furnisher(room, index, palette, finish, config).furnish()
         pieces.extend(space.pieces)
         points.append(space.roomiest(_FLIGHT_HEIGHT_M))
     name = f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}"
@@ -89,16 +73,16 @@ def assemble(
     instances: list[str] = []
     surfaces: dict[Surface, int] = {}
     parts: list[Part] = []
-    face_material, face_instance = [], []
+    face_material: list[int] = []
+    face_instance: list[int] = []
     for piece in pieces:
         counts[piece.kind] = counts.get(piece.kind, 0) + 1
         for part, surface in piece.parts:
             # Shifts of textures differ from part to part (additive recurrence of the plastic number).
             shift = np.array([0.7548776662, 0.5698402910]) * len(parts) % 1.0
             parts.append(replace(part, uv=part.uv / surface.tile_m + (0.0 if surface.exact else shift)))
-            material = surfaces.setdefault(surface, len(surfaces))
-            face_material.append(np.full(len(part.faces), material, np.int32))
-            face_instance.append(np.full(len(part.faces), len(instances), np.int32))
+            face_material += [surfaces.setdefault(surface, len(surfaces))] * len(part.faces)
+            face_instance += [len(instances)] * len(part.faces)
         instances.append(f"{piece.kind}_{counts[piece.kind]}")
     keys = {surface.texture for surface in surfaces if surface.texture is not None}
     textures = {key: Texture(name=key, srgb=partial(palette.paint, key)) for key in keys}
@@ -109,8 +93,8 @@ def assemble(
         faces=whole.faces.astype(np.int32),
         normals=whole.normals.astype(np.float32),
         uv=whole.uv.astype(np.float32),
-        face_material=np.concatenate(face_material),
-        face_instance=np.concatenate(face_instance),
+        face_material=np.array(face_material, np.int32),
+        face_instance=np.array(face_instance, np.int32),
         instance_names=tuple(instances),
         materials=tuple(
             Material(

@@ -6,11 +6,15 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from neurosim_core.scene.apartment.draws import stream
+from neurosim_core.tables import read_table
+
+if TYPE_CHECKING:
+    from neurosim_core.scene.apartment.apartment import ApartmentConfig
 
 Role = Literal["studio", "living", "kitchen", "bedroom", "study", "bathroom", "dining"]
 
@@ -25,28 +29,7 @@ _OPEN_PLAN = ({"living", "kitchen"}, {"living", "dining"}, {"kitchen", "dining"}
 """Rooms with a wider doorway between them."""
 
 
-class _Size(NamedTuple):
-    """What a kind of room needs."""
-
-    area_m2: float
-    side_min_m: float
-    sill_m: float = 0.85
-    window_m: float = 1.35
-
-
-_SIZES: dict[Role, _Size] = {
-    "studio": _Size(38.0, 5.0, 0.55, 1.9),
-    "living": _Size(27.0, 4.2, 0.45, 1.9),
-    "kitchen": _Size(14.5, 3.0, 1.15),
-    "bedroom": _Size(16.0, 3.3),
-    "study": _Size(12.5, 2.8),
-    "bathroom": _Size(8.5, 2.2, 1.35, 0.8),
-    "dining": _Size(15.0, 3.2),
-}
-
-
-@dataclass(frozen=True)
-class Rect:
+class Rect(NamedTuple):
     """An axis-aligned rectangle [m]."""
 
     x0: float
@@ -72,14 +55,6 @@ class Rect:
     def grown(self, margin_m: float) -> Rect:
         """Return the rectangle with `margin_m` added on every side."""
         return Rect(self.x0 - margin_m, self.y0 - margin_m, self.x1 + margin_m, self.y1 + margin_m)
-
-    def overlaps(self, other: Rect) -> bool:
-        """Return whether the two share an area."""
-        return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
-
-    def contains(self, other: Rect) -> bool:
-        """Return whether `other` lies inside."""
-        return self.x0 <= other.x0 and self.y0 <= other.y0 and self.x1 >= other.x1 and self.y1 >= other.y1
 
 
 @dataclass(frozen=True)
@@ -112,11 +87,6 @@ class Wall:
         """Return where x along the wall and `out` in front of it is on the floor of the world [m]."""
         c, s = round(math.cos(self.yaw_rad)), round(math.sin(self.yaw_rad))
         return self.origin[0] + c * x + s * out, self.origin[1] + s * x - c * out
-
-    def rect(self, x0: float, x1: float, depth_m: float) -> Rect:
-        """Return the floor in front of the wall between x0 and x1, in the world."""
-        xs, ys = zip(self.point(x0, 0.0), self.point(x1, depth_m), strict=True)
-        return Rect(min(xs), min(ys), max(xs), max(ys))
 
 
 @dataclass(frozen=True)
@@ -153,28 +123,26 @@ class FloorPlan:
     """Everything inside the outer walls, plus half of an inner wall's thickness."""
     rooms: tuple[Room, ...]
     doors: tuple[Door, ...]
-    door_height_m: float
 
 
-def make_floor_plan(
-    *, seed: int, rooms: int, door_width_m: float, door_height_m: float, ceiling_m: float
-) -> FloorPlan:
-    """Lay out a flat of 1 to 8 rooms that are all connected by doors.
+def make_floor_plan(config: ApartmentConfig) -> FloorPlan:
+    """Lay out a flat whose rooms are all connected by doors.
 
     Of many random subdivisions of a rectangle the one with the best proportions is taken.
     """
+    seed, rooms, sizes = config.seed, config.rooms, read_table(__file__, "plan")
     roles = _MANY[:rooms] if rooms > 2 else (("studio",), ("living", "bedroom"))[rooms - 1]
     best: tuple[float, list[Rect], list[Door], Rect] | None = None
     for attempt in range(400):
         rng = stream(seed, "plan", rooms, attempt)
-        areas = [_SIZES[role].area_m2 * rng.uniform(0.9, 1.15) for role in roles]
+        areas = [sizes[role]["area_m2"] * rng.uniform(0.9, 1.15) for role in roles]
         aspect = rng.uniform(1.15, 1.6) if rooms > 1 else rng.uniform(1.2, 1.5)
         width = round(math.sqrt(sum(areas) * aspect), 2)
         depth = round(sum(areas) / width, 2)
         outline = Rect(-width / 2.0, -depth / 2.0, width / 2.0, depth / 2.0)
         placed = dict(_subdivide(outline, [int(k) for k in rng.permutation(rooms)], areas, rng))
         cells = [placed[index] for index in range(rooms)]
-        doors = _doors(cells, roles, door_width_m, rng)
+        doors = _doors(cells, roles, config.door_width_m, rng)
         if doors is None:
             continue
         badness = _badness(cells, roles, outline) + 0.05 * rng.uniform()
@@ -187,11 +155,9 @@ def make_floor_plan(
     built = []
     for index, (role, cell) in enumerate(zip(roles, cells, strict=True)):
         name = f"{role}_{1 + roles[:index].count(role)}"
-        walls = _walls(
-            index, role, cell, doors, outline, stream(seed, "windows", name), door_height_m, ceiling_m
-        )
+        walls = _walls(index, role, cell, doors, outline, stream(seed, "windows", name), config)
         built.append(Room(name, role, cell.grown(-0.5 * WALL_M), tuple(walls)))
-    return FloorPlan(outline, tuple(built), tuple(doors), door_height_m)
+    return FloorPlan(outline, tuple(built), tuple(doors))
 
 
 def _subdivide(
@@ -205,12 +171,10 @@ def _subdivide(
     weight = np.array([math.exp(-6.0 * abs(share - 0.5)) for share in shares])
     cut = 1 + int(rng.choice(len(shares), p=weight / weight.sum()))
     share = shares[cut - 1]
-    if (rect.width > rect.depth) == (rng.uniform() < 0.9):
-        at = round(rect.x0 + share * rect.width, 2)
-        first, second = Rect(rect.x0, rect.y0, at, rect.y1), Rect(at, rect.y0, rect.x1, rect.y1)
-    else:
-        at = round(rect.y0 + share * rect.depth, 2)
-        first, second = Rect(rect.x0, rect.y0, rect.x1, at), Rect(rect.x0, at, rect.x1, rect.y1)
+    axis = "x" if (rect.width > rect.depth) == (rng.uniform() < 0.9) else "y"
+    low, size = (rect.x0, rect.width) if axis == "x" else (rect.y0, rect.depth)
+    at = round(low + share * size, 2)
+    first, second = rect._replace(**{f"{axis}1": at}), rect._replace(**{f"{axis}0": at})
     return _subdivide(first, order[:cut], areas, rng) + _subdivide(second, order[cut:], areas, rng)
 
 
@@ -219,8 +183,9 @@ def _badness(cells: Sequence[Rect], roles: Sequence[Role], outline: Rect) -> flo
     badness = 0.0
     for cell, role in zip(cells, roles, strict=True):
         short, long = sorted((cell.width - WALL_M, cell.depth - WALL_M))
-        badness += 4.0 * max(0.0, _SIZES[role].side_min_m - short) + max(0.0, long / short - 1.6)
-        badness += 0.6 * outline.grown(-0.01).contains(cell)
+        side_min_m = read_table(__file__, "plan")[role]["side_min_m"]
+        badness += 4.0 * max(0.0, side_min_m - short) + max(0.0, long / short - 1.6)
+        badness += 0.6 * all(own != outer for own, outer in zip(cell, outline, strict=True))
     return badness
 
 
@@ -232,14 +197,12 @@ def _doors(
     margin = 0.5 * WALL_M + _CORNER_M
     for first, second in itertools.combinations(range(len(cells)), 2):
         a, b = cells[first], cells[second]
-        if a.x1 == b.x0 or a.x0 == b.x1:
-            axis, at, lower_first = "x", (a.x1 if a.x1 == b.x0 else a.x0), a.x1 == b.x0
-            low, high = max(a.y0, b.y0), min(a.y1, b.y1)
-        elif a.y1 == b.y0 or a.y0 == b.y1:
-            axis, at, lower_first = "y", (a.y1 if a.y1 == b.y0 else a.y0), a.y1 == b.y0
-            low, high = max(a.x0, b.x0), min(a.x1, b.x1)
-        else:
+        axis = next((axis for axis in (0, 1) if a[axis + 2] == b[axis] or a[axis] == b[axis + 2]), None)
+        if axis is None:
             continue
+        lower_first, across = a[axis + 2] == b[axis], 1 - axis
+        at = b[axis] if lower_first else a[axis]
+        low, high = max(a[across], b[across]), min(a[across + 2], b[across + 2])
         pair, clear = {roles[first], roles[second]}, high - low - 2.0 * margin
         wider = min(1.7 * door_width_m, max(door_width_m, clear - 0.4))
         width = wider if pair in _OPEN_PLAN else door_width_m
@@ -249,7 +212,7 @@ def _doors(
         cost = float(rng.uniform()) - 1.0 * ("living" in pair) + 1.5 * ("bathroom" in pair)
         cost -= 2.0 * (width > door_width_m)
         sides = (first, second) if lower_first else (second, first)
-        candidates.append((cost, Door(sides, "x" if axis == "x" else "y", at, start, start + width)))
+        candidates.append((cost, Door(sides, "y" if axis else "x", at, start, start + width)))
     group = list(range(len(cells)))
     doors: list[Door] = []
     spare: list[Door] = []
@@ -270,8 +233,7 @@ def _walls(
     doors: Sequence[Door],
     outline: Rect,
     rng: np.random.Generator,
-    door_height_m: float,
-    ceiling_m: float,
+    config: ApartmentConfig,
 ) -> list[Wall]:
     """Return the four walls of a room with doors, and windows in the longest outer ones."""
     rect = cell.grown(-0.5 * WALL_M)
@@ -290,9 +252,9 @@ def _walls(
         for door in doors:
             if (door.axis, door.at_m, door.rooms[side]) == (axis, at, index):
                 x0, x1 = sorted(abs(value - start) for value in (door.low_m, door.high_m))
-                openings.append(Opening("door", x0, x1, 0.0, door_height_m))
+                openings.append(Opening("door", x0, x1, 0.0, config.door_height_m))
         if wall in lit:
-            openings += _windows(role, wall.length_m, ceiling_m, rng)
+            openings += _windows(role, wall.length_m, config.ceiling_m, rng)
         openings.sort(key=lambda opening: opening.x0)
         walls.append(Wall(wall.origin, wall.yaw_rad, wall.length_m, tuple(openings)))
     return walls
@@ -300,10 +262,11 @@ def _walls(
 
 def _windows(role: Role, length_m: float, ceiling_m: float, rng: np.random.Generator) -> list[Opening]:
     """Return windows in an outer wall, evenly spread."""
-    width = _SIZES[role].window_m + rng.uniform(-0.1, 0.15)
+    size = {"sill_m": 0.85, "window_m": 1.35} | read_table(__file__, "plan")[role]
+    width = size["window_m"] + rng.uniform(-0.1, 0.15)
     count = 1 if length_m < 2.0 * width + 2.2 else 2
     if role == "bathroom" or length_m < width + 1.0:
         count = min(count, int(length_m > width + 0.8))
     middles = [length_m / count * (k + 0.5) for k in range(count)]
     top = min(2.3, ceiling_m - 0.25)
-    return [Opening("window", x - 0.5 * width, x + 0.5 * width, _SIZES[role].sill_m, top) for x in middles]
+    return [Opening("window", x - 0.5 * width, x + 0.5 * width, size["sill_m"], top) for x in middles]

@@ -39,39 +39,31 @@ class RoomSpace:
         self._doors: list[Array] = []
         self._windows: list[Array] = []
         self._clearances: list[Array] = []
-        for wall in room.walls:
-            for o in wall.openings:
-                if o.kind == "door":
-                    self._doors.append(
-                        _front_of(wall, o.x0 - 0.14, o.x1 + 0.14, _DOOR_FREE_M, (0.02, ceiling_m))
-                    )
-                else:
-                    above = (o.z0 - 0.05, ceiling_m)
-                    self._windows.append(_front_of(wall, o.x0 - 0.05, o.x1 + 0.05, 0.4, above))
+        for wall, o in ((side, opening) for side in room.walls for opening in side.openings):
+            if o.kind == "door":
+                free = _front_of(wall, o.x0 - 0.14, o.x1 + 0.14, _DOOR_FREE_M, (0.02, ceiling_m))
+                self._doors.append(free)
+            else:
+                above = (o.z0 - 0.05, ceiling_m)
+                self._windows.append(_front_of(wall, o.x0 - 0.05, o.x1 + 0.05, 0.4, above))
 
     def _free(self, boxes: Array, *, group: bool = False, window: bool = False) -> NDArray[np.bool_]:
         """Return for each box whether a body can be there, shape [N].
 
-        A `group` belongs to what asked for clearance, and may stand in it; `window`: it may hide one.
+        A `group` may stand in the clearance that a piece of it asked for; what may hide a `window` says so.
         """
-        rect = self.room.rect
-        inside = (boxes[:, 0, :2] >= (rect.x0, rect.y0)) & (boxes[:, 1, :2] <= (rect.x1, rect.y1))
         grown = boxes + np.array([[-_APART_M, -_APART_M, 0.0], [_APART_M, _APART_M, 0.0]])
         kept = [*self._doors, *([] if window else self._windows), *([] if group else self._clearances)]
-        return inside.all(axis=1) & ~_touches(grown, self._bodies) & ~_touches(boxes, kept)
+        return self._inside(boxes) & ~_touches(grown, self._bodies) & ~_touches(boxes, kept)
 
-    def put(
-        self,
-        piece: Piece,
-        offset: ArrayLike,
-        yaw_rad: float = 0.0,
-        *,
-        group: bool = False,
-        window: bool = False,
-    ) -> bool:
-        """Place a piece at a position in the world if it fits there; see `_free`."""
+    def _inside(self, boxes: Array) -> NDArray[np.bool_]:
+        x0, y0, x1, y1 = self.room.rect
+        return np.asarray(((boxes[:, 0, :2] >= (x0, y0)) & (boxes[:, 1, :2] <= (x1, y1))).all(axis=1))
+
+    def put(self, piece: Piece, offset: ArrayLike, yaw_rad: float = 0.0, **allowed: bool) -> bool:
+        """Place a piece at a position in the world if it fits there; `_free` says what can be allowed."""
         moved = piece.moved(np.add(offset, (0.0, 0.0, _LIFT_M)), yaw_rad)
-        if not self._free(moved.bounds[None], group=group, window=window)[0]:
+        if not self._free(moved.bounds[None], **allowed)[0]:
             return False
         self.pieces.append(moved)
         self._bodies.append(moved.bounds[None])
@@ -86,12 +78,10 @@ class RoomSpace:
         out: float = WALL_GAP_M,
         yaw_rad: float = 0.0,
         lift: float = 0.0,
-        group: bool = False,
-        window: bool = False,
+        **allowed: bool,
     ) -> bool:
         """Place a piece in the frame of a wall, at x along it and `out` in front of it, if it fits there."""
-        offset = (*wall.point(x, out), lift)
-        return self.put(piece, offset, wall.yaw_rad + yaw_rad, group=group, window=window)
+        return self.put(piece, (*wall.point(x, out), lift), wall.yaw_rad + yaw_rad, **allowed)
 
     def hang(self, piece: Piece, wall: Wall, x: float, *, window: bool = False) -> bool:
         """Hang a piece on a wall, 3 mm off it, if it fits there."""
@@ -114,23 +104,18 @@ class RoomSpace:
         one of which it may hide with `window`.
         """
         (x0, y0, z0), (x1, _, z1) = piece.bounds
-        heights = (z0 + _LIFT_M, z1 + _LIFT_M)
+        deep, heights = WALL_GAP_M - y0, (z0 + _LIFT_M, z1 + _LIFT_M)
         best: tuple[float, Wall, float] | None = None
         for index, wall in enumerate(self.room.walls):
             low, high = 0.04 - x0 + sides, wall.length_m - 0.04 - x1 - sides
             if high < low:
                 continue
             x = np.unique(np.concatenate([np.arange(low, high, 0.1), [high, 0.5 * (low + high)]]))
-            fits = self._free(
-                _front_of(wall, x + x0 - sides, x + x1 + sides, WALL_GAP_M - y0, heights), window=window
-            )
-            fits &= self._free(_front_of(wall, x + x0, x + x1, WALL_GAP_M - y0, heights), window=window)
-            ahead = _front_of(wall, x + x0, x + x1, WALL_GAP_M - y0 + front, (0.05, 1.5))
-            floor = self.room.rect
-            fits &= (
-                (ahead[:, 0, :2] >= (floor.x0, floor.y0)) & (ahead[:, 1, :2] <= (floor.x1, floor.y1))
-            ).all(1)
-            fits &= ~_touches(ahead, self._bodies)
+            beside = _front_of(wall, x + x0 - sides, x + x1 + sides, deep, heights)
+            fits = self._free(beside, window=window)
+            fits &= self._free(_front_of(wall, x + x0, x + x1, deep, heights), window=window)
+            ahead = _front_of(wall, x + x0, x + x1, deep + front, (0.05, 1.5))
+            fits &= self._inside(ahead) & ~_touches(ahead, self._bodies)
             for k in np.nonzero(fits)[0]:
                 score = 0.6 * draws.uniform(f"spot {index} {k}") + _liking(prefer, wall, float(x[k]))
                 if best is None or score > best[0]:
@@ -139,16 +124,13 @@ class RoomSpace:
             return None
         _, wall, at = best
         self.put_at_wall(piece, wall, at, window=window)
-        self._clearances.append(_front_of(wall, at + x0, at + x1, WALL_GAP_M - y0 + front, (0.02, 1.9)))
+        self._clearances.append(_front_of(wall, at + x0, at + x1, deep + front, (0.02, 1.9)))
         return wall, at
 
     def open_spot(
         self, bounds: Array, draws: Draws, *, around: float, group: bool = False
     ) -> tuple[float, float] | None:
-        """Return where something has the most central place with `around` of free floor [m], or None.
-
-        Its corners are `bounds` [m], shape [2, 3]; with `group` it may stand in what other pieces want free.
-        """
+        """Return the most central place for `bounds` with `around` of free floor about it [m], or None."""
         rect = self.room.rect
         box = bounds + np.array([[-around, -around, _LIFT_M], [around, around, _LIFT_M]])
         low, high = np.array([rect.x0, rect.y0]) - box[0, :2], np.array([rect.x1, rect.y1]) - box[1, :2]
@@ -165,8 +147,9 @@ class RoomSpace:
     def roomiest(self, height_m: float) -> tuple[float, tuple[float, float, float]]:
         """Return the point at a height that is furthest from walls and bodies, after that distance [m]."""
         rect = self.room.rect
-        xs, ys = np.arange(rect.x0 + 0.2, rect.x1 - 0.2, 0.1), np.arange(rect.y0 + 0.2, rect.y1 - 0.2, 0.1)
-        x, y = (grid.reshape(-1) for grid in np.meshgrid(xs, ys))
+        spans = ((rect.x0, rect.x1), (rect.y0, rect.y1))
+        axes = (np.arange(low + 0.2, high - 0.2, 0.1) for low, high in spans)
+        x, y = (grid.reshape(-1) for grid in np.meshgrid(*axes))
         points = np.stack([x, y, np.full_like(x, height_m)], axis=1)
         clear = np.minimum.reduce([x - rect.x0, rect.x1 - x, y - rect.y0, rect.y1 - y])
         for body in self._bodies:
@@ -178,9 +161,8 @@ class RoomSpace:
 
 def _front_of(wall: Wall, x0: ArrayLike, x1: ArrayLike, depth: float, heights: tuple[float, float]) -> Array:
     """Return boxes in front of a wall, from x0 to x1 along it [m], shape [N, 2, 3]."""
-    ends = np.stack(
-        [np.stack(wall.point(np.atleast_1d(x0), 0.0)), np.stack(wall.point(np.atleast_1d(x1), depth))]
-    )
+    corners = wall.point(np.atleast_1d(x0), 0.0), wall.point(np.atleast_1d(x1), depth)
+    ends = np.array([np.stack(corner) for corner in corners])
     boxes = np.empty((ends.shape[2], 2, 3))
     boxes[:, 0, :2], boxes[:, 1, :2] = ends.min(axis=0).T, ends.max(axis=0).T
     boxes[:, :, 2] = heights

@@ -25,7 +25,7 @@ class Surface:
     """Albedo, or what the texture is multiplied with."""
     texture: str | None = None
     """Key of the texture; see `Palette.paint`."""
-    tile_m: tuple[float, float] = (1.0, 1.0)
+    tile_m: tuple[float, ...] = (1.0, 1.0)
     """Size of one repetition of the texture along u and v [m]."""
     emission: LinearRgb = (0.0, 0.0, 0.0)
     exact: bool = False
@@ -50,10 +50,10 @@ def _surface(
     name: str, *, color: str = "#ffffff", texture: str | None = None, tile: float = 1.0, **more: Any
 ) -> Surface:
     """Return a surface of an sRGB colour over a nearly white texture."""
+    more = {key: tuple(value) if isinstance(value, list) else value for key, value in more.items()}
     code = textures.rgb(color).astype(np.float64)
     light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    more = {key: tuple(value) if isinstance(value, list) else value for key, value in more.items()}
-    r, g, b = (float(value) for value in light)
+    r, g, b = light.tolist()
     return Surface(name=name, color=(r, g, b), texture=texture, tile_m=(tile, tile), **more)
 
 
@@ -73,28 +73,26 @@ class Palette:
         }
 
     def paint(self, key: str) -> NDArray[np.uint8]:
-        """Return the texture of a surface's key."""
+        """Return the texture of a surface's key, 8-bit sRGB."""
         rng = stream(self._seed, "texture", key)
         formula, variables = self._formulas[key]
         u, v = textures.texel_grid()
         painters = {painter.__name__: functools.partial(painter, rng) for painter in _PAINTERS}
         scope = {**_FUNCTIONS, **painters, "u": u, "v": v, "scheme": self._scheme, **variables}
-        return textures.quantize(eval(formula, scope))
+        return np.asarray(np.clip(eval(formula, scope) * 255.0 + 0.5, 0.0, 255.0), np.uint8)
 
-    def _painted(self, key: str, formula: str, tile_m: tuple[float, float], **variables: Any) -> Surface:
+    def _painted(self, key: str, formula: str, tile_m: tuple[float, ...], **variables: Any) -> Surface:
         self._formulas[key] = formula, variables
         return Surface(name=key, texture=key, tile_m=tile_m, exact=True)
 
-    def rug(self, index: int, width_m: float, depth_m: float) -> Surface:
-        """Return the pattern of a rug, fitted to its size."""
-        return self._painted(f"rug {index}", 'rug(scheme["prints"])', (width_m, depth_m))
+    def rug(self, index: int, *size_m: float) -> Surface:
+        """Return the pattern of a rug, fitted to its width and depth."""
+        return self._painted(f"rug {index}", 'rug(scheme["prints"])', size_m)
 
-    def poster(self, index: int, width_m: float, height_m: float) -> Surface:
-        """Return a print of its own for each index."""
+    def poster(self, index: int, *size_m: float) -> Surface:
+        """Return a print of its own for each index, fitted to its width and height."""
         kind = index + int(stream(self._seed, "posters").integers(5))
-        return self._painted(
-            f"poster {index}", 'poster(scheme["prints"], kind)', (width_m, height_m), kind=kind
-        )
+        return self._painted(f"poster {index}", 'poster(scheme["prints"], kind)', size_m, kind=kind)
 
     def finish(self, name: str, role: Role, index: int) -> Finish:
         """Return what a room is lined with."""
@@ -107,13 +105,10 @@ class Palette:
             floor = _surface("parquet", texture="chevron", tile=1.4, exact=True)
         if role in ("bedroom", "dining", "living") and rng.uniform() < 0.75:
             kind = str(rng.choice(list(self._table["wallpapers"])))
-            colors = {
-                "ground": rng.choice(self._scheme["walls"]),
-                "motif": rng.choice(self._scheme["accents"]),
-            }
-            tile = (self._table["wallpapers"][kind],) * 2
-            formula = "wallpaper(ground, motif, kind)"
-            accent = self._painted(f"wallpaper {kind} {number}", formula, tile, kind=kind, **colors)
+            ground, motif = (rng.choice(self._scheme[part]) for part in ("walls", "accents"))
+            tile, formula = (self._table["wallpapers"][kind][part] for part in ("tile", "texture"))
+            colors = {"ground": ground, "motif": motif}
+            accent = self._painted(f"wallpaper {kind} {number}", formula, (tile, tile), **colors)
         if role == "bedroom" and rng.uniform() < 0.4:
             color["carpet"] = str(rng.choice(self._table["carpets"]))
             floor = _surface(f"carpet {number}", color=color["carpet"], texture="pile", tile=1.2)

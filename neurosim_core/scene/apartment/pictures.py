@@ -10,9 +10,6 @@ from neurosim_core.scene.apartment.textures import Field, Picture, blend, noise,
 
 SPINE_COLUMNS, SPINE_ROWS = 16, 2
 """Cells of the picture that `spines` paints; the last one is paper."""
-_SPINE_COLORS = (
-    "#7b2d26 #23395b #c9a227 #3d5a45 #e8dcc4 #2b2b2b #a3603a #5b7a8c #8c3b52 #d8cfc0 #44355b #b5482e"
-)
 
 
 def _cover(picture: Picture, inside: Field, color: str) -> Picture:
@@ -118,9 +115,8 @@ def _stems(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
             for side in (-1.0, 1.0):
                 angle = -0.5 * np.pi + side * (0.95 - 0.3 * step) + lean
                 low_x, low_y = (max(0, int((value - size) * 384)) for value in (base_x, base_y))
-                window = np.s_[
-                    low_y : low_y + int(2.0 * size * 384) + 2, low_x : low_x + int(2.0 * size * 384) + 2
-                ]
+                extent = int(2.0 * size * 384) + 2
+                window = np.s_[low_y : low_y + extent, low_x : low_x + extent]
                 dx, dy = x[window] - base_x, y[window] - base_y
                 s = (dx * np.cos(angle) + dy * np.sin(angle)) / size
                 t = (dy * np.cos(angle) - dx * np.sin(angle)) / size
@@ -163,19 +159,16 @@ def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     border = np.minimum(0.5 - x, (0.5 - y) * 0.75)
     band = np.floor(border * 50.0).astype(np.int64)
     teeth = (np.floor(knots_u * 48.0) + np.floor(knots_v * 36.0)).astype(np.int64) % 2
-    index = np.where(
-        border < 0.09, np.where(band % 2 == 0, 0, 1 + teeth * (band % 4 == 1)) % len(colors), index
-    )
-    picture = palette[index]
+    edging = np.where(band % 2 == 0, 0, 1 + teeth * (band % 4 == 1)) % len(colors)
+    picture = palette[np.where(border < 0.09, edging, index)]
     knot = 0.5 + 0.5 * np.cos(2.0 * np.pi * 192.0 * u) * np.cos(2.0 * np.pi * 144.0 * v)
     wear = 0.82 + 0.16 * knot + 0.06 * noise(rng, 0.4) + 0.05 * noise(rng, 1.6)
     return np.asarray(picture * wear[..., None], np.float32)
 
 
-def spines(rng: np.random.Generator) -> Picture:
+def spines(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Backs of books in a grid of cells, each with bands, title bars and worn edges."""
     width, height = 512 // SPINE_COLUMNS, 512 // SPINE_ROWS
-    colors = _SPINE_COLORS.split()
     picture = np.empty((512, 512, 3), np.float32)
     across = np.abs(np.linspace(-1.0, 1.0, width, dtype=np.float32))
     for row in range(SPINE_ROWS):
@@ -230,10 +223,8 @@ def view(rng: np.random.Generator) -> Picture:
             wall = rgb(str(rng.choice(["#b9a58c", "#a8836a", "#c8c0b4", "#8f8d8a", "#b06a52"])))
             block = np.broadcast_to(wall * (1 - haze) + rgb("#dfe9f2") * haze, (512 - top, wide, 3)).copy()
             pitch = 8 + 2 * depth
-            panes = (np.arange(512 - top)[:, None] % pitch > pitch // 2) & (
-                np.arange(wide)[None, :] % pitch > pitch // 2
-            )
-            block[panes] *= 0.72
+            rows, columns = (np.arange(count) % pitch > pitch // 2 for count in (512 - top, wide))
+            block[rows[:, None] & columns] *= 0.72
             visible = min(wide, 512 - left)
             picture[top:, left : left + visible] = block[:, :visible]
             left += wide

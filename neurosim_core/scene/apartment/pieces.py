@@ -56,7 +56,7 @@ class Piece:
         lights = []
         for light in self.lights:
             at = turned(np.array(light.position_m), yaw_rad, axis=2) + np.asarray(offset, float)
-            lights.append(replace(light, position_m=(float(at[0]), float(at[1]), float(at[2]))))
+            lights.append(replace(light, position_m=tuple(at.tolist())))
         parts = [(part.moved(offset, yaw_rad=yaw_rad), surface) for part, surface in self.parts]
         return Piece(self.kind, parts, lights)
 
@@ -68,7 +68,7 @@ class Piece:
 
 
 def make_piece(kind: str, surfaces: Mapping[str, Surface], draws: Draws, **given: Any) -> Piece:
-    """Build a piece of the table; `given` variables replace those of its `let`, or are those it asks for.
+    """Build a piece of the table; what is `given` replaces variables of its `let`, or is what it asks for.
 
     Raises:
         NameError: It asks for a variable that is not given.
@@ -118,13 +118,11 @@ def _solid(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws) -> Piec
         surfaces = {name: value for name, value in scope.items() if isinstance(value, Surface)}
         return make_piece(kind, surfaces, draws.under(kind), **given)
     if kind == "light":
-        r, g, b = (float(value) for value in evaluate(node[kind], scope, draws, kind) * _WARM)
-        return Piece("", lights=[Light(position_m=(0.0, 0.0, 0.0), intensity=(r, g, b))])
+        intensity = tuple((evaluate(node[kind], scope, draws, kind) * _WARM).tolist())
+        return Piece("", lights=[Light(position_m=(0.0, 0.0, 0.0), intensity=intensity)])
     if kind == "sheet":
-        columns, rows = (
-            np.linspace(0.0, 1.0, count + 1) for count in evaluate(node["steps"], scope, draws, "steps")
-        )
-        scope["u"], scope["v"] = np.meshgrid(columns, rows)
+        steps = evaluate(node["steps"], scope, draws, "steps")
+        scope["u"], scope["v"] = np.meshgrid(*(np.linspace(0.0, 1.0, count + 1) for count in steps))
     options = {key: evaluate(data, scope, draws, key) for key, data in node.items() if key not in _KEYS}
     return Piece("", parts=[(_SOLIDS[kind](options.pop(kind), **options), scope["of"])])
 
@@ -176,12 +174,10 @@ def _book(size: Sequence[float], *, cell: int) -> Part:
 
 def _sheet(points: Sequence[ArrayLike], *, steps: Sequence[int], uv: Sequence[ArrayLike]) -> Part:
     """A smooth sheet: x, y, z and uv as functions of u and v in [0, 1], in `steps` along u and v."""
-    rows, columns = steps[1] + 1, steps[0] + 1
+    shape = steps[1] + 1, steps[0] + 1
 
     def stacked(values: Sequence[ArrayLike]) -> Array:
-        return np.stack(
-            [np.broadcast_to(np.asarray(value, float), (rows, columns)) for value in values], axis=-1
-        )
+        return np.stack([np.broadcast_to(np.asarray(value, float), shape) for value in values], axis=-1)
 
     return solids.grid_surface(stacked(points), stacked(uv))
 

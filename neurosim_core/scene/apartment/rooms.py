@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurosim_core.scene.apartment.draws import Draws
 from neurosim_core.scene.apartment.floorplan import Room, Wall
@@ -14,6 +14,9 @@ from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
 from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
 from neurosim_core.tables import read_table
+
+if TYPE_CHECKING:
+    from neurosim_core.scene.apartment.apartment import ApartmentConfig
 
 _PLACE = ("front", "sides", "window")
 
@@ -25,24 +28,14 @@ class Furnisher:
     """
 
     def __init__(
-        self,
-        room: Room,
-        index: int,
-        palette: Palette,
-        finish: Finish,
-        *,
-        seed: int,
-        density: float,
-        ceiling_m: float,
+        self, room: Room, index: int, palette: Palette, finish: Finish, config: ApartmentConfig
     ) -> None:
-        """Take an empty room; `density` is the share of the optional things that are there, 0 to 1."""
-        self._room = room
-        self._space = RoomSpace(room, ceiling_m)
-        self._all_draws = self._draws = Draws(seed, room.name)
-        self._palette = palette
+        """Take an empty room, of this number in the plan."""
+        self._room, self._index, self._palette = room, index, palette
+        self._space = RoomSpace(room, config.ceiling_m)
+        self._all_draws = self._draws = Draws(config.seed, room.name)
         self._surfaces = palette.look(room.name) | {"splash": finish.splash}
-        self._index = index
-        self._density = density
+        self._density = config.furniture
         self._prints = 0
 
     def furnish(self) -> RoomSpace:
@@ -50,10 +43,8 @@ class Furnisher:
         for number, step in enumerate(read_table(__file__, "rooms")[self._room.role]):
             ((method, options),) = step.items()
             self._do(f"{method} {number}", method, **options)
-        self._draws = self._all_draws.under("windows")
-        self._dress_windows()
-        self._draws = self._all_draws.under("pictures")
-        self._hang_pictures()
+        self._do("windows", "_dress_windows")
+        self._do("pictures", "_hang_pictures")
         for k in range(2):
             self._do(f"plant {k}", "along_wall", kind="plant", chance=0.75, front=0.05, prefer="corner")
         return self._space
@@ -89,9 +80,7 @@ class Furnisher:
     ) -> None:
         """Place `count` pieces along the walls, each in the first way that fits, with what belongs to them.
 
-        `tries` are variables of the piece and requirements of its place, the best first, and `options` what
-        they have in common (`with`: variables). Each stands `beside` the one before, if it fits there [m].
-        `pictures` is the chance of pictures above it; what stands `around` it: see `rooms.yaml`.
+        `rooms.yaml` documents the options; those that are not named here hold for all `tries`.
         """
         common = evaluate(options.pop("with", {}), dict(FUNCTIONS), self._draws, "with")
         spot: tuple[Wall, float] | None = None
@@ -120,6 +109,7 @@ class Furnisher:
         variables: dict[str, Any],
         around: Sequence[dict[str, Any]],
     ) -> None:
+        """Place what stands around a piece, in the frame of its wall."""
         (_, front, _), (half, _, top) = (corner.tolist() for corner in piece.bounds)
         scope = FUNCTIONS | variables | {"half": half, "deep": -front, "top": top, "edge": out - front}
         for number, data in enumerate(around):
@@ -161,19 +151,17 @@ class Furnisher:
         space, draws = self._space, self._draws
         turn = 0.0 if self._room.rect.width >= self._room.rect.depth else 0.5 * math.pi
         for count, around in ((draws.pick("seats", seats), 0.45), (4, 0.4), (4, 0.15), (2, 0.15)):
-            name = (count, around)
-            if count == 2 or (count == 4 and draws.chance(f"round {name}", 0.4)):
-                table = self._make("round_table", r=0.5 if count == 2 else 0.58)
-            else:
-                table = self._make("table", w=0.4 + 0.33 * count)
+            name = count, around
+            circular = count == 2 or (count == 4 and draws.chance(f"round {name}", 0.4))
+            size = {"r": 0.5 if count == 2 else 0.58} if circular else {"w": 0.4 + 0.33 * count}
+            table = self._make("round_table" if circular else "table", **size)
             table = table.moved((0.0, -0.5 * table.bounds[:, 1].sum(), 0.0))
             group = [(table, 0.0, 0.0, 0.0)]
             chair = self._make("chair")
             for side, k in itertools.product((-1.0, 1.0), range(count // 2)):
                 # The front of a chair is 0.46 m before its back, and looks at the table.
-                yaw = (0.0 if side > 0.0 else math.pi) + draws.uniform(
-                    f"chair {name} {side} {k}", -0.12, 0.12
-                )
+                turned = draws.uniform(f"chair {name} {side} {k}", -0.12, 0.12)
+                yaw = (0.0 if side > 0.0 else math.pi) + turned
                 at = 0.62 * (k - 0.5 * (count // 2 - 1))
                 group.append((chair, at, side * (float(table.bounds[1, 1]) + 0.56), yaw))
             whole = Piece("group")
@@ -202,19 +190,16 @@ class Furnisher:
         if spot:
             self._space.put(rug, (*spot, 0.0), turn, group=True)
 
-    def main_lamps(self, strength: float) -> None:
+    def main_lamps(self, strength: float, kind: str = "") -> None:
         """One lamp in the middle of the ceiling, two in a long room."""
         rect, ceiling = self._room.rect, self._space.ceiling_m
-        kind = self._draws.pick("kind", ("pendant", "ceiling_lamp"))
-        if self._room.role in ("bathroom", "kitchen"):
-            kind = "spots"
+        kind = kind or self._draws.pick("kind", ("pendant", "ceiling_lamp"))
         given = {"low": ceiling - 0.55} if kind == "pendant" else {}
         count = 2 if rect.width * rect.depth > 21.0 else 1
         for k in range(count):
             share = (k + 0.5) / count
-            along_x = rect.width >= rect.depth
-            x = rect.x0 + rect.width * (share if along_x else 0.5)
-            y = rect.y0 + rect.depth * (0.5 if along_x else share)
+            shares = (share, 0.5) if rect.width >= rect.depth else (0.5, share)
+            x, y = rect.x0 + rect.width * shares[0], rect.y0 + rect.depth * shares[1]
             lamp = self._make(kind, c=ceiling, strength=strength, **given)
             for dx, dy in ((0.0, 0.0), (0.4, 0.4), (-0.4, 0.4), (0.4, -0.4), (-0.4, -0.4)):
                 if self._space.put(lamp, (x + dx, y + dy, -0.002), group=True):
@@ -226,9 +211,8 @@ class Furnisher:
         for index, wall in enumerate(self._room.walls):
             for k, o in enumerate(o for o in wall.openings if o.kind == "window"):
                 x, width = 0.5 * (o.x0 + o.x1), o.x1 - o.x0
-                if self._room.role not in ("kitchen", "bathroom") and self._wants(
-                    f"curtain {index} {k}", 0.8
-                ):
+                dry = self._room.role not in ("kitchen", "bathroom")
+                if dry and self._wants(f"curtain {index} {k}", 0.8):
                     self._curtains(wall, x, width, o.z0, o.z1 + 0.12, fabric=fabric)
                 if o.z0 > 0.75:
                     self._space.hang(self._make("radiator", w=width - 0.2), wall, x, window=True)
@@ -248,19 +232,16 @@ class Furnisher:
     def _pictures_above(self, wall: Wall, x: float) -> None:
         """Two or three prints in a row above a piece of furniture."""
         count = self._draws.pick("prints", (2, 3))
+        w, h = (0.6, 0.8) if count == 2 else (0.45, 0.6)
         for k in range(count):
-            w, h = (0.6, 0.8) if count == 2 else (0.45, 0.6)
-            picture = self._make("picture", w=w, h=h)
-            self._space.hang(picture, wall, x + 0.74 * (k - 0.5 * (count - 1)))
+            self._space.hang(self._make("picture", w=w, h=h), wall, x + 0.74 * (k - 0.5 * (count - 1)))
 
     def _hang_pictures(self) -> None:
         """Prints on free stretches of wall, above whatever stands there."""
         formats = ((0.6, 0.8), (0.45, 0.6), (0.75, 1.0), (0.36, 0.48))
         for index, wall in enumerate(self._room.walls):
             hung = 0
-            for share in (0.5, 0.32, 0.68, 0.16, 0.84):
-                name = f"{index} {share}"
+            for name, share in ((f"{index} {share}", share) for share in (0.5, 0.32, 0.68, 0.16, 0.84)):
                 if hung < 2 and self._wants(f"wanted {name}", 0.7):
                     w, h = self._draws.pick(f"format {name}", formats)
-                    picture = self._make("picture", w=w, h=h)
-                    hung += self._space.hang(picture, wall, share * wall.length_m)
+                    hung += self._space.hang(self._make("picture", w=w, h=h), wall, share * wall.length_m)

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,28 +16,33 @@ from neurosim_core.scene.apartment.looks import Finish, Surface
 from neurosim_core.scene.apartment.pieces import Piece, make_piece
 from neurosim_core.scene.solids import Part, box, merge, quad
 
+if TYPE_CHECKING:
+    from neurosim_core.scene.apartment.apartment import ApartmentConfig
+
 _CASING_M = 0.0375
 """How far the middle of a door's casing is from the doorway."""
 _NO_DRAWS = Draws()
 
 
 def make_shell(
-    plan: FloorPlan, finishes: Sequence[Finish], surfaces: Mapping[str, Surface], *, ceiling_m: float
+    plan: FloorPlan, finishes: Sequence[Finish], surfaces: Mapping[str, Surface], config: ApartmentConfig
 ) -> list[Piece]:
     """Build every room of the plan, where it stands, of the surfaces that each is lined with.
 
     Ceilings are pieces `ceiling` and the top is `roof`, so that they can be left out of a picture from above;
     the walls have tops just below the roof.
+
+    `finishes` is what each room is lined with; `surfaces` are those of all else, by name.
     """
     pieces = []
     for room, finish in zip(plan.rooms, finishes, strict=True):
-        pieces += _room(room, finish, surfaces, ceiling_m)
+        pieces += _room(room, finish, surfaces, config.ceiling_m)
     for door in plan.doors:
         width, along_x = door.high_m - door.low_m, door.axis == "y"
-        way = make_piece("doorway", surfaces, _NO_DRAWS, w=width, h=plan.door_height_m, t=WALL_M)
+        way = make_piece("doorway", surfaces, _NO_DRAWS, w=width, h=config.door_height_m, t=WALL_M)
         offset = (door.low_m, door.at_m, 0.0) if along_x else (door.at_m, door.low_m, 0.0)
         pieces.append(way.moved(offset, 0.0 if along_x else 0.5 * math.pi))
-    return pieces + _outside(plan, surfaces, ceiling_m)
+    return pieces + _outside(plan, surfaces, config.ceiling_m)
 
 
 def _room(room: Room, finish: Finish, surfaces: Mapping[str, Surface], ceiling_m: float) -> list[Piece]:
@@ -91,8 +97,7 @@ def _outside(plan: FloorPlan, surfaces: Mapping[str, Surface], ceiling_m: float)
     ys = sorted({outer.y0, outer.y1, *(y for rect in rects for y in (rect.y0, rect.y1))})
     tops = Piece("wall_top")
     for (x0, x1), (y0, y1) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys)):
-        x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-        if not any(rect.x0 < x < rect.x1 and rect.y0 < y < rect.y1 for rect in rects):
+        if not any(rect.x0 <= x0 < rect.x1 and rect.y0 <= y0 < rect.y1 for rect in rects):
             top = quad((x0, y0, ceiling_m), (x1 - x0, 0, 0), (0, y1 - y0, 0))
             tops.parts.append((top, surfaces["cut_wall"]))
     return [*pieces, tops]

@@ -23,11 +23,7 @@ def rgb(color: str) -> NDArray[np.float32]:
 
 
 def noise(
-    rng: np.random.Generator,
-    slope: float = 1.0,
-    *,
-    stretch: float = 1.0,
-    coarsest: float = 1.0,
+    rng: np.random.Generator, slope: float = 1.0, *, stretch: float = 1.0, coarsest: float = 1.0
 ) -> Field:
     """Return tileable noise of mean 0 and standard deviation 1 whose amplitude falls as frequency^-slope.
 
@@ -47,11 +43,6 @@ def blend(low: str | Picture, high: str | Picture, share: NDArray[np.floating[An
     """Return the way from colour (or picture) `low` to `high` by a share that is clipped to [0, 1]."""
     first, last = (rgb(color) if isinstance(color, str) else color for color in (low, high))
     return np.asarray(first + (last - first) * np.clip(share, 0.0, 1.0)[..., None], np.float32)
-
-
-def quantize(picture: Picture) -> NDArray[np.uint8]:
-    """Return 8-bit sRGB."""
-    return np.asarray(np.clip(picture * 255.0 + 0.5, 0.0, 255.0), np.uint8)
 
 
 def texel_grid(width: int = SIZE_PX, height: int = SIZE_PX) -> tuple[Field, Field]:
@@ -127,11 +118,9 @@ def tiles(
     row = np.floor(v * rows).astype(np.int64)
     shifted = u + (0.5 / columns * (row % 2)).astype(np.float32) * bond
     column = np.floor(shifted * columns).astype(np.int64) % columns
-    mixed = (
-        (row + column) % len(colors)
-        if checker
-        else rng.integers(0, len(colors), (rows, columns))[row, column]
-    )
+    mixed = (row + column) % len(colors)
+    if not checker:
+        mixed = rng.integers(0, len(colors), (rows, columns))[row, column]
     tone = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)[row, column]
     glaze = 0.022 * noise(rng, 1.4, coarsest=3.0) + 0.016 * noise(rng, 0.5, coarsest=40.0) + 0.05 * tone
     edge = np.minimum(_edge(shifted, columns), _edge(v, rows)) * SIZE_PX
@@ -159,19 +148,15 @@ def marble(rng: np.random.Generator, ground: str, vein: str) -> Picture:
     return blend(ground, vein, share)
 
 
-def wallpaper(rng: np.random.Generator, ground: str, motif: str, kind: str) -> Picture:
-    """Return printed paper: `stripes`, `scales` (overlapping arcs), `lattice` (diamonds) or `leaves`."""
-    ink = _MOTIFS[kind](rng) * (0.93 + 0.05 * noise(rng, 0.5))
+def wallpaper(rng: np.random.Generator, ground: str, motif: str, ink: Field) -> Picture:
+    """Return paper that is printed with a share of ink."""
+    ink = ink * (0.93 + 0.05 * noise(rng, 0.5))
     paper = 1.0 + 0.022 * noise(rng, 0.5) + 0.018 * noise(rng, 1.5)
     return np.asarray(blend(ground, motif, ink) * paper[..., None], np.float32)
 
 
-def _stripes(rng: np.random.Generator) -> Field:
-    bands = texel_grid()[0] * 8.0 % 1.0
-    return np.where(bands < 0.5, 0.85, 0.0) + np.where(np.abs(bands - 0.75) < 0.03, 0.9, 0.0)
-
-
-def _scales(rng: np.random.Generator) -> Field:
+def scales(_: np.random.Generator) -> Field:
+    """Return overlapping arcs."""
     u, v = texel_grid()
     share = np.zeros_like(u)
     for row in range(-1, 17):  # later rows lie over earlier ones
@@ -182,14 +167,15 @@ def _scales(rng: np.random.Generator) -> Field:
     return share
 
 
-def _lattice(rng: np.random.Generator) -> Field:
+def lattice(_: np.random.Generator) -> Field:
+    """Return diamonds."""
     u, v = texel_grid()
     a, b = np.abs((u + v) * 6.0 % 1.0 - 0.5), np.abs((u - v) * 6.0 % 1.0 - 0.5)
     share = np.where(np.minimum(a, b) < 0.05, 0.95, np.where(a + b < 0.62, 0.0, 0.45))
     return np.where(np.hypot(a - 0.5, b - 0.5) < 0.13, 0.95, share)
 
 
-def _leaves(rng: np.random.Generator) -> Field:
+def leaves(rng: np.random.Generator) -> Field:
     """Return leaves in all directions with ribs and veins."""
     share = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     window = np.arange(-(SIZE_PX // 10), SIZE_PX // 10 + 1)
@@ -207,6 +193,5 @@ def _leaves(rng: np.random.Generator) -> Field:
     return share
 
 
-_MOTIFS = {"stripes": _stripes, "scales": _scales, "lattice": _lattice, "leaves": _leaves}
-PAINTERS = (noise, wood, planks, chevron, tiles, terrazzo, marble, wallpaper)
+PAINTERS = (noise, wood, planks, chevron, tiles, terrazzo, marble, wallpaper, scales, lattice, leaves)
 """What an expression of a texture can use; each takes a source of randomness first."""

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Bodies of messages: what generated structs are read and written with (WIRE.md, section 5).
+// Bodies of messages: how generated structs hold their values, for the walk of `body_walk.h`.
 #pragma once
 
 #include <algorithm>
@@ -7,20 +7,24 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <limits>
 #include <optional>
 #include <stdexcept>
 #include <string>
-#include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "cortex/array.hpp"
+#include "cortex/body_walk.h"
 #include "cortex/broadcast.h"
-#include "cortex/fields.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex {
+
+// Specialised by the headers that `cortex cpp` writes:
+//   name, schema (canonical JSON), fingerprint; fixed (no tail), stamped; stamp(message); items (a table, see `body.h`), names (of
+//   the fields). Of an optional, a list, or an array that may be a view, the table has its type, as below.
+template <class T>
+struct Codec;
 
 // Whether bytes are UTF-8 as Python reads it: no overlong forms, no surrogates, at most U+10FFFF.
 inline bool is_utf8(const std::uint8_t* at, std::size_t size) noexcept {
@@ -45,333 +49,258 @@ inline bool is_utf8(const std::uint8_t* at, std::size_t size) noexcept {
   return true;
 }
 
-// Reads a body that may hold anything. Every range is checked; all items together may not be larger than the body
-// that brings them, so that lists that point at each other cannot multiply. What is in shared memory may change
-// meanwhile: each number is read once.
-class Decoder {
- public:
-  Decoder(Span<const std::uint8_t> body, std::size_t block) : body_(body.data()), size_(body.size()) {
-    if (size_ < block) {
-      throw MalformedMessage("a body of " + std::to_string(size_) + " bytes is shorter than its block of " +
-                             std::to_string(block));
-    }
-    if (size_ > std::numeric_limits<std::uint32_t>::max()) throw MalformedMessage("a body must be below 4 GiB");
-    left_ = size_ - block;
-  }
+namespace detail {
 
-  // Positions are inside a block or a list's element, which were checked as a whole.
-  template <class T>
-  void operator()(std::size_t at, T& out) {
-    if constexpr (std::is_same_v<T, bool>) {
-      const std::uint8_t byte = body_[at];
-      if (byte > 1) throw MalformedMessage("a bool is " + std::to_string(byte) + ", not 0 or 1");
-      out = byte == 1;
-    } else if constexpr (std::is_enum_v<T>) {
-      const auto number = wire::load<std::int32_t>(body_ + at);
-      if (!EnumCodec<T>::known(number)) {
-        throw MalformedMessage(std::to_string(number) + " is no value of " + std::string(EnumCodec<T>::name));
-      }
-      out = static_cast<T>(number);
-    } else if constexpr (std::is_same_v<T, std::string>) {
-      const auto range = item(at, 1);
-      out.assign(reinterpret_cast<const char*>(body_ + range.at), range.count);
-      if (!is_utf8(reinterpret_cast<const std::uint8_t*>(out.data()), out.size())) {
-        throw MalformedMessage("a str is not UTF-8");
-      }
-    } else if constexpr (is_plain<T>) {
-      std::memcpy(static_cast<void*>(&out), body_ + at, sizeof out);
-    } else {
-      Codec<T>::fields(*this, at, out);
-    }
-  }
-
-  template <class T, std::size_t Offset, class... Shape>
-  void operator()(std::size_t at, std::optional<T>& out, Held<Offset>, const Shape&... shape) {
-    bool present = false;
-    (*this)(at, present);
-    if (!present) return out.reset();
-    (*this)(at + Offset, out.emplace(), shape...);
-  }
-
-  template <class T, std::size_t Stride, std::size_t Alignment, std::size_t Values, class... Shape>
-  void operator()(std::size_t at, std::vector<T>& out, Elements<Stride, Alignment, Values>, const Shape&... shape) {
-    const Items range = item(at, Stride);
-    if (range.count > values_left_ / Values) throw MalformedMessage("lists hold more values than a body may");
-    values_left_ -= range.count * Values;
-    out.clear();
-    out.reserve(range.count);
-    for (std::size_t index = 0; index < range.count; ++index) {
-      (begin_scope(shape), ...);
-      T element{};
-      (*this)(range.at + index * Stride, element, shape...);
-      out.push_back(std::move(element));
-    }
-  }
-
-  void operator()(std::size_t at, Array<std::uint8_t>& out, Bytes) {
-    const auto range = item(at, 1);
-    out = range.count == 0 ? Array<std::uint8_t>()
-                           : Array<std::uint8_t>::view(body_ + range.at, {static_cast<std::uint32_t>(range.count)});
-  }
-
-  template <class T, std::size_t Rank>
-  void operator()(std::size_t at, Array<T, Rank>& out, const Extents<Rank>& extents) {
-    std::array<std::uint32_t, Rank> shape{};
-    const auto range = array_range(at, shape, dtype_of<T>(), extents);
-    place(range.at, range.count, shape, out);
-  }
-
-  template <std::size_t Rank>
-  void operator()(std::size_t at, AnyArray<Rank>& out, const Extents<Rank>& extents) {
-    std::array<std::uint32_t, Rank> shape{};
-    const auto dtype = static_cast<Dtype>(body_[at + 4]);
-    const std::size_t size = item_size(dtype);
-    if (size == 0) throw MalformedMessage("dtype code " + std::to_string(static_cast<int>(dtype)) + " is unknown");
-    const auto range = array_range(at, shape, dtype, extents);
-    const auto bytes = static_cast<std::uint32_t>(range.count * size);
-    Array<std::uint8_t> items;
-    if (reinterpret_cast<std::uintptr_t>(body_ + range.at) % std::min<std::size_t>(size, 8) == 0) {
-      if (bytes > 0) items = Array<std::uint8_t>::view(body_ + range.at, {bytes});
-    } else {
-      items = Array<std::uint8_t>({bytes}, {body_ + range.at, bytes});
-    }
-    out = AnyArray<Rank>(dtype, shape, std::move(items));
-  }
-
-  template <class T, std::size_t Rank, std::uint32_t... Sizes>
-  void operator()(std::size_t at, Array<T, Rank>& out, Within<Sizes...>) {
-    place(at, (std::size_t{1} * ... * Sizes), {Sizes...}, out);
-  }
-
- private:
-  struct Items {
-    std::size_t at;
-    std::size_t count;
-  };
-
-  // What an offset and a count in the block point at. Arithmetic is in 64 bits on numbers of 32: it cannot wrap.
-  Items item(std::size_t at, std::size_t stride) {
-    return range(wire::load<std::uint32_t>(body_ + at), wire::load<std::uint32_t>(body_ + at + 4), stride);
-  }
-
-  Items range(std::uint64_t offset, std::uint64_t count, std::uint64_t stride) {
-    if (count > left_ / stride) {
-      throw MalformedMessage("a body of " + std::to_string(size_) + " bytes cannot hold " + std::to_string(count) +
-                             " items of " + std::to_string(stride));
-    }
-    if (offset > size_ || count * stride > size_ - offset) {
-      throw MalformedMessage("an item at " + std::to_string(offset) + " of " + std::to_string(count * stride) +
-                             " bytes leaves the body of " + std::to_string(size_));
-    }
-    left_ -= static_cast<std::size_t>(count * stride);
-    return {static_cast<std::size_t>(offset), static_cast<std::size_t>(count)};
-  }
-
-  template <std::size_t Rank>
-  Items array_range(std::size_t at, std::array<std::uint32_t, Rank>& shape, Dtype dtype, const Extents<Rank>& extents) {
-    const std::uint8_t* head = body_ + at;
-    if (head[4] != static_cast<std::uint8_t>(dtype) || head[5] != Rank || head[6] != 0 || head[7] != 0) {
-      throw MalformedMessage("an array has dtype code " + std::to_string(head[4]) + " and " +
-                             std::to_string(head[5]) + " dimensions, the type says " +
-                             std::to_string(static_cast<int>(dtype)) + " and " + std::to_string(Rank));
-    }
-    bool empty = false;
-    for (std::size_t index = 0; index < Rank; ++index) {
-      shape[index] = wire::load<std::uint32_t>(head + 8 + 4 * index);
-      empty = empty || shape[index] == 0;
-    }
-    extents.template check<MalformedMessage>(shape);
-    // A shape is bounded by the body that holds its items, and without items by what an index can count.
-    const std::uint64_t most = empty ? (std::uint64_t{1} << 63) - 1 : size_;
-    std::uint64_t bytes = item_size(dtype);
-    for (const auto extent : shape) {
-      if (extent != 0 && bytes > most / extent) throw MalformedMessage("an array's shape is larger than its body");
-      if (extent != 0) bytes *= extent;
-    }
-    const std::uint64_t items = empty ? 0 : bytes / item_size(dtype);
-    return range(wire::load<std::uint32_t>(head), items, item_size(dtype));
-  }
-
-  // A view where memory is aligned (always in a slot), a copy where ZeroMQ put the frame elsewhere.
-  template <class T, std::size_t Rank>
-  void place(std::size_t at, std::size_t items, const std::array<std::uint32_t, Rank>& shape, Array<T, Rank>& out) {
-    const std::uint8_t* const from = body_ + at;
-    if (items > 0 && reinterpret_cast<std::uintptr_t>(from) % alignof(T) == 0) {
-      out = Array<T, Rank>::view(reinterpret_cast<const T*>(from), shape);
-    } else {
-      out = Array<T, Rank>::uninitialized(shape);
-      if (items > 0) std::memcpy(static_cast<void*>(out.writable().data()), from, items * sizeof(T));
-    }
-  }
-
-  const std::uint8_t* body_;
-  std::size_t size_;
-  std::size_t left_ = 0;  // bytes that items may still take
-  std::size_t values_left_ = values_max;
-};
-
-// Writes a body into memory of a known size; or, where it `writes` not, counts the bytes.
-template <bool writes>
-class Encoder {
- public:
-  // `tail` is where the tail begins: after the block, or after the arrays that a loan placed.
-  Encoder(Span<std::uint8_t> out, std::size_t tail)
-      : out_(out.data()), capacity_(writes ? out.size() : wire::body_limit), cursor_(tail) {
-    if (tail > capacity_) does_not_fit();
-  }
-
-  // Bytes of the body, once all fields are written; the block has so many.
-  std::size_t finish(std::size_t block) {
-    reach(block, 0);
-    return cursor_;
-  }
-
-  template <class T>
-  void operator()(std::size_t at, const T& value) {
-    if constexpr (std::is_enum_v<T>) {
-      const auto number = static_cast<std::int32_t>(value);
-      if (writes && !EnumCodec<T>::known(number)) {
-        throw std::invalid_argument(std::to_string(number) + " is no value of " + std::string(EnumCodec<T>::name));
-      }
-      store(at, number);
-    } else if constexpr (std::is_same_v<T, std::string>) {
-      if (writes && !is_utf8(reinterpret_cast<const std::uint8_t*>(value.data()), value.size())) {
-        throw std::invalid_argument("a str must be UTF-8; use bytes for other data");
-      }
-      describe(at, put(value.data(), value.size(), 8), value.size());
-    } else if constexpr (is_plain<T>) {
-      store(at, value);
-    } else {
-      Codec<T>::fields(*this, at, value);
-    }
-  }
-
-  template <class T, std::size_t Offset, class... Shape>
-  void operator()(std::size_t at, const std::optional<T>& value, Held<Offset>, const Shape&... shape) {
-    if (!value.has_value()) return;
-    store(at, true);
-    (*this)(at + Offset, *value, shape...);
-  }
-
-  template <class T, std::size_t Stride, std::size_t Alignment, std::size_t Values, class... Shape>
-  void operator()(std::size_t at, const std::vector<T>& value, Elements<Stride, Alignment, Values>, const Shape&... shape) {
-    if (value.size() > capacity_ / Stride) does_not_fit();
-    if (value.size() > values_left_ / Values) throw std::invalid_argument("lists hold more values than a body may");
-    values_left_ -= value.size() * Values;
-    const std::size_t start = take(value.size() * Stride, Alignment);
-    describe(at, start, value.size());
-    const std::size_t filled = std::exchange(filled_, start);
-    for (std::size_t index = 0; index < value.size(); ++index) {
-      (begin_scope(shape), ...);
-      (*this)(start + index * Stride, static_cast<const T&>(value[index]), shape...);
-    }
-    reach(start + value.size() * Stride, 0);
-    filled_ = filled;
-  }
-
-  void operator()(std::size_t at, const Array<std::uint8_t>& value, Bytes) {
-    describe(at, put(value.data(), value.size(), 8), value.size());
-  }
-  template <class T, std::size_t Rank>
-  void operator()(std::size_t at, const Array<T, Rank>& value, const Extents<Rank>& extents) {
-    items(at, dtype_of<T>(), value.shape(), value.data(), value.size() * sizeof(T), extents);
-  }
-  template <std::size_t Rank>
-  void operator()(std::size_t at, const AnyArray<Rank>& value, const Extents<Rank>& extents) {
-    items(at, value.dtype(), value.shape(), value.bytes().data(), value.bytes().size(), extents);
-  }
-  template <class T, std::size_t Rank, std::uint32_t... Sizes>
-  void operator()(std::size_t at, const Array<T, Rank>& value, Within<Sizes...>) {
-    if (value.shape() != typename Array<T, Rank>::Shape{Sizes...} || value.size() != (std::size_t{1} * ... * Sizes)) {
-      throw std::invalid_argument("an array within a message has another shape than the type says");
-    }
-    const std::size_t bytes = value.size() * sizeof(T);
-    reach(at, bytes);
-    if (writes && static_cast<const void*>(value.data()) != out_ + at) std::memcpy(out_ + at, value.data(), bytes);
-  }
-
- private:
-  template <std::size_t Rank>
-  void items(std::size_t at, Dtype dtype, const std::array<std::uint32_t, Rank>& shape, const void* from, std::size_t bytes,
-             const Extents<Rank>& extents) {
-    extents.template check<std::invalid_argument>(shape);
-    std::uint64_t expected = item_size(dtype);
-    for (const auto extent : shape) expected *= extent;
-    if (expected != bytes) throw std::invalid_argument("an array without its items");
-    const std::size_t start = put(from, bytes, bytes >= large_bytes ? 64 : 8);
-    describe(at, start, static_cast<std::size_t>(dtype) | Rank << 8);
-    for (std::size_t index = 0; index < Rank; ++index) store(at + 8 + 4 * index, shape[index]);
-  }
-
-  // An offset and a second number, as begin the descriptors of all that lies in the tail.
-  void describe(std::size_t at, std::size_t start, std::size_t second) {
-    store(at, static_cast<std::uint32_t>(start));
-    store(at + 4, static_cast<std::uint32_t>(second));
-  }
-
-  template <class T>
-  void store(std::size_t at, [[maybe_unused]] const T& value) {
-    reach(at, sizeof value);
-    if constexpr (writes) std::memcpy(out_ + at, static_cast<const void*>(&value), sizeof value);
-  }
-
-  // Fields come in order: what lies between them is zero.
-  void reach([[maybe_unused]] std::size_t at, [[maybe_unused]] std::size_t bytes) {
-    if constexpr (writes) {
-      if (at > filled_) std::memset(out_ + filled_, 0, at - filled_);
-      filled_ = at + bytes;
-    }
-  }
-
-  // Offset of these bytes in the tail; they are copied, unless a loan has them here already.
-  std::size_t put(const void* from, std::size_t bytes, std::size_t alignment) {
-    const auto position = reinterpret_cast<std::uintptr_t>(from) - reinterpret_cast<std::uintptr_t>(out_);
-    if (writes && bytes > 0 && position < capacity_) return position;
-    const std::size_t start = take(bytes, alignment);
-    if (writes && bytes > 0) cortex_copy(out_ + start, from, bytes);
-    return start;
-  }
-
-  std::size_t take(std::size_t bytes, std::size_t alignment) {
-    if (bytes == 0) return 0;
-    const auto start = static_cast<std::size_t>(wire::round_up(cursor_, alignment));
-    if (start > capacity_ || bytes > capacity_ - start) does_not_fit();
-    if (writes) std::memset(out_ + cursor_, 0, start - cursor_);
-    cursor_ = start + bytes;
-    return start;
-  }
-
-  [[noreturn]] void does_not_fit() const {
-    throw std::invalid_argument("a message does not fit into " + std::to_string(capacity_) + " bytes");
-  }
-
-  std::uint8_t* out_;
-  std::size_t capacity_;
-  std::size_t cursor_;
-  std::size_t filled_ = 0;  // of the block, or of a list, all below this is written
-  std::size_t values_left_ = values_max;
+struct OptionalType {
+  char* (*set)(void* optional, bool present);
+  const char* (*get)(const void* optional);
 };
 
 template <class T>
-constexpr std::size_t block_of() noexcept {
-  return static_cast<std::size_t>(wire::round_up(Codec<T>::block, 8));
+constexpr OptionalType optional_type{
+    [](void* place, bool present) {
+      auto& optional = *static_cast<std::optional<T>*>(place);
+      optional.reset();
+      return present ? reinterpret_cast<char*>(&optional.emplace()) : nullptr;
+    },
+    [](const void* place) {
+      const auto& optional = *static_cast<const std::optional<T>*>(place);
+      return optional.has_value() ? reinterpret_cast<const char*>(&*optional) : nullptr;
+    }};
+
+struct ListType {
+  char* (*resize)(void* list, std::size_t count);
+  const char* (*get)(const void* list, std::uint64_t& count);
+  std::size_t step;
+};
+
+template <class T>
+constexpr ListType list_type{
+    [](void* place, std::size_t count) {
+      auto& list = *static_cast<std::vector<T>*>(place);
+      list.clear();
+      list.resize(count);
+      return reinterpret_cast<char*>(list.data());
+    },
+    [](const void* place, std::uint64_t& count) {
+      const auto& list = *static_cast<const std::vector<T>*>(place);
+      count = list.size();
+      return reinterpret_cast<const char*>(list.data());
+    },
+    sizeof(T)};
+
+struct ArrayType {
+  void (*put)(void* array, const CortexArray& found, bool loaned);  // items that lie elsewhere; aligned, or they are copied
+  void (*get)(const void* array, CortexArray& found);
+};
+
+template <std::size_t Rank>
+std::array<std::uint32_t, Rank> shape_of(const CortexArray& found) noexcept {
+  std::array<std::uint32_t, Rank> shape{};
+  for (std::size_t axis = 0; axis < Rank; ++axis) shape[axis] = static_cast<std::uint32_t>(found.shape[axis]);
+  return shape;
 }
+
+inline bool is_aligned(const void* data, std::size_t alignment) noexcept { return reinterpret_cast<std::uintptr_t>(data) % alignment == 0; }
+
+// A view where memory is aligned (always in a slot), a copy where ZeroMQ put the frame elsewhere; what is loaned may be written.
+template <class T, std::size_t Rank>
+void put(Array<T, Rank>& array, const CortexArray& found, bool loaned) {
+  const auto shape = shape_of<Rank>(found);
+  if (loaned) {
+    array = Array<T, Rank>::loaned(static_cast<T*>(const_cast<void*>(found.data)), shape);
+  } else if (found.bytes > 0 && is_aligned(found.data, alignof(T))) {
+    array = Array<T, Rank>::view(static_cast<const T*>(found.data), shape);
+  } else {
+    array = Array<T, Rank>::uninitialized(shape);
+    if (found.bytes > 0) std::memcpy(static_cast<void*>(array.writable().data()), found.data, found.bytes);
+  }
+}
+template <std::size_t Rank>
+void put(AnyArray<Rank>& array, const CortexArray& found, bool loaned) {
+  const auto dtype = static_cast<Dtype>(found.dtype);
+  const auto* const data = static_cast<const std::uint8_t*>(found.data);
+  const bool aligned = found.bytes > 0 && is_aligned(data, std::min<std::size_t>(item_size(dtype), 8));
+  const std::array<std::uint32_t, 1> count{static_cast<std::uint32_t>(found.bytes)};
+  auto bytes = loaned    ? Array<std::uint8_t>::loaned(const_cast<std::uint8_t*>(data), count)
+               : aligned ? Array<std::uint8_t>::view(data, count)
+                         : Array<std::uint8_t>(count, {data, found.bytes});
+  array = AnyArray<Rank>(dtype, shape_of<Rank>(found), std::move(bytes));
+}
+
+template <class T, std::size_t Rank>
+void get(const Array<T, Rank>& array, CortexArray& found) noexcept {
+  std::copy(array.shape().begin(), array.shape().end(), found.shape);
+  found.dtype = 0;
+  found.data = array.data();
+  found.bytes = array.size() * sizeof(T);
+}
+template <std::size_t Rank>
+void get(const AnyArray<Rank>& array, CortexArray& found) noexcept {
+  std::copy(array.shape().begin(), array.shape().end(), found.shape);
+  found.dtype = static_cast<std::int64_t>(array.dtype());
+  found.data = array.bytes().data();
+  found.bytes = array.bytes().size();
+}
+
+template <class A>
+constexpr ArrayType array_type{[](void* array, const CortexArray& found, bool loaned) { put(*static_cast<A*>(array), found, loaned); },
+                               [](const void* array, CortexArray& found) { get(*static_cast<const A*>(array), found); }};
+
+// Copies a number, or a small array of a fixed shape, which lies in a struct as in a body.
+inline void copy_number(void* to, const void* from, std::int64_t size) noexcept {
+  switch (size) {
+    case 8:
+      std::memcpy(to, from, 8);
+      break;
+    case 4:
+      std::memcpy(to, from, 4);
+      break;
+    case 2:
+      std::memcpy(to, from, 2);
+      break;
+    case 1:
+      std::memcpy(to, from, 1);
+      break;
+    default:
+      std::memcpy(to, from, static_cast<std::size_t>(size));
+  }
+}
+
+template <class Type>
+const Type& type_of(const CortexItem* item) noexcept {
+  return *static_cast<const Type*>(item->object);
+}
+
+}  // namespace detail
+}  // namespace cortex
+
+// What `body_walk.h` asks for.
+
+inline int cortex_put_number(CortexRead*, const CortexItem* item, const std::uint8_t* in, char* place) {
+  cortex::detail::copy_number(place, in, item->size);
+  return 1;
+}
+
+inline int cortex_put_bool(CortexRead*, int truth, char* place) {
+  *place = static_cast<char>(truth);
+  return 1;
+}
+
+inline int cortex_put_member(CortexRead*, const CortexItem* member, char* place) {
+  const auto number = static_cast<std::int32_t>(member->code);
+  std::memcpy(place, &number, sizeof number);
+  return 1;
+}
+
+inline int cortex_put_text(CortexRead* read, const CortexItem* item, const std::uint8_t* in, std::uint64_t size, char* place) {
+  if (item->kind == CORTEX_BYTES) {
+    auto& bytes = *reinterpret_cast<cortex::Array<std::uint8_t>*>(place);
+    bytes = size == 0 ? cortex::Array<std::uint8_t>() : cortex::Array<std::uint8_t>::view(in, {static_cast<std::uint32_t>(size)});
+    return 1;
+  }
+  auto& text = *reinterpret_cast<std::string*>(place);
+  text.assign(reinterpret_cast<const char*>(in), size);  // first: what it was read from may change
+  if (cortex::is_utf8(reinterpret_cast<const std::uint8_t*>(text.data()), text.size())) return 1;
+  return cortex_reject(read, "a str is not UTF-8");
+}
+
+inline int cortex_put_array(CortexRead*, const CortexItem* item, const CortexArray* array, char* place) {
+  cortex::detail::type_of<cortex::detail::ArrayType>(item).put(place, *array, false);
+  return 1;
+}
+
+inline char* cortex_put_optional(CortexRead*, const CortexItem* item, int present, char* place) {
+  return cortex::detail::type_of<cortex::detail::OptionalType>(item).set(place, present != 0);
+}
+
+inline int cortex_put_list(CortexRead*, const CortexItem* item, std::uint64_t count, char* place, char** elements, std::size_t* step) {
+  const auto& type = cortex::detail::type_of<cortex::detail::ListType>(item);
+  *elements = type.resize(place, count);
+  *step = type.step;
+  return 1;
+}
+
+inline char* cortex_put_message(CortexRead*, const CortexItem*, char* place) { return place; }
+
+inline int cortex_get_scalar(CortexWrite* write, const CortexItem* item, const char* place, std::uint8_t* out) {
+  cortex::detail::copy_number(out, place, item->size);
+  if (item->kind == CORTEX_NUMBER) return 1;
+  if (item->kind == CORTEX_BOOL) *out = *out != 0;
+  if (item->kind != CORTEX_ENUM || cortex_member(write->items, item, cortex::wire::load<std::int32_t>(out)) != nullptr) return 1;
+  return cortex_refuse(write, "a number is no value of its enum");
+}
+
+inline int cortex_get_text(CortexWrite* write, const CortexItem* item, const char* place, const void** data, std::uint64_t* size) {
+  if (item->kind == CORTEX_BYTES) {
+    const auto& bytes = *reinterpret_cast<const cortex::Array<std::uint8_t>*>(place);
+    *data = bytes.data();
+    *size = bytes.size();
+    return 1;
+  }
+  const auto& text = *reinterpret_cast<const std::string*>(place);
+  *data = text.data();
+  *size = text.size();
+  const bool is_good = write->out == nullptr || cortex::is_utf8(reinterpret_cast<const std::uint8_t*>(text.data()), text.size());
+  return is_good ? 1 : cortex_refuse(write, "a str must be UTF-8; use bytes for other data");
+}
+
+inline int cortex_get_array(CortexWrite* write, const CortexItem* item, const char* place, CortexArray* array) {
+  cortex::detail::type_of<cortex::detail::ArrayType>(item).get(place, *array);
+  auto bytes = static_cast<std::uint64_t>(write->items[item->first + item->count + array->dtype].size);
+  for (std::int64_t axis = 0; axis < item->count; ++axis) bytes *= static_cast<std::uint64_t>(array->shape[axis]);
+  return bytes == array->bytes ? 1 : cortex_refuse(write, "an array without its items");
+}
+
+inline int cortex_copy_array(CortexWrite* write, const CortexArray* array, const char*, std::uint64_t start) {
+  if (write->out != nullptr && array->data != write->out + start) cortex_copy(write->out + start, array->data, array->bytes);
+  return 1;
+}
+
+inline const char* cortex_get_optional(CortexWrite*, const CortexItem* item, const char* place) {
+  return cortex::detail::type_of<cortex::detail::OptionalType>(item).get(place);
+}
+
+inline int cortex_get_list(CortexWrite*, const CortexItem* item, const char* place, std::uint64_t* count, const char** elements,
+                           std::size_t* step) {
+  const auto& type = cortex::detail::type_of<cortex::detail::ListType>(item);
+  *elements = type.get(place, *count);
+  *step = type.step;
+  return 1;
+}
+
+inline const char* cortex_get_message(CortexWrite*, const CortexItem*, const char* place) { return place; }
+
+namespace cortex {
+
+// Bytes of a body before its tail.
+template <class T>
+constexpr std::size_t block_of() noexcept {
+  return static_cast<std::size_t>(Codec<T>::items[0].size);
+}
+
+namespace detail {
+
+template <class T>
+std::size_t write_body(const T& message, std::uint8_t* out, std::size_t placed, std::size_t limit) {
+  CortexWrite write;
+  if (cortex_write_body(&write, Codec<T>::items, out, placed, limit, reinterpret_cast<const char*>(&message)) != 0) return write.end;
+  throw std::invalid_argument(std::string(Codec<T>::name) + ": " + write.wrong);
+}
+
+}  // namespace detail
 
 // Bytes of the body of this message. Throws std::invalid_argument for a message that breaks its type.
 template <class T>
 std::size_t encoded_size(const T& message) {
   if constexpr (Codec<T>::fixed) return block_of<T>();
-  Encoder<false> encoder({}, block_of<T>());
-  Codec<T>::fields(encoder, 0, message);
-  return encoder.finish(block_of<T>());
+  return detail::write_body(message, nullptr, 0, wire::body_limit);
 }
 
-// Writes the body into memory of at least `encoded_size` bytes, returns its size.
+// Writes the body into memory of at least `encoded_size` bytes, returns its size. Arrays that lie there before `tail` stay.
 template <class T>
-std::size_t encode_into(const T& message, Span<std::uint8_t> out, std::size_t tail = block_of<T>()) {
-  Encoder<true> encoder(out, tail);
-  Codec<T>::fields(encoder, 0, message);
-  return encoder.finish(block_of<T>());
+std::size_t encode_into(const T& message, Span<std::uint8_t> out, std::size_t tail = 0) {
+  return detail::write_body(message, out.data(), tail, out.size());
 }
 
 template <class T>
@@ -381,15 +310,12 @@ std::vector<std::uint8_t> encode(const T& message) {
   return body;
 }
 
-// Reads a body; arrays look into it. Throws MalformedMessage.
+// Reads a body that may hold anything; arrays look into it. Throws MalformedMessage.
 template <class T>
 void decode_into(Span<const std::uint8_t> body, T& out) {
-  if (Codec<T>::fixed && body.size() != block_of<T>()) {
-    throw MalformedMessage("a body of " + std::to_string(body.size()) + " bytes, the type has " +
-                           std::to_string(block_of<T>()));
-  }
-  Decoder decoder(body, block_of<T>());
-  Codec<T>::fields(decoder, 0, out);
+  CortexRead read;
+  if (cortex_read_body(&read, Codec<T>::items, body.data(), body.size(), nullptr, reinterpret_cast<char*>(&out)) != 0) return;
+  throw MalformedMessage(std::string(Codec<T>::name) + ": " + read.wrong);
 }
 
 template <class T>

@@ -6,10 +6,10 @@
 #include <algorithm>
 #include <cstdint>
 #include <functional>
+#include <iterator>
 #include <map>
 #include <memory>
 #include <optional>
-#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -233,8 +233,7 @@ class Directory {
     } else if (frame.is<records::Gone>()) {
       const auto gone = frame.as<records::Gone>();
       count(gone.version);
-      missing_.erase(gone.node);
-      doubted_.erase(gone.node);
+      named_.erase(gone.node);
       drop(gone.node);
     } else if (frame.is<records::Refused>()) {
       complaints_->once("refused " + address_,
@@ -260,31 +259,23 @@ class Directory {
     if (welcome.epoch != epoch_) clock_.forget();
     epoch_ = welcome.epoch;
     version_ = welcome.version;
-    missing_.clear();
-    std::set<std::uint64_t> named;
-    for (std::size_t index = 0; index < welcome.nodes.size(); ++index) {
-      const std::uint64_t node = welcome.nodes[index];
-      if (node == own_.node) continue;
-      named.insert(node);
-      const auto known = nodes_.find(node);
-      if (known == nodes_.end() || known->second.revision != welcome.revisions[index]) {
-        missing_[node] = welcome.revisions[index];
-      }
-    }
-    // A registry that was just started does not know everybody yet: one lease of grace.
-    std::map<std::uint64_t, std::int64_t> doubted;
-    for (const auto& entry : nodes_) {
-      const std::uint64_t node = entry.first;
-      if (named.count(node) != 0) continue;
-      const auto since = doubted_.find(node);
-      doubted[node] = since != doubted_.end() ? since->second : now_ns + lease_ns;
-    }
-    doubted_ = std::move(doubted);
+    named_.clear();
+    for (std::size_t index = 0; index < welcome.nodes.size(); ++index) named_[welcome.nodes[index]] = welcome.revisions[index];
+    named_.erase(own_.node);
+    doubt_until_ns_ = now_ns + lease_ns;  // a registry that was just started does not know everybody yet
+  }
+
+  // Whether all records that were named have come.
+  bool is_complete() const {
+    return std::all_of(named_.begin(), named_.end(), [&](const auto& named) {
+      const auto known = nodes_.find(named.first);
+      return known != nodes_.end() && known->second.revision == named.second;
+    });
   }
 
   void on_alive(const records::Alive& alive, std::int64_t now_ns) {
     if (!welcomed_ || now_ns < quiet_ns_) return;  // the answer to our last `Hello` says more
-    if (alive.epoch != epoch_ || alive.version != version_ || !missing_.empty()) return say_hello(now_ns, true);
+    if (alive.epoch != epoch_ || alive.version != version_ || !is_complete()) return say_hello(now_ns, true);
     if (alive.held != own_.revision) say_hello(now_ns, false);
   }
 
@@ -298,9 +289,8 @@ class Directory {
     check(changed.record);
     const std::uint64_t node = changed.record.node;
     count(changed.version);
-    missing_.erase(node);
-    doubted_.erase(node);
     if (node == own_.node) return;
+    named_[node] = changed.record.revision;
     const auto known = nodes_.find(node);
     if (known != nodes_.end() && known->second.revision == changed.record.revision) return;
     nodes_[node] = std::move(changed.record);
@@ -315,14 +305,15 @@ class Directory {
 
   void forgive(std::int64_t stood_ns) {
     heard_ns_ += stood_ns;
-    for (auto& doubt : doubted_) doubt.second += stood_ns;
+    doubt_until_ns_ += stood_ns;
   }
 
   void expire(std::int64_t now_ns) {
-    if (!welcomed_) return;  // without a registry nobody is removed
-    for (auto doubt = doubted_.begin(); doubt != doubted_.end();) {
-      if (now_ns > doubt->second) drop(doubt->first);
-      doubt = now_ns > doubt->second ? doubted_.erase(doubt) : std::next(doubt);
+    if (!welcomed_ || now_ns <= doubt_until_ns_) return;  // without a registry nobody is removed
+    for (auto node = nodes_.begin(); node != nodes_.end();) {
+      const bool is_named = named_.count(node->first) != 0;
+      changed_ = changed_ || !is_named;
+      node = is_named ? std::next(node) : nodes_.erase(node);
     }
   }
 
@@ -349,8 +340,8 @@ class Directory {
   bool welcomed_ = false;
   std::uint64_t epoch_ = 0;
   std::uint64_t version_ = 0;
-  std::map<std::uint64_t, std::uint64_t> missing_;  // revisions that `Welcome` named and that have not come yet
-  std::map<std::uint64_t, std::int64_t> doubted_;   // when to drop nodes that the registry did not name
+  std::map<std::uint64_t, std::uint64_t> named_;  // revisions of all nodes that the registry has told of
+  std::int64_t doubt_until_ns_ = 0;               // when to drop the others
 };
 
 }  // namespace cortex::detail

@@ -150,16 +150,11 @@ class Link {
   };
 
   void attach(bool shared_memory) {
-    wire::AttachKey key;
-    key.source = source_;
-    key.reader = reader_ = random_number();
-    key.shared_memory = shared_memory;
-    key.strict = policy_.is_reliable;
-    key.confirms = true;
-    key.confirms_end = policy_.is_reliable;
-    key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
-    key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
-    key_ = wire::pack_key(key, flags());
+    using wire::Key;
+    const auto quota = std::min<std::uint64_t>(policy_.depth + 2, 255), timeout_ms = static_cast<std::uint64_t>(policy_.timeout.count());
+    const std::uint64_t options = (shared_memory ? Key::shared_memory : 0) | (policy_.is_reliable ? Key::strict | Key::confirms_end : 0);
+    reader_ = random_number();
+    key_ = Key('A', flags(), source_, reader_, options | Key::confirms | quota << 8 | timeout_ms << 32).bytes();
     if (shared_memory && net::is_ipc(address_)) {
       end_ = RingReader::open(address_.substr(6, address_.rfind('.') - 6) + ".ring", source_, reader_);
     }
@@ -226,7 +221,7 @@ class Link {
 
   // Tells the publisher that all below a sequence is accounted for.
   void confirm(std::uint64_t sequence) {
-    const std::string key = wire::pack_resume(source_, reader_, sequence, flags());
+    const std::string key = wire::Key('R', flags(), source_, reader_, sequence).bytes();
     socket_.set(zmq::sockopt::subscribe, key);
     socket_.set(zmq::sockopt::unsubscribe, key);
   }
@@ -262,10 +257,14 @@ class Link {
       item.body = bytes;
       item.frame = std::move(body);
     } else {  // ZeroMQ keeps small messages within `body`, which moves
-      auto copy = std::make_shared<std::vector<std::uint8_t>>(bytes.begin(), bytes.end());
-      item.body = {copy->data(), copy->size()};
-      item.owner = std::move(copy);
+      keep_copy(item, bytes);
     }
+  }
+
+  static void keep_copy(Item& item, Span<const std::uint8_t> body) {
+    auto copy = std::make_shared<std::vector<std::uint8_t>>(body.begin(), body.end());
+    item.body = {copy->data(), copy->size()};
+    item.owner = std::move(copy);
   }
 
   // Tells which number comes next, so that a loss at the end of a burst is known, or that none does.
@@ -337,10 +336,7 @@ class Link {
     }
     const auto body = wire::body_of(header, frame, wire::body_limit);
     if (header.sequence >= expected_) advance(header.sequence, 1);
-    auto copy = std::make_shared<std::vector<std::uint8_t>>(body.begin(), body.end());
-    Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
-    item.body = {copy->data(), copy->size()};
-    item.owner = std::move(copy);
+    keep_copy(append(queue, header.sequence, header.stamp_ns, header.publish_ns), body);
   }
 
   // Attaches anew, as another reader: what follows comes through the socket.

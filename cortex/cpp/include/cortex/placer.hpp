@@ -3,18 +3,16 @@
 #pragma once
 
 #include <algorithm>
-#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <stdexcept>
 #include <string>
-#include <string_view>
 #include <utility>
 #include <vector>
 
 #include "cortex/array.hpp"
-#include "cortex/fields.hpp"
+#include "cortex/codec.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex {
@@ -22,76 +20,58 @@ namespace cortex {
 using Dimensions = std::vector<std::pair<std::string, std::uint32_t>>;  // by the name of the dimension
 using Dtypes = std::vector<std::pair<std::string, Dtype>>;              // by the name of the field
 
-// Visits the fields of a loan, and gives those of its arrays their place in the slot whose dimensions are all known.
-class Placer {
- public:
-  // Without memory (data null) it only counts.
-  Placer(Span<std::uint8_t> body, std::size_t block, const Dimensions& dimensions, const Dtypes& dtypes)
-      : body_(body), cursor_(block), dimensions_(dimensions), dtypes_(dtypes) {}
-  std::size_t size() const noexcept { return cursor_; }
+namespace detail {
 
-  template <class T, class... Shape>
-  void operator()(std::size_t, T&, const Shape&...) const noexcept {}
+// What is known of a name; null if nothing is.
+template <class Value>
+const Value* find(const std::vector<std::pair<std::string, Value>>& known, const char* name) {
+  const auto found = std::find_if(known.begin(), known.end(), [&](const auto& each) { return each.first == name; });
+  return found == known.end() ? nullptr : &found->second;
+}
 
-  template <class T, std::size_t Rank>
-  void operator()(std::size_t, Array<T, Rank>& out, const Extents<Rank>& extents) {
-    std::array<std::uint32_t, Rank> shape{};
-    std::size_t bytes = sizeof(T);
-    if (!known(extents, shape, bytes)) return;
-    std::uint8_t* at = take(bytes);
-    if (at != nullptr) out = Array<T, Rank>::loaned(reinterpret_cast<T*>(at), shape);
+// Whether dtype and dimensions of a field are all given; then `array` gets them.
+inline bool is_given(const CortexItem* items, const CortexItem& field, const char* name, const Dimensions& dimensions,
+                     const Dtypes& dtypes, CortexArray& array) {
+  const Dtype* const dtype = field.dtypes > 1 ? find(dtypes, name) : nullptr;
+  if (field.dtypes > 1 && dtype == nullptr) return false;
+  const CortexItem* const axes = items + field.first;
+  array.dtype = dtype == nullptr ? 0 : static_cast<std::int64_t>(*dtype);
+  array.bytes = static_cast<std::uint64_t>(axes[field.count + array.dtype].size);
+  for (std::int64_t axis = 0; axis < field.count; ++axis) {
+    const auto* const dimension = static_cast<const char*>(axes[axis].object);
+    const std::uint32_t* const size = dimension == nullptr ? nullptr : find(dimensions, dimension);
+    if (dimension != nullptr && size == nullptr) return false;
+    array.shape[axis] = size == nullptr ? axes[axis].size : *size;
+    const auto factor = static_cast<std::uint64_t>(array.shape[axis]);
+    if (factor != 0 && array.bytes > wire::body_limit / factor) throw std::invalid_argument("a loan is larger than 1 GiB");
+    array.bytes *= factor;
   }
-  template <std::size_t Rank>
-  void operator()(std::size_t, AnyArray<Rank>& out, const Extents<Rank>& extents) {
-    const std::string_view field = std::string_view(extents.field).substr(std::string_view(extents.field).rfind('.') + 1);
-    const auto found = std::find_if(dtypes_.begin(), dtypes_.end(), [&](const auto& each) { return each.first == field; });
-    if (found == dtypes_.end()) return;
-    std::array<std::uint32_t, Rank> shape{};
-    std::size_t bytes = item_size(found->second);
-    if (!known(extents, shape, bytes)) return;
-    std::uint8_t* at = take(bytes);
-    if (at == nullptr) return;
-    out = AnyArray<Rank>(found->second, shape, Array<std::uint8_t>::loaned(at, {static_cast<std::uint32_t>(bytes)}));
-  }
-  template <class T, std::size_t Rank, std::uint32_t... Sizes>
-  void operator()(std::size_t at, Array<T, Rank>& out, Within<Sizes...>) {
-    if (body_.data() != nullptr) out = Array<T, Rank>::loaned(reinterpret_cast<T*>(body_.data() + at), {Sizes...});
-  }
+  return true;
+}
 
- private:
-  // Whether all dimensions are given: then the shape, and `bytes` times its items.
-  template <std::size_t Rank>
-  bool known(const Extents<Rank>& extents, std::array<std::uint32_t, Rank>& shape, std::size_t& bytes) const {
-    for (std::size_t index = 0; index < Rank; ++index) {
-      const auto& extent = extents.each[index];
-      shape[index] = extent.size;
-      if (extent.named != nullptr) {
-        const auto found = std::find_if(dimensions_.begin(), dimensions_.end(),
-                                        [&](const auto& dimension) { return dimension.first == extent.named->name; });
-        if (found == dimensions_.end()) return false;
-        shape[index] = found->second;
-      }
-      if (shape[index] != 0 && bytes > wire::body_limit / shape[index]) too_large();
-      bytes *= shape[index];
+// Gives those arrays of a loan their places in its slot whose dimensions are all given; where they end. Without memory (null) it
+// only counts.
+inline std::size_t place_arrays(const CortexItem* items, const char* const* names, char* message, std::uint8_t* body,
+                                const Dimensions& dimensions, const Dtypes& dtypes) {
+  auto end = static_cast<std::uint64_t>(items->size);
+  for (std::int64_t number = 0; number < items->count; ++number) {
+    const CortexItem& field = items[items->first + number];
+    const bool is_array = field.kind == CORTEX_VARIABLE || field.kind == CORTEX_FIXED;
+    CortexArray array;
+    if (!is_array || !is_given(items, field, names[number], dimensions, dtypes, array)) continue;
+    auto start = static_cast<std::uint64_t>(field.offset);
+    if (field.kind == CORTEX_VARIABLE) {
+      start = wire::round_up(end, array.bytes >= CORTEX_LARGE_BYTES ? 64 : 8);
+      if (start + array.bytes > wire::body_limit) throw std::invalid_argument("a loan is larger than 1 GiB");
+      if (body != nullptr) std::memset(body + end, 0, start - end);
+      end = start + array.bytes;
     }
-    return true;
+    if (body == nullptr) continue;
+    array.data = body + start;
+    type_of<ArrayType>(&field).put(message + field.place, array, true);
   }
+  return end;
+}
 
-  // The next place for so many bytes, null while only counting.
-  std::uint8_t* take(std::size_t bytes) {
-    const auto start = static_cast<std::size_t>(wire::round_up(cursor_, bytes >= large_bytes ? 64 : 8));
-    if (start + bytes > wire::body_limit) too_large();
-    if (body_.data() != nullptr && start > cursor_) std::memset(body_.data() + cursor_, 0, start - cursor_);
-    cursor_ = start + bytes;
-    return body_.data() == nullptr ? nullptr : body_.data() + start;
-  }
-
-  [[noreturn]] static void too_large() { throw std::invalid_argument("a loan is larger than 1 GiB"); }
-
-  Span<std::uint8_t> body_;
-  std::size_t cursor_;
-  const Dimensions& dimensions_;
-  const Dtypes& dtypes_;
-};
-
+}  // namespace detail
 }  // namespace cortex

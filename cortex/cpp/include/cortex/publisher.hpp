@@ -64,17 +64,17 @@ class Loan {
 
   Loan(std::shared_ptr<detail::PublisherCore> core, const Dimensions& dimensions, const Dtypes& dtypes)
       : core_(std::move(core)) {
-    Placer measure({}, block_of<T>(), dimensions, dtypes);
-    Codec<T>::fields(measure, 0, message_);
-    tail_ = measure.size();
+    const auto place = [&](std::uint8_t* body) {
+      return detail::place_arrays(Codec<T>::items, Codec<T>::names, reinterpret_cast<char*>(&message_), body, dimensions, dtypes);
+    };
+    tail_ = place(nullptr);
     const std::size_t size = tail_ + reserve;
     slot_ = size <= core_->inline_max() ? detail::private_slot(size) : core_->acquire(size, true);
     if (slot_.buffer.data() == nullptr) {
       core_.reset();
       throw std::runtime_error("every slot is out on loan; publish or drop one first");
     }
-    Placer place(slot_.buffer, block_of<T>(), dimensions, dtypes);
-    Codec<T>::fields(place, 0, message_);
+    place(slot_.buffer.data());
   }
 
   std::shared_ptr<detail::PublisherCore> core_;

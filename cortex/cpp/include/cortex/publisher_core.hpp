@@ -88,25 +88,23 @@ class PublisherCore {
     Lock lock(pub_sockets_->mutex);
     prepare(lock, true);
     waited_ns_ = 0;
-    const auto after_wait = [&](Slot acquired) {
-      acquired.waited_ns = waited_ns_;
-      return acquired;
-    };
-    if (!provide(lock, size)) return after_wait(private_slot(size));
-    Slot slot = readers_.acquire();
-    if (slot.index < 0) {
+    Slot slot;
+    if (provide(lock, size)) {
       wait_for_readers(lock, 0, [&] {
         if (!readers_.has_members()) return true;
         slot = readers_.acquire();
         return slot.index >= 0;
       });
+      if (slot.index < 0 && for_loan) {
+        ++sequence_;
+        ++counters_.published;
+        ++counters_.skipped;
+        return {};
+      }
     }
-    if (slot.index >= 0) return after_wait(std::move(slot));
-    if (!for_loan) return after_wait(private_slot(size));
-    ++sequence_;
-    ++counters_.published;
-    ++counters_.skipped;
-    return {};
+    if (slot.index < 0) slot = private_slot(size);
+    slot.waited_ns = waited_ns_;
+    return slot;
   }
 
   void abandon(const Slot& slot) noexcept {
@@ -154,10 +152,9 @@ class PublisherCore {
   }
 
   // A reader has come; called under the lock.
-  void attach(PubSocket& pub_socket, const std::string& key, wire::AttachKey request) {
+  void attach(PubSocket& pub_socket, const std::string& key, const wire::Key& request) {
     if (closed_ || readers_.size() >= 1024) return;
-    request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
-    const auto& reader = readers_.add(pub_socket, key, request, sequence_, pub_sockets_->listener);
+    const auto& reader = readers_.add(pub_socket, key, request, max_wait_ms_, sequence_, pub_sockets_->listener);
     if (pub_sockets_->listener.heard_other_version) {
       complaints_->once("version", "a subscriber with another version of Cortex cannot share memory, and gets messages through its socket");
     }
@@ -428,18 +425,14 @@ inline void PubSockets::refresh() {
     const std::int64_t until_ns = monotonic_ns() + look_max_ns;  // others may send more than we can read
     while (monotonic_ns() < until_ns && pub_socket->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
-      wire::AttachKey request;
       if (bytes.empty()) continue;
-      const Span<const std::uint8_t> subscription(bytes.data() + 1, bytes.size() - 1);
-      if (!wire::read_key(subscription, request)) {
-        std::uint64_t reader = 0;
-        std::uint64_t sequence = 0;
-        const auto resumed = publishers.find(wire::read_resume(subscription, reader, sequence));
-        if (bytes[0] == 1 && resumed != publishers.end()) std::shared_ptr(resumed->second)->resume(reader, sequence);
-        continue;
-      }
-      const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
+      const wire::Key request = wire::read_key({bytes.data() + 1, bytes.size() - 1});
       const auto publisher = publishers.find(request.source);
+      if (request.kind == 'R' && bytes[0] == 1 && publisher != publishers.end()) {
+        std::shared_ptr(publisher->second)->resume(request.reader, request.last);
+      }
+      if (request.kind != 'A') continue;
+      const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
       if (publisher == publishers.end()) {
         attached.erase(key);
       } else if (bytes[0] == 1) {

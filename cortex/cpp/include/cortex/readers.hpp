@@ -20,7 +20,8 @@ namespace cortex::detail {
 // One subscriber's link to this publisher.
 struct Reader {
   std::string key;
-  wire::AttachKey request;
+  wire::Key request;
+  std::uint32_t timeout_ms = 0;  // the longest that it holds up the publisher
   PubSocket* pub_socket = nullptr;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the socket
   std::uint64_t confirmed = 0;  // it has accounted for all below this; the end of the stream counts as one
@@ -48,14 +49,15 @@ class Readers {
 
   // Takes a reader in; through the ring, if it asks for that and there is room. `first` is the sequence of the first
   // message for it.
-  const std::shared_ptr<Reader>& add(PubSocket& pub_socket, const std::string& key, const wire::AttachKey& request,
-                                     std::uint64_t first, Listener& listener) {
+  const std::shared_ptr<Reader>& add(PubSocket& pub_socket, const std::string& key, const wire::Key& request,
+                                     std::uint32_t max_wait_ms, std::uint64_t first, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
+    reader->timeout_ms = std::min(request.timeout_ms(), max_wait_ms);
     reader->pub_socket = &pub_socket;
-    if (request.shared_memory) join(*reader, first, listener);
-    reader->has_answer = reader->member >= 0 || !request.confirms_end;
+    if (request.has(wire::Key::shared_memory)) join(*reader, first, listener);
+    reader->has_answer = reader->member >= 0 || !request.has(wire::Key::confirms_end);
     ++(reader->member >= 0 ? members_ : pub_socket.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -97,7 +99,7 @@ class Readers {
   // Whether some reader has still to come to its socket; a reliable one misses what is sent meanwhile.
   bool is_moving(bool strict_only) const noexcept {
     return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
-      return reader->is_moving && (reader->request.strict || !strict_only);
+      return reader->is_moving && (reader->request.has(wire::Key::strict) || !strict_only);
     });
   }
 
@@ -141,7 +143,8 @@ class Readers {
     ring_.reset();  // its readers keep what is in it
     const auto is_settled = [&](const auto& reader) {
       const auto& request = reader->request;
-      return reader->member >= 0 || !request.confirms || reader->confirmed >= sequence + (request.confirms_end ? 1 : 0);
+      return reader->member >= 0 || !request.has(wire::Key::confirms) ||
+             reader->confirmed >= sequence + (request.has(wire::Key::confirms_end) ? 1 : 0);
     };
     all_.erase(std::remove_if(all_.begin(), all_.end(), is_settled), all_.end());
     const auto strict = std::count_if(all_.begin(), all_.end(), [](const auto& reader) { return reader->pub_socket->strict; });
@@ -154,7 +157,7 @@ class Readers {
   std::uint32_t timeout_ms(const PubSocket& pub_socket) const noexcept {
     std::uint32_t longest = 0;
     for (const auto& reader : all_) {
-      if (reader->pub_socket == &pub_socket && reader->member < 0) longest = std::max(longest, reader->request.timeout_ms);
+      if (reader->pub_socket == &pub_socket && reader->member < 0) longest = std::max(longest, reader->timeout_ms);
     }
     return longest;
   }
@@ -178,7 +181,7 @@ class Readers {
     if (ring_ == nullptr) {
       cortex_hello_close(&hello);
     } else {
-      reader.member = cortex_writer_add(ring_.get(), &hello, request.strict ? 1 : 0, request.timeout_ms, first);
+      reader.member = cortex_writer_add(ring_.get(), &hello, request.has(wire::Key::strict) ? 1 : 0, reader.timeout_ms, first);
     }
   }
 

@@ -28,8 +28,7 @@ namespace wire {
 constexpr std::uint8_t version = 1;
 constexpr std::size_t header_size = 64;
 constexpr std::size_t prefix_size = 16;  // of a header: what a ZeroMQ subscription matches
-constexpr std::size_t key_size = 32;     // of an attach key
-constexpr std::size_t resume_size = 32;  // of a resume key
+constexpr std::size_t key_size = 32;     // of an attach key, or a resume key
 constexpr std::uint64_t jump_max = std::uint64_t{1} << 32;  // no source loses more messages at once
 constexpr std::uint8_t flag_stamp = 1;
 constexpr std::uint64_t last = 1;  // `aux` of a frame of kind N: nothing follows, the stream ends here
@@ -104,61 +103,36 @@ inline Span<const std::uint8_t> body_of(const Header& header, Span<const std::ui
   return {frame.data() + header_size, static_cast<std::size_t>(header.body_size)};
 }
 
-// What a reader asks for when it attaches to a publisher.
-struct AttachKey {
+// What a reader subscribes to, as it lies in a subscription: kind A with options to attach; kind R, which is given up at once, to say
+// that all below a sequence is accounted for.
+struct Key {
+  static constexpr std::uint64_t shared_memory = 1, strict = 2;
+  static constexpr std::uint64_t confirms = 4;      // it says how far it has read, when it is told how many messages there have been
+  static constexpr std::uint64_t confirms_end = 8;  // it says so of the answer, too, and of the end of the stream
+
+  Key() = default;
+  Key(char letter, std::uint8_t bits, std::uint64_t from, std::uint64_t number, std::uint64_t rest) noexcept
+      : kind(letter), flags(bits), source(from), reader(number), last(rest) {}
+  bool has(std::uint64_t option) const noexcept { return (last & option) != 0; }
+  std::uint32_t timeout_ms() const noexcept { return static_cast<std::uint32_t>(last >> 32); }
+  std::string bytes() const { return {reinterpret_cast<const char*>(this), key_size}; }
+
+  char magic[3] = {'C', 'T', 'X'};
+  char kind = 0;
+  std::uint8_t version = wire::version;
+  std::uint8_t flags = 0;
+  std::uint16_t size = header_size;
   std::uint64_t source = 0;
   std::uint64_t reader = 0;
-  bool shared_memory = false;
-  bool strict = false;
-  std::uint8_t quota = 0;
-  std::uint32_t timeout_ms = 0;
-  bool confirms = false;  // it says how far it has read, when it is told how many messages there have been
-  bool confirms_end = false;  // it says so of the answer, too, and of the end of the stream
+  std::uint64_t last = 0;  // options, or the sequence
 };
+static_assert(sizeof(Key) == key_size, "a key has 32 bytes");
 
-inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
-  std::string bytes(key_size, '\0');
-  auto* out = reinterpret_cast<std::uint8_t*>(bytes.data());
-  write_prefix(out, 'A', flags, key.source);
-  store(out + 16, key.reader);
-  store(out + 24, static_cast<std::uint64_t>(key.shared_memory ? 1 : 0) | (key.strict ? 2u : 0u) | (key.confirms ? 4u : 0u) |
-                      (key.confirms_end ? 8u : 0u) | static_cast<std::uint64_t>(key.quota) << 8 | static_cast<std::uint64_t>(key.timeout_ms) << 32);
-  return bytes;
-}
-
-// What a reliable reader subscribes to, and at once gives up: it has accounted for all below a sequence.
-inline std::string pack_resume(std::uint64_t source, std::uint64_t reader, std::uint64_t sequence,
-                               std::uint8_t flags) {
-  std::string bytes(resume_size, '\0');
-  auto* out = reinterpret_cast<std::uint8_t*>(bytes.data());
-  write_prefix(out, 'R', flags, source);
-  store(out + 16, reader);
-  store(out + 24, sequence);
-  return bytes;
-}
-
-// The source, reader and sequence of a resume key; a source of 0 if the subscription is something else.
-inline std::uint64_t read_resume(Span<const std::uint8_t> bytes, std::uint64_t& reader,
-                                 std::uint64_t& sequence) noexcept {
-  if (bytes.size() != resume_size || std::memcmp(bytes.data(), "CTXR", 4) != 0) return 0;
-  reader = load<std::uint64_t>(bytes.data() + 16);
-  sequence = load<std::uint64_t>(bytes.data() + 24);
-  return load<std::uint64_t>(bytes.data() + 8);
-}
-
-// True and the key, if the subscription is one.
-inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
-  if (bytes.size() != key_size || std::memcmp(bytes.data(), "CTXA", 4) != 0) return false;
-  const auto options = load<std::uint64_t>(bytes.data() + 24);
-  key.source = load<std::uint64_t>(bytes.data() + 8);
-  key.reader = load<std::uint64_t>(bytes.data() + 16);
-  key.shared_memory = (options & 1) != 0;
-  key.strict = (options & 2) != 0;
-  key.confirms = (options & 4) != 0;
-  key.confirms_end = (options & 8) != 0;
-  key.quota = static_cast<std::uint8_t>(options >> 8);
-  key.timeout_ms = static_cast<std::uint32_t>(options >> 32);
-  return true;
+// The key that was subscribed; of kind 0 if it was something else.
+inline Key read_key(Span<const std::uint8_t> bytes) noexcept {
+  Key key;
+  if (bytes.size() == key_size && std::memcmp(bytes.data(), key.magic, sizeof key.magic) == 0) std::memcpy(&key, bytes.data(), key_size);
+  return key;
 }
 
 struct AttachAnswer {

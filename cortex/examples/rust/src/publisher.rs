@@ -79,17 +79,22 @@ impl Publisher {
         strict.map(|reader| (reader.options >> 32).min(MAX_WAIT_MS)).max().unwrap_or(0)
     }
 
-    /// Send to all; those reliable readers that have no room in time are passed over. Whether there were none.
-    fn send(&mut self, frame: &[u8], wait_ms: u64) -> Result<bool> {
+    /// Send to all, unless a reliable reader has no room in time; false if none of the reliable ones got it.
+    fn try_send(&self, frame: &[u8], wait_ms: u64) -> Result<bool> {
         let _ = self.lossy.send(frame, DONTWAIT);
         self.strict.set_sndtimeo(wait_ms as i32)?;
-        if self.strict.send(frame, 0).is_ok() {
-            return Ok(true);
+        Ok(self.strict.send(frame, 0).is_ok())
+    }
+
+    /// Send to all. Libzmq passes over those reliable readers that have no room in time until they have read: they are late.
+    fn send(&mut self, frame: &[u8], wait_ms: u64) -> Result<()> {
+        if !self.try_send(frame, wait_ms)? {
+            set_nodrop(&mut self.strict, false)?;
+            self.strict.send(frame, DONTWAIT)?;
+            set_nodrop(&mut self.strict, true)?;
+            self.late = Some(self.next);
         }
-        set_nodrop(&mut self.strict, false)?;
-        self.strict.send(frame, DONTWAIT)?;
-        set_nodrop(&mut self.strict, true)?;
-        Ok(false)
+        Ok(())
     }
 
     /// A frame that goes to all, with the time.
@@ -103,9 +108,7 @@ impl Publisher {
         let body = body::encode(&self.schema, message)?;
         let frame = self.frame(Header { kind: b'M', stamp_ns, ..self.head }, &body)?;
         self.next += 1;
-        if !self.send(&frame, self.wait_ms())? {
-            self.late = Some(self.next);
-        }
+        self.send(&frame, self.wait_ms())?;
         self.timeouts += self.late.is_some() as u64;
         self.tell_at = Some(Instant::now() + SILENCE);
         Ok(())
@@ -120,7 +123,8 @@ impl Publisher {
             }
         }
         if self.tell_at.is_some_and(|at| at <= Instant::now()) {
-            self.tell_at = (!self.tell(0)?).then(|| Instant::now() + SILENCE);
+            let told = self.tell(0)? && self.late.is_none(); // to who is late it may not have come
+            self.tell_at = (!told).then(|| Instant::now() + SILENCE);
         }
         Ok(())
     }
@@ -153,9 +157,8 @@ impl Publisher {
     }
 
     /// Tell readers how many messages there were, or at the end will be; false if a reliable one has no room for it.
-    fn tell(&mut self, aux: u64) -> Result<bool> {
-        let frame = self.frame(Header { kind: b'N', aux, ..self.head }, &[])?;
-        self.send(&frame, 0)
+    fn tell(&self, aux: u64) -> Result<bool> {
+        self.try_send(&self.frame(Header { kind: b'N', aux, ..self.head }, &[])?, 0)
     }
 
     /// Say that the stream is over [E1], and wait until those that say so have read all of it [E2].
