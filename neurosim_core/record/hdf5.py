@@ -35,6 +35,7 @@ Reference: DSEC, Gehrig et al. (2021), https://dsec.ifi.uzh.ch/data-format, for 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import threading
@@ -66,10 +67,14 @@ _ROW_CHUNK = 1024
 _FIRST_FLUSH_BYTES = 65536
 _ATTRIBUTE_MAX_BYTES = 60000
 _DEFLATE_THREADS = 8
+_EXIT_S = 5.0
+"""A flush is waited for so long when the interpreter ends [s]."""
 
 
 class RecordingWriter:
     """Writes packets to a file while they are measured. A context manager.
+
+    Without `close` the file is that of a killed run: what came after the last flush is lost.
 
     Packets of one sensor must come in the order of their stamps. Arrays of 64 kB and more, such as pictures
     and columns of events, are read later and must not change; smaller ones are copied. The first flushes come
@@ -135,6 +140,7 @@ class RecordingWriter:
             raise
         cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
         self._root_camera = cameras[0] if cameras else None
+        atexit.register(self._abandon)
 
     @property
     def pending_bytes(self) -> int:
@@ -181,6 +187,7 @@ class RecordingWriter:
         """
         if not self._file:
             return
+        atexit.unregister(self._abandon)
         try:
             if not self._is_told:  # a failure is reported once
                 for stream in self._streams.values():
@@ -243,6 +250,15 @@ class RecordingWriter:
             self.kept_ns = newest_ns
         except Exception as error:  # raised by `_finish_flush`
             self._failure = error
+
+    def _abandon(self) -> None:
+        """Close the file as it is: HDF5 would do it when there is no interpreter to call, and hang."""
+        flushing = self._flushing
+        if flushing is not None:
+            flushing.join(_EXIT_S)
+        if flushing is None or not flushing.is_alive():
+            self._file.close()
+            self._disk.close()
 
     def _open_stream(self, packet: Packet) -> _Stream:
         name = packet.sensor

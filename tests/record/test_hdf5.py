@@ -390,6 +390,21 @@ def test_killed_run_leaves_a_readable_file(tmp_path, then, caplog):
         assert file["events/t"].shape[0] >= len(t)
 
 
+@pytest.mark.parametrize(
+    "then", ["", "raise SystemExit(0)", "writer.write(packets[60]); writer._begin_flush()"]
+)
+def test_a_program_that_does_not_close_ends_and_leaves_what_was_flushed(tmp_path, then):
+    command = [sys.executable, "-c", CHILD.format(then=then), str(tmp_path / "f.h5")]
+    done = subprocess.run(
+        [*command, str(Path(__file__).parent)], timeout=60, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    with Recording(tmp_path / "f.h5") as flight:
+        assert not flight.clean
+        packets = make_flight(5, [700, 0, 900, 30, 1, 500] * 4)[:-1]
+        assert_same(list(flight.packets()), packets[: 61 if "flush" in then else 50])
+
+
 def test_writing_waits_for_a_slow_disk(tmp_path, monkeypatch):
     """What is not in the file is at most twice the bound and a packet, and nothing of it is lost."""
     rng = np.random.default_rng(0)
