@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from neurosim_core.signals import end_with_parent
 
@@ -41,11 +41,13 @@ class SceneReader:
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
+        self._file.write(json.dumps(read, default=str).encode())  # more than arguments may hold
+        self._file.seek(0)
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", program, json.dumps(read, default=str)],
-            stdin=self._file,  # which is to be written: its number may be 0 here, and is there
+            [sys.executable, "-c", program],
+            stdin=self._file,  # which is to be written, too: its number may be 0 here, and is there
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             preexec_fn=end_with_parent(signal.SIGKILL),
@@ -87,15 +89,18 @@ class SceneReader:
 
 
 def main() -> None:
-    """Be the process: read the scene of the settings in the first argument, and write it to file 0."""
+    """Be the process: read the settings in file 0, and write their scene in their place."""
     gc.disable()  # it ends soon
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    _write(json.loads(sys.argv[1]))
+    with open(0, "r+b") as file:
+        settings = json.load(file)
+        file.seek(0)
+        _write(settings, file)
 
 
-def _write(settings: Mapping[str, Any]) -> None:
-    """Read a scene, compute what its light and its pictures need, and write all to standard input."""
+def _write(settings: Mapping[str, Any], file: BinaryIO) -> None:
+    """Read a scene, compute what its light and its pictures need, and write all to a file."""
     from neurosim_core.registry import find
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
@@ -119,8 +124,7 @@ def _write(settings: Mapping[str, Any]) -> None:
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
     views = [buffer.raw() for buffer in buffers]
-    with open(0, "wb") as file:
-        pickle.dump(([view.nbytes for view in views], body), file)
-        for view in views:
-            file.write(bytes(-file.tell() % _ALIGNMENT))
-            file.write(view)
+    pickle.dump(([view.nbytes for view in views], body), file)
+    for view in views:
+        file.write(bytes(-file.tell() % _ALIGNMENT))
+        file.write(view)

@@ -17,6 +17,7 @@ from small_room import room_scene
 
 import neurosim_core as ns
 from neurosim_core.render.refine import refine
+from neurosim_core.scene.hall import HallConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.scene.scene import Scene
@@ -129,6 +130,15 @@ def test_a_picture_that_cannot_be_decoded_counts_where_somebody_looks(tmp_path):
         assert len(reader.scene(config, pictures=False).faces) == 12
         with pytest.raises(SceneError, match="cannot be decoded"):
             reader.scene(config)
+
+
+def test_settings_of_a_scene_may_be_long(monkeypatch):
+    """Longer than an argument of a process on Linux, 128 KiB."""
+    boxes = [{"position_m": [0.001 * k, 1.0, 1.0], "size_m": [0.1, 0.1, 0.1]} for k in range(2000)]
+    config = HallConfig.model_validate({"boxes": boxes})
+    monkeypatch.setattr(HallConfig, "load", None)
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert len(reader.scene(config).faces) > 12 * len(boxes)
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
