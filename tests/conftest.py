@@ -12,7 +12,6 @@ from pathlib import Path
 import hypothesis
 import pytest
 import warp as wp
-from _pytest.assertion import rewrite
 from alone import pytest_runtest_protocol
 
 from neurosim_core.warp_start import start_warp
@@ -55,31 +54,13 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_configure(config: pytest.Config) -> None:
     """Keep the order of the files; pytest-xdist would begin with those of the most tests.
 
-    What is compiled is compiled once: packages before the workers start, of the tests a share by each worker.
+    Packages are compiled once, before the workers start.
     """
-    workerinput = getattr(config, "workerinput", None)
-    if workerinput is not None:
-        _rewrite_asserts(config, int(workerinput["workerid"].removeprefix("gw")) / workerinput["workercount"])
-    elif not sys.dont_write_bytecode:
+    if not hasattr(config, "workerinput") and not sys.dont_write_bytecode:
         for package in ("cortex", "cortex_ros2_bridge", "neurosim_core"):
             compileall.compile_dir(Path(__file__).parents[1] / package, quiet=2, workers=0)
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
-
-
-def _rewrite_asserts(config: pytest.Config, begin: float) -> None:
-    """Write the code of tests as pytest reads it, beginning at a share of all files.
-
-    All workers collect in the same order, and each would rewrite the asserts of each file at the same time.
-    """
-    paths = sorted(Path(__file__).parent.rglob("test_*.py"))
-    first = round(begin * len(paths))
-    for path in [] if sys.dont_write_bytecode else paths[first:] + paths[:first]:
-        compiled = rewrite.get_cache_dir(path) / f"{path.stem}{rewrite.PYC_TAIL}"
-        if not compiled.exists():  # one that is too old is written anew when it is imported
-            compiled.parent.mkdir(exist_ok=True)
-            source_hash, code = rewrite._rewrite_test(path, config)
-            rewrite._write_pyc(config.stash[rewrite.assertstate_key], code, source_hash, compiled)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

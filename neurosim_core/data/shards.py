@@ -27,9 +27,17 @@ _FACTS = ("stamp_ns", "start_ns", "source", "width", "height", "dropped_count", 
 def write_shards(samples: Iterable[Sample], folder: Path, *, windows: int = 1000) -> list[Path]:
     """Write windows into shards in a new folder; the same windows give the same bytes.
 
-    `samples`: such as a `Dataset`, or `RunSource(...).samples(...)`; taken one by one. `folder`: it appears
-    once all shards are complete. `windows`: of a shard, the last of which may have fewer. Returns the shards,
-    `windows-000000.tar` and so on.
+    Args:
+        samples: Such as a `Dataset`, or `RunSource(...).samples(...)`; taken one by one.
+        folder: It appears once all shards are complete.
+        windows: Of a shard, the last of which may have fewer.
+
+    Returns:
+        The shards, `windows-000000.tar` and so on.
+
+    Raises:
+        FileExistsError: The folder is there already.
+        ValueError: `windows` is less than 1.
     """
     if windows < 1:
         raise ValueError(f"windows must be at least 1, got {windows}")

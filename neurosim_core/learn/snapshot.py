@@ -14,7 +14,7 @@ from neurosim_core.learn.task import Task
 _LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
     "_scenes", "_model", "_routes", "_timetable", "_observations", "observation", "_status", "buffers",
     "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_pose_launches", "_record",
-    "_hosts",
+    "_flights", "_offsets_ns", "_hosts",
 }  # fmt: skip
 
 Place = tuple[str, Any, str, Any]

@@ -51,11 +51,12 @@ class SceneReader:
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
-    def scene(self, config: SceneConfig) -> Scene:
+    def scene(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
         """Wait for the scene and return it; what the process could not read is read here.
 
         Args:
             config: The settings, checked.
+            pictures: See `SceneConfig.load`; they are decoded if the process could.
 
         Raises:
             SceneError: A file cannot be used.
@@ -72,7 +73,7 @@ class SceneReader:
             read, scene = pickle.loads(body, buffers=buffers)
             if read == config:
                 return scene
-        return config.load()
+        return config.load(pictures=pictures)
 
     def __enter__(self) -> SceneReader:
         return self

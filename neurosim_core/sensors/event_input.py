@@ -87,10 +87,22 @@ def as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
     return stamps
 
 
-def are_ends(ends_ns: Sequence[int], start_ns: int, now_ns: int) -> bool:
-    """Return whether windows that begin at a stamp can end so."""
+def check_ends(ends_ns: Sequence[int], *, start_ns: int, now_ns: int) -> None:
+    """Refuse ends of windows [ns] that do not increase from a stamp, or lie after the newest frame."""
     bounds = [start_ns, *ends_ns]
-    return all(b - a >= NS_PER_US for a, b in itertools.pairwise(bounds)) and bounds[-1] <= now_ns
+    if bounds[-1] > now_ns or any(b - a < NS_PER_US for a, b in itertools.pairwise(bounds)):
+        raise ValueError(
+            f"ends_ns must increase by at least 1000 from {start_ns} and not pass {now_ns}, got {ends_ns}"
+        )
+
+
+def check_span(stamp_ns: int, *, origin_us: int, span_max_ns: int) -> None:
+    """Refuse a frame that is too far from the origin of the keys' time, that of the last window."""
+    span_us = stamp_ns // NS_PER_US - origin_us
+    if span_us * NS_PER_US >= span_max_ns:
+        raise ValueError(
+            f"stamps_ns must be within {span_max_ns / 1e9:g} s of the last window, got {span_us / 1e6:g} s"
+        )
 
 
 def invalid_message(count: int, first: str) -> str:

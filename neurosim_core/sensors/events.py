@@ -309,12 +309,7 @@ class EventCamera:
         event_input.check_stack(
             log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns
         )
-        span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
-        if span_us * NS_PER_US >= self.span_max_ns:
-            limit_s = self.span_max_ns / 1e9
-            raise ValueError(
-                f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
-            )
+        event_input.check_span(int(stamps[-1]), origin_us=self._keys.origin_us, span_max_ns=self.span_max_ns)
 
     def collect(self) -> Events:
         """Return all events up to the last frame fed, and wait for them.
@@ -373,11 +368,7 @@ class EventCamera:
             now_ns = self._require_reset()
             if not ends:
                 return list
-            if not event_input.are_ends(ends, self._window_start_ns, now_ns):
-                raise ValueError(
-                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
-                    f" and not pass {now_ns}, got {ends}"
-                )
+            event_input.check_ends(ends, start_ns=self._window_start_ns, now_ns=now_ns)
             return self._begin_cut(ends)
 
     def _forget(self) -> None:

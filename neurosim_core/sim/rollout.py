@@ -282,8 +282,13 @@ def start(model: Model, state: State) -> list[Packet]:
 def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
     """Fly one batch, at most to what `batch_end_ns` gives, and return what the sensors yield in it.
 
-    The state moves on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
-    (`failure`). The path controller commands.
+    The path controller commands.
+
+    Args:
+        model: What does not change.
+        state: Moved on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
+            (`failure`).
+        end_ns: End of the batch [ns], after the state's stamp.
 
     Raises:
         RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.

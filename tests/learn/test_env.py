@@ -165,6 +165,18 @@ def test_a_rollout_goes_on_from_a_saved_state(make, tmp_path):
         make(worlds=2, **options).load_state_dict(torch.load(tmp_path / "state.pt"))
 
 
+def test_a_state_is_taken_up_where_steps_differ_in_length(make):
+    """By a nanosecond, at 30 Hz: an environment of one step has not had those of all lengths."""
+    task = type("Thirty", (Brief,), {"rate_hz": 30.0})()
+    actions = actions_of(8, 3)
+    env, other = make(task=task), make(task=task)
+    roll(env, actions[:4])
+    other.load_state_dict(env.state_dict())
+    for action in actions[4:]:
+        expected, seen = env.step(action)[0], other.step(action)[0]
+        assert all(torch.equal(seen[name], value) for name, value in expected.items())
+
+
 def test_what_sensors_remember_elsewhere_is_not_saved(make):
     noisy = {"pixel": {"threshold_on": 0.2, "threshold_off": 0.2, "shot_noise": {"rate_hz": 5.0}}}
     env = make(task=type("Noisy", (Brief,), noisy)(), randomise=False)

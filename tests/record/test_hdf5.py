@@ -521,7 +521,7 @@ def test_a_thread_that_fails_is_reported_once_and_leaves_what_was_flushed(tmp_pa
     def fail(*_: object) -> list[bytes]:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(hdf5, "_deflate", fail)
+    monkeypatch.setattr(hdf5, "deflate", fail)
     writer.write(image(stamp_ns=2, shape=(90, 90)))
     with pytest.raises(MemoryError, match="no room"):
         writer.flush()

@@ -119,6 +119,18 @@ os.kill(os.getpid(), signal.SIGKILL)
         time.sleep(0.01)
 
 
+def test_a_picture_that_cannot_be_decoded_counts_where_somebody_looks(tmp_path):
+    box = trimesh.creation.box(extents=(6.0, 4.0, 3.0))
+    image = PIL.Image.fromarray(np.zeros((4, 4, 3), dtype=np.uint8))
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=image)
+    (tmp_path / "box.glb").write_bytes(box.export(file_type="glb").replace(b"\x89PNG", b"none"))
+    config = MeshSceneConfig(file=tmp_path / "box.glb")
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert len(reader.scene(config, pictures=False).faces) == 12
+        with pytest.raises(SceneError, match="cannot be decoded"):
+            reader.scene(config)
+
+
 def test_a_scene_that_nobody_waits_for_is_given_up():
     with SceneReader({"scene": "apartment"}) as reader:
         process = reader._process

@@ -1,0 +1,151 @@
+"""A column of a recording: an array of the file that grows by rows, which threads compress by chunks."""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.record.chunks import import_isal
+
+_KEPT_BYTES = 65536
+"""Pictures and arrays of varying length are kept, not copied, from this size on. A smaller one may be part
+of a large block of memory, which it would hold."""
+_PARTS_MAX = 64
+"""Arrays that are kept apart in a chunk that is not full, when that is flushed."""
+_scratch = threading.local()
+
+
+class Column:
+    """One array of the file that grows by rows, with the rows that are not yet in it."""
+
+    def __init__(
+        self, group: Any, name: str, shape: tuple[int, ...], dtype: Any, *, chunk: int, compressed: bool
+    ) -> None:
+        from h5py import h5s
+
+        # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
+        filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
+        room = [max(1, length) for length in shape]  # an axis may be empty
+        self._dataset = group.create_dataset(
+            name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
+        )
+        self._h5s = h5s
+        self._shape = shape
+        self.chunk = chunk
+        self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
+        self.deflates = compressed and self._dtype.kind != "O" and 0 not in shape
+        self._rows: list[NDArray[Any]] = []
+        """What came since the last flush; if that deflates, what the last chunk holds so far."""
+        self._begin = self._end = self._flushed_end = 0
+        """Where they begin and end, and where the last flush ended."""
+        self._deflated: list[Chunks] = []
+        self._taken: tuple[list[NDArray[Any]], int, int, list[Chunks]] | None = None
+        """Rows, begin, end and chunks for `write_rows`."""
+
+    def append(self, rows: NDArray[Any]) -> int:
+        """Add rows; return their size [bytes]."""
+        is_copied = not self.deflates or rows.nbytes < _KEPT_BYTES
+        block = rows.astype(self._dtype, casting="same_kind", copy=is_copied)
+        self._rows.append(block)
+        self._end += len(block)
+        return block.nbytes
+
+    def cut(self, *, partly: bool) -> tuple[int, list[NDArray[Any]]]:
+        """Return the first row and the rows of chunks to compress: those that are full, or the last one."""
+        first, count = self._begin, self._end - self._begin
+        if partly:
+            if self._end == self._flushed_end:
+                return first, []
+            if len(self._rows) > _PARTS_MAX:
+                self._rows = [np.concatenate(self._rows)]
+            return first, [*self._rows] if count else []
+        if count < self.chunk:
+            return first, []
+        left = count % self.chunk
+        *parts, block = self._rows
+        full, rest = np.split(block, [len(block) - left])
+        self._rows = [rest.copy() if rest.nbytes < _KEPT_BYTES else rest]
+        self._begin = self._end - left
+        return first, [*parts, full]
+
+    def note(self, chunks: Chunks) -> None:
+        """Take chunks that are being compressed."""
+        self._deflated.append(chunks)
+
+    def take(self) -> None:
+        """Set aside for `write_rows` what came since the last flush."""
+        if self._end == self._flushed_end:
+            return
+        self._taken = self._rows, self._begin, self._end, self._deflated
+        self._deflated, self._flushed_end = [], self._end
+        if not self.deflates:
+            self._rows, self._begin = [], self._end
+
+    def write_rows(self) -> None:
+        """Write what was set aside; from another thread."""
+        if self._taken is None:
+            return
+        rows, begin, end, deflated = self._taken
+        self._taken = None
+        self._dataset.id.set_extent((end, *self._shape))
+        for chunks in deflated:
+            for number, chunk in enumerate(chunks.future.result()[chunks.position]):
+                place = (chunks.first + number * self.chunk, *[0] * len(self._shape))
+                self._dataset.id.write_direct_chunk(place, chunk)
+        if self.deflates or 0 in self._shape:
+            return
+        values = np.concatenate(rows)
+        if self._dtype.kind == "O":
+            self._dataset[begin:] = values
+            return
+        place = self._dataset.id.get_space()
+        place.select_hyperslab((begin, *[0] * len(self._shape)), values.shape)
+        self._dataset.id.write(self._h5s.create_simple(values.shape), place, values)  # saves 50 us
+
+
+class Chunks(NamedTuple):
+    """Chunks of one column that are being compressed."""
+
+    first: int
+    """First row."""
+    future: Future[list[list[bytes]]]
+    position: int
+    """Of their list in its result."""
+
+
+def deflate(columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list[bytes]]:
+    """Return what HDF5's filters shuffle and gzip would make of the chunks of each column, faster.
+
+    Args:
+        columns: The parts of the rows of each, and how many rows a chunk has; zeros fill up the last.
+    """
+    return [_deflate_column(parts, length) for parts, length in columns]
+
+
+def _deflate_column(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
+    compress = (import_isal() or zlib).compress
+    size, width = length * int(np.prod(parts[0].shape[1:])), parts[0].itemsize
+    # Memory that comes and goes is mapped under the interpreter's lock, on which the flight waits.
+    if getattr(_scratch, "octets", np.empty(0)).size < size * width:
+        _scratch.octets = np.empty(size * width, np.uint8)
+    planes = _scratch.octets[: size * width].reshape(width, size)
+    chunks, filled = [], 0
+    for part in parts:
+        octets = np.ascontiguousarray(part).reshape(-1, 1).view(np.uint8)
+        while len(octets):
+            taken = octets[: size - filled]
+            planes[:, filled : filled + len(taken)] = taken.T
+            octets, filled = octets[len(taken) :], filled + len(taken)
+            if filled == size:
+                chunks.append(compress(planes, 1))
+                filled = 0
+    if filled:
+        planes[:, filled:] = 0
+        chunks.append(compress(planes, 1))
+    return chunks
