@@ -6,6 +6,7 @@ a name, which is mapped into memory.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import mmap
@@ -41,8 +42,9 @@ class SceneReader:
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
-        self._file.write(json.dumps(read, default=str).encode())  # more than arguments may hold
-        self._file.seek(0)
+        with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
+            # more than arguments may hold; nothing stays in a buffer
+            os.pwrite(self._file.fileno(), json.dumps(read, default=str).encode(), 0)
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         self._process = subprocess.Popen(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import subprocess
 import sys
 import time
@@ -139,6 +141,16 @@ def test_settings_of_a_scene_may_be_long(monkeypatch):
     monkeypatch.setattr(HallConfig, "load", None)
     with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
         assert len(reader.scene(config).faces) > 12 * len(boxes)
+
+
+def test_a_disk_without_room_is_done_without(tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", fail)
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert reader.scene(config).name == "room"
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
