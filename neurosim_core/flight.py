@@ -60,7 +60,7 @@ def fly(
     rerun: bool = True,
     console: Console | None = None,
     began_s: float | None = None,
-    scene: Callable[[], Scene] | None = None,
+    scene: Callable[..., Scene] | None = None,
 ) -> FlightReport:
     """Fly a configuration, hand its packets to its sinks, and leave config.yaml and their files in a folder.
 
@@ -75,7 +75,7 @@ def fly(
         rerun: Write flight.rrd, if that is among the sinks.
         console: Where to print; standard output if None.
         began_s: When the command began, as `time.perf_counter` says; None: now.
-        scene: Returns the scene of `config`; None: it is loaded here.
+        scene: Returns the scene of `config`, as its `load` does; None: it is loaded here.
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.

@@ -6,6 +6,7 @@ a name, which is mapped into memory.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import mmap
@@ -18,7 +19,7 @@ import tempfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from neurosim_core.signals import end_with_parent
 
@@ -41,21 +42,25 @@ class SceneReader:
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
+        with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
+            # more than arguments may hold; nothing stays in a buffer
+            os.pwrite(self._file.fileno(), json.dumps(read, default=str).encode(), 0)
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", program, json.dumps(read, default=str)],
-            stdin=self._file,  # which is to be written: its number may be 0 here, and is there
+            [sys.executable, "-c", program],
+            stdin=self._file,  # which is to be written, too: its number may be 0 here, and is there
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
-    def scene(self, config: SceneConfig) -> Scene:
+    def scene(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
         """Wait for the scene and return it; what the process could not read is read here.
 
         Args:
             config: The settings, checked.
+            pictures: See `SceneConfig.load`; they are decoded if the process could.
 
         Raises:
             SceneError: A file cannot be used.
@@ -72,7 +77,7 @@ class SceneReader:
             read, scene = pickle.loads(body, buffers=buffers)
             if read == config:
                 return scene
-        return config.load()
+        return config.load(pictures=pictures)
 
     def __enter__(self) -> SceneReader:
         return self
@@ -86,15 +91,18 @@ class SceneReader:
 
 
 def main() -> None:
-    """Be the process: read the scene of the settings in the first argument, and write it to file 0."""
+    """Be the process: read the settings in file 0, and write their scene in their place."""
     gc.disable()  # it ends soon
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    _write(json.loads(sys.argv[1]))
+    with open(0, "r+b") as file:
+        settings = json.load(file)
+        file.seek(0)
+        _write(settings, file)
 
 
-def _write(settings: Mapping[str, Any]) -> None:
-    """Read a scene, compute what its light and its pictures need, and write all to standard input."""
+def _write(settings: Mapping[str, Any], file: BinaryIO) -> None:
+    """Read a scene, compute what its light and its pictures need, and write all to a file."""
     from neurosim_core.registry import find
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
@@ -118,8 +126,7 @@ def _write(settings: Mapping[str, Any]) -> None:
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
     views = [buffer.raw() for buffer in buffers]
-    with open(0, "wb") as file:
-        pickle.dump(([view.nbytes for view in views], body), file)
-        for view in views:
-            file.write(bytes(-file.tell() % _ALIGNMENT))
-            file.write(view)
+    pickle.dump(([view.nbytes for view in views], body), file)
+    for view in views:
+        file.write(bytes(-file.tell() % _ALIGNMENT))
+        file.write(view)

@@ -63,7 +63,7 @@ class Model:
 def make_model(
     config: SimulationConfig,
     *,
-    scene: Scene | Callable[[], Scene] | None = None,
+    scene: Scene | Callable[..., Scene] | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> Model:
@@ -71,7 +71,8 @@ def make_model(
 
     Args:
         config: What to fly; one vehicle.
-        scene: Where to fly, in place of what `config` says, or what returns it; None: as it says.
+        scene: Where to fly, in place of what `config` says, or what returns it, called as
+            `SceneConfig.load` is; None: as it says.
         on_phase: Told the name of each part of the work when it begins.
         meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`), and
             with what says whether the scene is lit.
@@ -112,7 +113,7 @@ def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Mo
 def make_fleet(
     config: SimulationConfig,
     *,
-    scene: Scene | Callable[[], Scene] | None = None,
+    scene: Scene | Callable[..., Scene] | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> dict[str, Model]:
@@ -137,7 +138,7 @@ def make_fleet(
                 scene = config.scene.load(pictures=seeing)
             elif not isinstance(scene, Scene):
                 load_scipy()  # while another process reads
-                scene = scene()
+                scene = scene(pictures=seeing)
             bodies = make_bodies(config.bodies) if seeing else ()
         beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
         light = functools.partial(  # needs no path: both at once

@@ -66,7 +66,7 @@ def too_many_values() -> bytes:
 
 def test_vectors_and_damaged_bodies(programs):
     """Good bodies return as the same bytes, bad ones are rejected, damaged ones do no harm (ASan, UBSan)."""
-    lines = [f"Lists bad {too_many_values().hex()}"]
+    lines = [f"Lists bad {too_many_values().hex()} flags"]
     for vector in load_vectors().values():
         name = short(Schema.from_json(vector["schema"]))
         lines += [f"{name} good {case['body']}" for case in vector["cases"]]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import subprocess
 import sys
 import time
@@ -17,6 +19,7 @@ from small_room import room_scene
 
 import neurosim_core as ns
 from neurosim_core.render.refine import refine
+from neurosim_core.scene.hall import HallConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.scene.scene import Scene
@@ -117,6 +120,37 @@ os.kill(os.getpid(), signal.SIGKILL)
     while state.exists() and state.read_text().split()[2] != "Z":
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def test_a_picture_that_cannot_be_decoded_counts_where_somebody_looks(tmp_path):
+    box = trimesh.creation.box(extents=(6.0, 4.0, 3.0))
+    image = PIL.Image.fromarray(np.zeros((4, 4, 3), dtype=np.uint8))
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=image)
+    (tmp_path / "box.glb").write_bytes(box.export(file_type="glb").replace(b"\x89PNG", b"none"))
+    config = MeshSceneConfig(file=tmp_path / "box.glb")
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert len(reader.scene(config, pictures=False).faces) == 12
+        with pytest.raises(SceneError, match="cannot be decoded"):
+            reader.scene(config)
+
+
+def test_settings_of_a_scene_may_be_long(monkeypatch):
+    """Longer than an argument of a process on Linux, 128 KiB."""
+    boxes = [{"position_m": [0.001 * k, 1.0, 1.0], "size_m": [0.1, 0.1, 0.1]} for k in range(2000)]
+    config = HallConfig.model_validate({"boxes": boxes})
+    monkeypatch.setattr(HallConfig, "load", None)
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert len(reader.scene(config).faces) > 12 * len(boxes)
+
+
+def test_a_disk_without_room_is_done_without(tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", fail)
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        assert reader.scene(config).name == "room"
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():

@@ -116,6 +116,7 @@ class HostilePublisher {
   // Goes on until it has written so often.
   void run(std::uint64_t writes) {
     while (writes_ < writes) {
+      is_silent = is_expected.load();
       take_in();
       if (!open_) continue;
       steps.wait();
@@ -129,7 +130,7 @@ class HostilePublisher {
           publish_large();
           break;
         case 4:
-          if (random_() % 16 == 0) send_damaged();
+          if (!is_silent && random_() % 16 == 0) send_damaged();
           break;
         case 5:
           if (random_() % 64 == 0) welcome();
@@ -143,6 +144,8 @@ class HostilePublisher {
 
   std::atomic<bool> done{false};
   std::atomic<std::uint64_t> sessions{0};
+  // Until who comes next has its answer nothing goes through the socket: it would not know what was before it.
+  std::atomic<bool> is_expected{true}, is_silent{false};
   Steps steps;  // of who reads
 
  private:
@@ -164,6 +167,7 @@ class HostilePublisher {
         open_ = cortex_writer_open(&writer_, source, 1 << 16) == 0 && cortex_writer_grow(&writer_, 1 << 16, 8, 1 << 14) == 0;
         expect(open_ && cortex_writer_add(&writer_, &hello, 1, 0, 0) == 0, "a reader is taken in");
         sequence_ = 0;
+        is_expected = is_silent = false;
         ++sessions;
       }
       const std::string name(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
@@ -187,7 +191,7 @@ class HostilePublisher {
   void put(const std::string& frame) { sequence_ += cortex_writer_put(&writer_, frame.data(), frame.size(), 0) != CORTEX_FULL; }
 
   void publish_small() {
-    if (random_() % 8 != 0) return put(message('M'));
+    if (random_() % 8 != 0) return put(random_() % 16 == 0 ? damaged() : message('M'));
     const std::string frame = header('N', 0, 0);
     cortex_writer_put(&writer_, frame.data(), frame.size(), 0);
   }
@@ -206,11 +210,17 @@ class HostilePublisher {
     }
   }
 
-  // Through the socket: a frame with a few bytes changed, or parts that do not belong together.
-  void send_damaged() {
+  // A frame with a few bytes changed, or cut off.
+  std::string damaged() {
     std::string frame = random_() % 2 == 0 ? message("ML"[random_() % 2]) : header("LNSAR"[random_() % 5], random_() % 4096, 0);
     for (std::uint64_t edits = random_() % 4; edits > 0; --edits) frame[16 + random_() % (frame.size() - 16)] = static_cast<char>(random_());
     frame.resize(frame.size() - (random_() % 4 == 0 ? random_() % frame.size() : 0));
+    return frame;
+  }
+
+  // Through the socket: such a frame, or parts that do not belong together.
+  void send_damaged() {
+    const std::string frame = damaged();
     const bool more = random_() % 3 == 0;
     socket_.send(zmq::buffer(frame), more ? zmq::send_flags::sndmore : zmq::send_flags::none);
     if (more) socket_.send(zmq::buffer(body()), zmq::send_flags::none);
@@ -288,12 +298,17 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
   const cortex::detail::TypeId type{cortex::Codec<Rich>::fingerprint, true};
   std::uint64_t taken = 0, looks = 0, decoded = 0, rejected = 0;
   while (!publisher.done) {
+    publisher.is_expected = true;
+    while (!publisher.is_silent && !publisher.done) {
+      publisher.steps.count();
+      std::this_thread::yield();
+    }
     const auto counters = std::make_shared<cortex::SubscriberCounters>();
     const auto complaints = std::make_shared<cortex::net::Complaints>(cortex::Log{});
     cortex::detail::Link link(context, "ipc://" + directory + "/1.strict", source, type, policy, true, [](zmq::socket_t&) {},
                               counters, complaints);
     std::deque<cortex::detail::Item> queue, held;
-    std::uint64_t accepted = 0, begin = 0;
+    std::uint64_t accepted = 0;
     for (int idle = 0; link.bell_fd() >= 0 && !publisher.done && idle < 500;) {
       const bool none = in_time([&] { return link.drain(queue, 1); });
       publisher.steps.count();
@@ -304,8 +319,7 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
       decoded += !held.empty() && in_time([&] { return look(held.back()); });  // once more: it may have changed
       while (!queue.empty()) {
         ++accepted;
-        if (accepted == 1 && !link.attached()) begin = queue.front().sequence;  // it came before the answer: what was before it is not ours
-        const std::uint64_t uncounted = queue.front().sequence + 1 - begin - accepted - counters->lost;
+        const std::uint64_t uncounted = queue.front().sequence + 1 - accepted - counters->lost;
         expect(uncounted <= counters->rejected, "every message is received, lost or rejected");
         held.push_back(std::move(queue.front()));
         queue.pop_front();
@@ -318,8 +332,7 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
   thread.join();
   std::cout << "publisher: " << publisher.sessions << " sessions, " << taken << " messages, " << decoded << " of " << looks
             << " decoded, " << rejected << " frames rejected" << std::endl;
-  const bool are_few = writes < 100'000;  // of which one in 10,000 has a frame rejected
-  expect(taken > 0 && decoded > 0 && decoded < looks && (rejected > 0 || are_few), "some messages are good, and some are not");
+  expect(taken > 0 && decoded > 0 && decoded < looks && rejected > 0, "some messages are good, and some are not");
 }
 
 // A message that says itself whether it is whole: all its words are its number.

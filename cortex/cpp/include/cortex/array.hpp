@@ -218,12 +218,14 @@ class Array {
     return items;
   }
   void allocate(bool zero) {
+    for (const auto extent : shape_) {
+      if (extent == 0) return;  // whatever the others are
+    }
     std::size_t items = 1;
     for (const auto extent : shape_) {
-      if (extent != 0 && items > (std::size_t{1} << 40) / extent) throw std::invalid_argument("an array is too large");
+      if (items > (std::size_t{1} << 40) / extent) throw std::invalid_argument("an array is too large");
       items *= extent;
     }
-    if (items == 0) return;
     owned_.reset(zero ? new T[items]() : new T[items]);
     data_ = mutable_ = owned_.get();
   }

@@ -44,6 +44,7 @@ typedef struct {
     uint64_t left; /* bytes that items may still take: they may not be larger together than the body that brings them */
     uint64_t values_left;
     const char *wrong; /* what is, once something was refused */
+    const CortexItem *field; /* of the outermost message, in which it is; NULL: in none */
     void *owner;       /* of the memory */
 } CortexRead;
 
@@ -57,6 +58,7 @@ typedef struct {
     uint64_t filled; /* of the block, or of a list, all below this is written */
     uint64_t values_left;
     const char *wrong;
+    const CortexItem *field;
 } CortexWrite;
 
 #endif

@@ -128,7 +128,10 @@ static inline int cortex_read_message(CortexRead *read, const CortexItem *item, 
     cortex_begin_scope(sizes, item->scope);
     const CortexItem *field = read->items + item->first, *end = field + item->count;
     for (; field < end; ++field)
-        if (!cortex_read_item(read, field, at + (uint64_t)field->offset, message + field->place, sizes)) return 0;
+        if (!cortex_read_item(read, field, at + (uint64_t)field->offset, message + field->place, sizes)) {
+            read->field = field; /* whoever is further out writes it last */
+            return 0;
+        }
     return 1;
 }
 
@@ -180,6 +183,7 @@ static inline int cortex_read_body(
     read->left = size - block;
     read->values_left = CORTEX_VALUES;
     read->wrong = NULL;
+    read->field = NULL;
     read->owner = owner;
     if (size < block || size >= CORTEX_BODY_LIMIT || (size > block && !items->has_tail)) return cortex_reject(read, "a body has a wrong size");
     return cortex_read_message(read, items, 0, place);
@@ -286,7 +290,11 @@ static inline int cortex_write_message(CortexWrite *write, const CortexItem *ite
     cortex_begin_scope(sizes, item->scope);
     const CortexItem *field = write->items + item->first, *end = field + item->count;
     for (; field < end; ++field)
-        if ((write->out != NULL || field->has_tail) && !cortex_write_item(write, field, at + (uint64_t)field->offset, message + field->place, sizes)) return 0;
+        if ((write->out != NULL || field->has_tail)
+            && !cortex_write_item(write, field, at + (uint64_t)field->offset, message + field->place, sizes)) {
+            write->field = field;
+            return 0;
+        }
     return 1;
 }
 
@@ -331,6 +339,7 @@ static inline int cortex_write_body(CortexWrite *write, const CortexItem *items,
     write->filled = 0;
     write->values_left = CORTEX_VALUES;
     write->wrong = NULL;
+    write->field = NULL;
     if (write->end > write->limit) return cortex_refuse(write, "a message does not fit");
     if (!cortex_write_message(write, items, 0, place)) return 0;
     if (out != NULL) cortex_reach(write, block, 0);

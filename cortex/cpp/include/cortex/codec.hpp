@@ -281,11 +281,19 @@ constexpr std::size_t block_of() noexcept {
 
 namespace detail {
 
+// Of what type, and in which of its fields, something is wrong.
+template <class T>
+std::string complaint(const char* wrong, const CortexItem* field) {
+  std::string where(Codec<T>::name);
+  if (field != nullptr) where.append(".").append(Codec<T>::names[field - &Codec<T>::items[Codec<T>::items[0].first]]);
+  return where + ": " + wrong;
+}
+
 template <class T>
 std::size_t write_body(const T& message, std::uint8_t* out, std::size_t placed, std::size_t limit) {
   CortexWrite write;
   if (cortex_write_body(&write, Codec<T>::items, out, placed, limit, reinterpret_cast<const char*>(&message)) != 0) return write.end;
-  throw std::invalid_argument(std::string(Codec<T>::name) + ": " + write.wrong);
+  throw std::invalid_argument(complaint<T>(write.wrong, write.field));
 }
 
 }  // namespace detail
@@ -315,7 +323,7 @@ template <class T>
 void decode_into(Span<const std::uint8_t> body, T& out) {
   CortexRead read;
   if (cortex_read_body(&read, Codec<T>::items, body.data(), body.size(), nullptr, reinterpret_cast<char*>(&out)) != 0) return;
-  throw MalformedMessage(std::string(Codec<T>::name) + ": " + read.wrong);
+  throw MalformedMessage(detail::complaint<T>(read.wrong, read.field));
 }
 
 template <class T>
