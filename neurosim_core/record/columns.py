@@ -48,6 +48,11 @@ class Column:
         self._taken: tuple[list[NDArray[Any]], int, int, list[Chunks]] | None = None
         """Rows, begin, end and chunks for `write_rows`."""
 
+    def check(self, rows: NDArray[Any]) -> None:
+        """Refuse, with a TypeError, rows of a type that the column cannot hold."""
+        if not np.can_cast(rows.dtype, self._dtype, casting="same_kind"):
+            raise TypeError(f"{self._dataset.name} holds {self._dtype}, got {rows.dtype}")
+
     def append(self, rows: NDArray[Any]) -> int:
         """Add rows; return their size [bytes]."""
         is_copied = not self.deflates or rows.nbytes < _KEPT_BYTES

@@ -331,6 +331,9 @@ class _Stream:
         fixed = self._fixed_part(values)
         if fixed != self._fixed:
             raise ValueError(f"sensor {packet.sensor!r} was {self._fixed} before, got {fixed}")
+        for field in self._fields:  # before any column has grown: a packet is written whole, or not at all
+            if not field.constant:
+                self._columns[field.name].check(values[field.name])
         size = 0
         if self._is_events:
             size += self._append_index(values["t"], packet.stamp_ns)

@@ -487,6 +487,18 @@ def test_packets_that_do_not_fit_are_refused(tmp_path, second, message):
         assert_same(list(flight.packets()), [image(stamp_ns=10)])
 
 
+def test_a_packet_of_a_wrong_type_leaves_nothing(tmp_path):
+    samples = [packet for packet in make_flight(0, [50, 50, 50]) if isinstance(packet, Events)]
+    wrong = replace(samples[1], polarity=samples[1].polarity.astype(np.float64))
+    with RecordingWriter(tmp_path / "f.h5", HEADER) as writer:
+        writer.write(samples[0])
+        with pytest.raises(TypeError, match="float64"):
+            writer.write(wrong)
+        writer.write(samples[2])
+    with Recording(tmp_path / "f.h5") as flight:
+        assert_same(list(flight.packets()), [samples[0], samples[2]])
+
+
 def test_unwritable_path_is_named(tmp_path):
     with pytest.raises(OSError, match=r"cannot write .*nowhere/f.h5.*No such file or directory"):
         RecordingWriter(tmp_path / "nowhere" / "f.h5", HEADER)
