@@ -69,6 +69,8 @@ class ImageChannel:
     constants: Mapping[str, Any] = field(default_factory=dict)
     """Fields that all its packets have."""
     sequence: int = 0
+    gives_images: bool = False
+    """Its last packet was an `Image`: pictures of its next one may be lent."""
 
     @property
     def output(self) -> str:

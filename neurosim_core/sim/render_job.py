@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import Rate
-from neurosim_core.packets import Packet
+from neurosim_core.packets import Image, Packet
 from neurosim_core.render.outputs import INSTANT_OUTPUTS
 from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.scene.bodies import (
@@ -259,7 +259,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
     """Return the pictures of a batch that the device has finished with.
 
     With `borrow` those for which the caller has no room are views that are valid until the buffers are
-    overwritten, not copies.
+    overwritten, not copies, if what their sensor yields is an `Image`.
     """
     copies: dict[tuple[str, int], NDArray[Any]] = {}
 
@@ -268,7 +268,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         if room is not None:
             return room
         picture: NDArray[Any] = group.buffers[instants.buffer_index].copies[image.source].view(slot, 1)[0]
-        if borrow:
+        if borrow and image.gives_images:
             return picture
         key = (image.source, slot)  # cameras that take the same picture share the copy
         if key not in copies:
@@ -280,7 +280,11 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         image = group.images[name]
         picture = copy_of(image, slot, name, stamp_ns)
         header = {"stamp_ns": stamp_ns, "sequence": image.sequence, "sensor": name}
-        packets.append(image.config.packet(picture, **image.constants, **header))
+        packet = image.config.packet(picture, **image.constants, **header)
+        packets.append(packet)
+        image.gives_images = isinstance(
+            packet, Image
+        )  # of other packets nobody knows whether they keep a view
         image.sequence += 1
     return packets
 

@@ -447,6 +447,21 @@ def test_borrowed_pictures_are_those_of_the_step(settings, instants):
         assert sum(packet.sensor == "rgb" for packet in own) == (3 if number == 0 else 2)
 
 
+def test_only_images_are_lent(settings):
+    """Packets of other types keep their picture: who records them later has it as it was."""
+    lens = {"width": 12, "height": 8, "horizontal_fov_rad": 1.5}
+    sensors = {"radiance": {"kind": "log_radiance", "rate_hz": 100, "lens": lens}}
+    model = sim.make_model(ns.load_config({**settings, "sensors": sensors}))
+    state = sim.make_state(model, in_flight=1, borrow_pictures=True)
+    packets = [packet for _ in range(4) for packet in sim.step(model, state, 1.05 * hover(model))]
+    before = [np.array(packet.data) for packet in packets]
+    for _ in range(4):
+        sim.step(model, state, 1.05 * hover(model))
+    assert not np.array_equal(before[0], before[-1])
+    for packet, data in zip(packets, before, strict=True):
+        np.testing.assert_array_equal(packet.data, data)
+
+
 class LateCopies:
     """Copies to the host are done when somebody waits for a milestone that was set after them."""
 
