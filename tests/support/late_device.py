@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.runtime import cuda
-from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
+from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, event_states, events
 
-_MODULES = (cuda, events, event_keys, event_pixels, event_readout)
+_MODULES = (cuda, events, event_keys, event_pixels, event_states, event_readout)
 
 
 class LateStream:
