@@ -5,10 +5,13 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
+import pytest
+
 import neurosim_core as ns
 
 
 def test_it_has_every_sensor_and_scene_and_a_remark_on_each_key():
+    pytest.importorskip("mkdocs", reason="needs the extra docs", exc_type=ImportError)
     page = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "pages.py"))["settings_page"]()
     for kind in ("apartment", "hall", "mesh"):
         assert f"## `scene`, kind `{kind}`" in page
