@@ -195,7 +195,7 @@ def _stretches(batch: Batch, *, joined: bool) -> Iterator[tuple[Boundary, int, i
     Those are joined that are equal, and between which nothing is due.
     """
     count = 0
-    following = [*batch.elapsed_ns[1:], 0]
+    following = [*batch.elapsed_ns[1:], -1]  # no span is that long: the last one is yielded, also one of 0
     for boundary, span_ns, next_ns in zip(batch.boundaries, batch.elapsed_ns, following, strict=True):
         count += 1
         if not joined or boundary.samplers or boundary.control or next_ns != span_ns:
