@@ -166,7 +166,7 @@ class ControlThread:
         self._directory.tick(now_ns)
         self._pub_sockets.tick()
         self._pub_sockets.emit_notes()
-        offset_ns = self._directory.clock.offset_ns(now_ns)
+        offset_ns = self._directory.clock.offset_ns()
         if abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
             self._clock_offset_ns = offset_ns
             self._on_clock(offset_ns)
