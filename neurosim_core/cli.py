@@ -153,9 +153,6 @@ def _add_fly(commands: _Commands) -> None:
         help="what to command (default: motor_speeds)",
     )
     fly.add_argument(
-        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
-    )
-    fly.add_argument(
         "--policy",
         metavar="NAME",
         help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
@@ -336,7 +333,7 @@ def _fly(arguments: argparse.Namespace) -> int:
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
     with handle_signals(signal.default_int_handler):
-        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
+        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
 
 
 def _up(arguments: argparse.Namespace) -> int:
