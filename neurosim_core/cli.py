@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from neurosim_core import __version__, docs
+from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
@@ -112,14 +112,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
     others = (
-        _add_gallery,
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
         fit.add_parser,
         bench.add_parser,
         learn.add_parsers,
-        docs.add_parser,
     )
     for add in (*parsers, *others):
         add(commands)
@@ -154,9 +152,6 @@ def _add_fly(commands: _Commands) -> None:
         default="motor_speeds",
         choices=["motor_speeds", "velocity", "position"],
         help="what to command (default: motor_speeds)",
-    )
-    fly.add_argument(
-        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
     )
     fly.add_argument(
         "--policy",
@@ -266,20 +261,6 @@ def _add_view(commands: _Commands) -> None:
     view.set_defaults(command=_view)
 
 
-def _add_gallery(commands: _Commands) -> None:
-    gallery = commands.add_parser(
-        "gallery", help="draw every sensor, pixel preset, lens and scene, and films, on one page"
-    )
-    gallery.add_argument(
-        "--out", type=Path, default=Path("gallery.html"), metavar="HTML", help="default: gallery.html"
-    )
-    gallery.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    gallery.add_argument(
-        "--only", metavar="SECTION", help="sensors, pixels, lenses, scenes or flights (default: all)"
-    )
-    gallery.set_defaults(command=_gallery)
-
-
 def _add_print_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
@@ -356,7 +337,7 @@ def _fly(arguments: argparse.Namespace) -> int:
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
     with handle_signals(signal.default_int_handler):
-        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
+        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
 
 
 def _up(arguments: argparse.Namespace) -> int:
@@ -417,14 +398,3 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.view.rerun_viewer import show_file
 
     return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)
-
-
-def _gallery(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    with Console(stderr=True).status("drawing"):
-        from neurosim_core.view.gallery import save_gallery
-
-        save_gallery(arguments.out, device=arguments.device, only=arguments.only)
-    print(f"wrote {arguments.out}")
-    return 0
