@@ -6,15 +6,15 @@ import argparse
 import atexit
 import contextlib
 import faulthandler
-import functools
 import gc
+import importlib
 import logging
 import os
 import re
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -30,6 +30,7 @@ from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_onc
 
 if TYPE_CHECKING:
     from neurosim_core.config import SimulationConfig
+    from neurosim_core.scene.reader import SceneReader
 
     _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -139,7 +140,7 @@ def _add_serve(commands: _Commands) -> None:
     serve = commands.add_parser("serve", help="simulate for controllers in other processes, over Cortex")
     add_settings(serve)
     _add_live(serve)
-    serve.set_defaults(command=_serve)
+    serve.set_defaults(command=_serve, computes=False)  # it starts Warp itself
 
 
 def _add_fly(commands: _Commands) -> None:
@@ -280,11 +281,22 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.print_config:
+        return _print_config(load_settings(arguments))
+    with _prepare(arguments, "neurosim_core.flight") as (config, reader):
+        from neurosim_core.flight import fly, new_folder
+
+        folder = new_folder(arguments.out, overwrite=arguments.overwrite)
+        report = fly(config, folder, rerun=not arguments.no_rrd, began_s=arguments.began_s, reader=reader)
+    return 130 if report.interrupted else 0
+
+
+@contextlib.contextmanager
+def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[SimulationConfig, SceneReader]]:
+    """Import a module, while a process reads the scene and a CUDA driver begins; give settings and reader."""
     from neurosim_core.scene.reader import SceneReader
     from neurosim_core.settings_file import unchecked_settings
 
-    if arguments.print_config:
-        return _print_config(load_settings(arguments))
     with SceneReader(unchecked_settings(arguments.config, settings_of(arguments))) as reader:
         from rich.console import Console
 
@@ -294,18 +306,10 @@ def _run(arguments: argparse.Namespace) -> int:
         ):
             from neurosim_core.warp_start import start_warp
 
-            aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
+            aside.submit(start_warp)
             config = load_settings(arguments)
-            from neurosim_core.flight import fly, new_folder
-        folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-        report = fly(
-            config,
-            folder,
-            rerun=not arguments.no_rrd,
-            began_s=arguments.began_s,
-            scene=functools.partial(reader.scene, config.scene),
-        )
-    return 130 if report.interrupted else 0
+            importlib.import_module(module)
+        yield config, reader
 
 
 def _print_config(config: SimulationConfig) -> int:
@@ -316,12 +320,12 @@ def _print_config(config: SimulationConfig) -> int:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    config = load_settings(arguments)
     if arguments.print_config:
-        return _print_config(config)
-    from neurosim_core.live.serve import serve
+        return _print_config(load_settings(arguments))
+    with _prepare(arguments, "neurosim_core.live.serve") as (config, reader):
+        from neurosim_core.live.serve import serve
 
-    return serve(config, record=arguments.record, overwrite=arguments.overwrite)
+        return serve(config, record=arguments.record, overwrite=arguments.overwrite, reader=reader)
 
 
 def _fly(arguments: argparse.Namespace) -> int:
