@@ -29,7 +29,7 @@ _EXAMPLES = """examples:
   cortex topics                                what is published and subscribed
   cortex info /scan                            counters, live, and the type
   cortex echo /scan                            messages as they come
-  cortex hz /scan                              rate and regularity
+  cortex hz /scan                              rate, bandwidth, delay
   cortex record -o run.mcap --all              record everything until Ctrl-C
   cortex play run.mcap --rate 0.5 --loop       play it slowly, again and again
   cortex topics --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex
@@ -121,12 +121,14 @@ def _add(
     examples: Sequence[str] = (),
     interrupted: int = 0,
     network: bool = True,
+    aliases: Sequence[str] = (),
 ) -> Callable[..., argparse.Action]:
     """Add a command; return what adds its arguments."""
     description = textwrap.fill(f"{what[0].upper()}{what[1:]}. {details}".strip(), _HELP_WIDTH)
     shown = "\n".join(["examples:", *(f"  {line}" for line in examples)]) if examples else None
     form = argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=what, description=description, epilog=shown, formatter_class=form)
+    texts = {"help": what, "description": description, "epilog": shown}
+    parser = commands.add_parser(name, aliases=aliases, formatter_class=form, **texts)
     parser.set_defaults(run=run, interrupted=interrupted)
     if network:
         add = parser.add_argument_group("where to look").add_argument
@@ -179,25 +181,16 @@ def _add_watching(commands: Any) -> None:
     arrays = commands.choices["echo"].add_mutually_exclusive_group()
     arrays.add_argument("--no-arrays", action="store_true", help="of arrays only the type and shape")
     arrays.add_argument("--full", action="store_true", help="arrays and texts in full, however long")
-    period = "Of the time between two messages, as they were published: mean, standard deviation"
-    for name, what, run, details in (
-        ("hz", "measure how often and how regularly a topic is published", "show_rate", period),
-        ("bw", "measure the bandwidth of a topic", "show_bandwidth", "Of the size of a message: mean"),
-        (
-            "delay",
-            "measure the time from publishing to receiving",
-            "show_delay",
-            "Of that time: mean, standard deviation",
-        ),
-    ):
-        details = f"{details}, least, median, 99th percentile and most."
-        add = _add(commands, name, what, ("watch", run), details=details)
-        add("topic", type=_topic)
-        add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
-        add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
-        if name == "delay":
-            stamp = "from stamp_ns, where that is the time of day, until now"
-            add("--stamp", action="store_true", help=stamp)
+    what = "measure rate, regularity, bandwidth and delay of a topic"
+    details = (
+        "Each second a line over those before: the rate; standard deviation and longest of the times between "
+        "two messages, as they were published; bandwidth and mean size; how long messages were under way."
+    )
+    add = _add(commands, "hz", what, ("watch", "show_rate"), details=details, aliases=("bw", "delay"))
+    add("topic", type=_topic)
+    add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
+    add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
+    add("--stamp", action="store_true", help="delay from stamp_ns, where that is the time of day, until now")
 
 
 def _add_files(commands: Any) -> None:

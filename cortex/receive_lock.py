@@ -58,8 +58,10 @@ class ReceiveLock:
     def _holds(self, frame: FrameType | None) -> bool:
         """Return whether a thread, by its innermost frame, uses this lock, and does not wait for it."""
         while frame is not None and not self._is_own(frame):
-            if frame.f_code is ReceiveLock.__enter__.__code__ and frame.f_locals["self"] is self:
-                return self._is_used_below(frame.f_back)
+            if frame.f_code is ReceiveLock.__enter__.__code__:
+                wanted: ReceiveLock = frame.f_locals["self"]
+                if wanted is self:
+                    return self._is_used_below(frame.f_back)
             frame = frame.f_back
         return frame is not None
 
@@ -76,5 +78,5 @@ class ReceiveLock:
 
     def _is_own(self, frame: FrameType) -> bool:
         """Return whether a function belongs to an object that uses this lock."""
-        is_ours = frame.f_globals.get("__package__") == __package__
-        return bool(is_ours) and getattr(frame.f_locals.get("self"), "_receive_lock", None) is self
+        is_ours: bool = frame.f_globals.get("__package__") == __package__
+        return is_ours and getattr(frame.f_locals.get("self"), "_receive_lock", None) is self
