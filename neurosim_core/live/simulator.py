@@ -26,6 +26,7 @@ from neurosim_core.live.status import RunStats, StatusPublisher, SubscriberMonit
 from neurosim_core.live.streaming import StreamingLoop
 from neurosim_core.live.vehicle import ResetState, VehicleCollisions, VehicleNode, make_reset
 from neurosim_core.packets import Packet
+from neurosim_core.scene.reader import SceneReader
 from neurosim_core.sim import Model, make_fleet, warm_flight, warm_up
 from neurosim_core.trajectory import PosesConfig
 from neurosim_core.vehicle import DynamicsError
@@ -57,6 +58,7 @@ class Simulator:
         record: Path | None = None,
         overwrite: bool = False,
         on_phase: Callable[[str], None] | None = None,
+        reader: SceneReader | None = None,
     ) -> None:
         """Prepare everything, and announce topics and services.
 
@@ -67,6 +69,7 @@ class Simulator:
             record: Folder to record to.
             overwrite: Replace a recording that exists.
             on_phase: Called with the name of each part of the preparation when it begins.
+            reader: Reads the scene in another process; None: it is read here.
 
         Raises:
             ValueError: The scene cannot be loaded, no path exists, there is no such device, or nothing can be
@@ -79,7 +82,7 @@ class Simulator:
             folders = open_folders(record, list(config.vehicles), overwrite=overwrite)
         self.config = config
         if models is None:
-            models = make_fleet(config, on_phase=on_phase, meanwhile=warm_flight)
+            models = make_fleet(config, reader=reader, on_phase=on_phase, meanwhile=warm_flight)
             if on_phase is not None:
                 on_phase("kernels (compiled on the first run, then cached)")
             for model in models.values():
