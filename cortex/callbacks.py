@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cortex.loop_reader import WAIT_MAX_S
-from cortex.subscriber import Subscriber, watch
+from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
@@ -122,9 +122,7 @@ class CallbackThread:
             if subscriber is None:
                 self._wakeup.clear()
                 continue
-            if fd == subscriber.wakeup.fd:
-                subscriber.wakeup.clear()
-                self._changed = True
+            subscriber.wakeup.clear()
             if subscriber not in ready:
                 ready.append(subscriber)
         return ready
@@ -137,13 +135,17 @@ class CallbackThread:
             self._running = None
 
     def _watch(self) -> tuple[select.poll, dict[int, Subscriber[Any]]]:
-        """What to poll: our own descriptor, and those of all sockets by subscriber."""
+        """What to poll: our own descriptor, and those of the subscribers, by number."""
         self._changed = False  # before looking: what changes meanwhile sets it again
         with self._lock:
             subscribers = list(self._subscribers)
             # Waiting in the only socket is quicker than polling, but a service's request would not wake us.
             self._alone = subscribers[0] if len(subscribers) == 1 and not self._serving else None
-        return watch(subscribers, self._wakeup.fd)
+        owners = {subscriber.fd: subscriber for subscriber in subscribers}
+        poll = select.poll()
+        for fd in (self._wakeup.fd, *owners):
+            poll.register(fd, select.POLLIN)
+        return poll, owners
 
     def _call(self, job: Callable[[], object]) -> None:
         try:

@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from cortex.commands import interrupts
+
 INTERRUPTED = 130
 TERMINATED = 143
 BROKEN_PIPE = 141
@@ -27,17 +29,13 @@ _EXAMPLES = """examples:
   cortex topics                                what is published and subscribed
   cortex info /scan                            counters, live, and the type
   cortex echo /scan                            messages as they come
-  cortex hz /scan                              rate and regularity
+  cortex hz /scan                              rate, bandwidth, delay
   cortex record -o run.mcap --all              record everything until Ctrl-C
   cortex play run.mcap --rate 0.5 --loop       play it slowly, again and again
   cortex topics --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex
 """
 
 T = TypeVar("T")
-
-
-class _Terminated(BaseException):
-    """SIGTERM: end as after Ctrl-C, with files closed and leave taken."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,14 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format=f"cortex {options.command}: %(message)s")
-    signal.signal(signal.SIGINT, _leave)  # imports may swallow an exception, or make another of it
-    signal.signal(signal.SIGTERM, _leave)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupts.leave)  # imports may swallow an exception, or make another of it
     try:
         status = _call(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
         status = options.interrupted
-    except _Terminated:
+    except interrupts.Terminated:
         status = TERMINATED
     except BrokenPipeError:
         # Whoever read our output has seen enough. Python would complain once more at exit.
@@ -75,8 +73,7 @@ def _call(options: argparse.Namespace) -> int:
     module, name = options.run
     try:
         run = getattr(importlib.import_module(f"cortex.commands.{module}"), name)
-        signal.signal(signal.SIGINT, _interrupt)
-        signal.signal(signal.SIGTERM, _terminate)
+        interrupts.raise_at_signals()
         return int(run(options))
     except BrokenPipeError:
         raise
@@ -86,21 +83,6 @@ def _call(options: argparse.Namespace) -> int:
             text = f"{error.filename}: {error.strerror}"
         print(f"cortex {options.command}: {text}", file=sys.stderr)
         return int(getattr(error, "status", 1))
-
-
-def _interrupt(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGINT, _leave)
-    raise KeyboardInterrupt
-
-
-def _leave(number: int, frame: object) -> NoReturn:
-    """Leave at once: nothing is open yet, or closing takes too long. No file is worse than after SIGKILL."""
-    os._exit(128 + number)
-
-
-def _terminate(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGTERM, _leave)
-    raise _Terminated
 
 
 class _Version(argparse.Action):
@@ -139,12 +121,14 @@ def _add(
     examples: Sequence[str] = (),
     interrupted: int = 0,
     network: bool = True,
+    aliases: Sequence[str] = (),
 ) -> Callable[..., argparse.Action]:
     """Add a command; return what adds its arguments."""
     description = textwrap.fill(f"{what[0].upper()}{what[1:]}. {details}".strip(), _HELP_WIDTH)
     shown = "\n".join(["examples:", *(f"  {line}" for line in examples)]) if examples else None
     form = argparse.RawDescriptionHelpFormatter
-    parser = commands.add_parser(name, help=what, description=description, epilog=shown, formatter_class=form)
+    texts = {"help": what, "description": description, "epilog": shown}
+    parser = commands.add_parser(name, aliases=aliases, formatter_class=form, **texts)
     parser.set_defaults(run=run, interrupted=interrupted)
     if network:
         add = parser.add_argument_group("where to look").add_argument
@@ -197,25 +181,16 @@ def _add_watching(commands: Any) -> None:
     arrays = commands.choices["echo"].add_mutually_exclusive_group()
     arrays.add_argument("--no-arrays", action="store_true", help="of arrays only the type and shape")
     arrays.add_argument("--full", action="store_true", help="arrays and texts in full, however long")
-    period = "Of the time between two messages, as they were published: mean, standard deviation"
-    for name, what, run, details in (
-        ("hz", "measure how often and how regularly a topic is published", "show_rate", period),
-        ("bw", "measure the bandwidth of a topic", "show_bandwidth", "Of the size of a message: mean"),
-        (
-            "delay",
-            "measure the time from publishing to receiving",
-            "show_delay",
-            "Of that time: mean, standard deviation",
-        ),
-    ):
-        details = f"{details}, least, median, 99th percentile and most."
-        add = _add(commands, name, what, ("watch", run), details=details)
-        add("topic", type=_topic)
-        add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
-        add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
-        if name == "delay":
-            stamp = "from stamp_ns, where that is the time of day, until now"
-            add("--stamp", action="store_true", help=stamp)
+    what = "measure rate, regularity, bandwidth and delay of a topic"
+    details = (
+        "Each second a line over those before: the rate; standard deviation and longest of the times between "
+        "two messages, as they were published; bandwidth and mean size; how long messages were under way."
+    )
+    add = _add(commands, "hz", what, ("watch", "show_rate"), details=details, aliases=("bw", "delay"))
+    add("topic", type=_topic)
+    add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
+    add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
+    add("--stamp", action="store_true", help="delay from stamp_ns, where that is the time of day, until now")
 
 
 def _add_files(commands: Any) -> None:

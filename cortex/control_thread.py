@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import select
 import threading
 import time
 from collections import deque
@@ -167,7 +166,7 @@ class ControlThread:
         self._directory.tick(now_ns)
         self._pub_sockets.tick()
         self._pub_sockets.emit_notes()
-        offset_ns = self._directory.clock.offset_ns(now_ns)
+        offset_ns = self._directory.clock.offset_ns()
         if abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
             self._clock_offset_ns = offset_ns
             self._on_clock(offset_ns)
@@ -176,16 +175,10 @@ class ControlThread:
         self._top_up(now_ns)
 
     def _top_up(self, now_ns: int) -> None:
-        poll, owners = select.poll(), {}
         for subscriber in list(self._subscribers):
             subscriber.dismiss(now_ns)
-            if subscriber.must_read:
+            if subscriber.must_read or subscriber.has_input:
                 subscriber.top_up(now_ns)
-            for fd in subscriber.fds():
-                owners[fd] = subscriber
-                poll.register(fd, select.POLLIN)
-        for subscriber in {owners[fd] for fd, _ in poll.poll(0)} if owners else ():
-            subscriber.top_up(now_ns)
 
 
 def ask_stats(place: Reach, asker: int, timeout_s: float) -> StatsReply:

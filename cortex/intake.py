@@ -193,18 +193,17 @@ class Intake:
             self.fast_receive.exhausted = False
         return bool(left)
 
-    def end_overdue(self, now_ns: int) -> bool:
-        """Close links that have ended or had their time, once a reliable one has all; whether any was."""
+    def end_overdue(self, now_ns: int) -> list[Link]:
+        """End links that have ended or had their time, once a reliable one has all; they are to be closed."""
         overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns or link.has_ended]
         if overdue and self._policy.reliable:  # what is on its way stays there until there is room for it
             unread = self.drain()
             overdue = [link for link in overdue if link not in unread]
         for link in overdue:
             link.end()
-            link.close()
             self.links.remove(link)
             del self.leaving[link]
-        return bool(overdue)
+        return overdue
 
     def accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
         """Put the message of a frame into the queue."""

@@ -311,8 +311,7 @@ class Node(Closing):
 
     def now_ns(self) -> int:
         """CLOCK_REALTIME of the registry's host, for stamps that hosts compare [ns]; may go back a little."""
-        now_ns = time.monotonic_ns()
-        return now_ns + self._directory.clock.offset_ns(now_ns)
+        return time.monotonic_ns() + self._directory.clock.offset_ns()
 
     def clock(self) -> Clock | None:
         """Return this host's clock beside that of the registry's host; None: it has not answered yet."""

@@ -10,10 +10,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-import select
+import selectors
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -48,18 +48,6 @@ LEAVING_NS = 2_000_000_000
 """How long the connection to a publisher that has left is kept, for what is still on its way."""
 
 
-def watch(
-    subscribers: Iterable[Subscriber[Any]], *more: int
-) -> tuple[select.poll, dict[int, Subscriber[Any]]]:
-    """What to wait with for some subscribers, or for `more` descriptors; and whose each descriptor is."""
-    poll, owners = select.poll(), {}
-    for subscriber in subscribers:
-        owners.update(dict.fromkeys((subscriber.wakeup.fd, *subscriber.fds()), subscriber))
-    for fd in (*more, *owners):
-        poll.register(fd, select.POLLIN)
-    return poll, owners
-
-
 class Subscriber(Closing, Generic[T]):
     """Receives the messages of a topic; made by `Node.subscriber`. Methods may be called from any thread."""
 
@@ -80,6 +68,11 @@ class Subscriber(Closing, Generic[T]):
         self._receive_lock = ReceiveLock()
         self._lock = self._receive_lock.lock
         self.wakeup = Wakeup()
+        self._selector = selectors.DefaultSelector()
+        """Waits for `wakeup` and all sockets; changed under the lock.
+
+        It ends with us: somebody may still watch `fd` when we are closed."""
+        self._selector.register(self.wakeup.fd, selectors.EVENT_READ)
         self._problems: deque[Exception] = deque()
         self._intake = Intake(policy, self.counters, self._receive_lock)
         self._links, self._queue = self._intake.links, self._intake.queue
@@ -88,11 +81,9 @@ class Subscriber(Closing, Generic[T]):
         self._on_close = on_close
         self._closed = False
         self._async_receiver: AsyncReceiver[T] | None = None
-        self._generation = 0
         self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
-        self._poll: select.poll | None = None
         self._looks_left_out = 0
         self._mismatch: TypeMismatch | None = None
 
@@ -136,14 +127,10 @@ class Subscriber(Closing, Generic[T]):
                 self._intake.receive_one()  # descriptors show what comes after a look in vain
             if self._closed or self._queue:
                 return True
-            poll = self._take_poll()
         until_ns = monotonic_ns() + round(spin_s * 1e9)
-        while not (found := poll.poll(0)) and monotonic_ns() < until_ns:
+        while not (found := self._selector.select(0)) and monotonic_ns() < until_ns:
             os.sched_yield()
-        if any(fd == self.wakeup.fd for fd, _ in found):
-            self.wakeup.clear()
-        else:
-            self._poll = poll
+        self.wakeup.clear()
         self._looks_left_out = 0 if found else LOOK_EVERY
         return bool(found)
 
@@ -201,10 +188,6 @@ class Subscriber(Closing, Generic[T]):
             if item is not None:
                 message = self._open(item, self._decode)
         return message
-
-    def _watched(self) -> tuple[int, list[int]]:
-        with self._receive_lock:
-            return self._generation, [self.wakeup.fd, *(fd for link in self._links for fd in link.fds)]
 
     def _nothing_came(self, timeout_s: float | None) -> TimeoutError:
         """What to raise when no message came in time: if all publishers have another type, that is why."""
@@ -277,21 +260,8 @@ class Subscriber(Closing, Generic[T]):
         with self._receive_lock:
             if self._closed or not self._fast_receive.exhausted:
                 return
-            poll = self._take_poll()
-        for fd, _ in poll.poll(timeout_s * 1000.0):
-            if fd == self.wakeup.fd:
-                self.wakeup.clear()
-                return
-        self._poll = poll
-
-    def _take_poll(self) -> select.poll:
-        """What to wait with; one thread at a time may use it."""
-        poll, self._poll = self._poll, None
-        if poll is None:
-            poll = select.poll()
-            for fd in (self.wakeup.fd, *(fd for link in self._links for fd in link.fds)):
-                poll.register(fd, select.POLLIN)
-        return poll
+        self._selector.select(timeout_s)
+        self.wakeup.clear()
 
     def dispatch(self, *, block: bool = False) -> bool:
         """Hand what has arrived to the callback; for the callback thread.
@@ -349,10 +319,15 @@ class Subscriber(Closing, Generic[T]):
             not self.policy.reliable or len(self._queue) < self.policy.depth
         )
 
-    def fds(self) -> list[int]:
-        """File descriptors that become readable when a message may have come."""
-        with self._receive_lock:
-            return [fd for link in self._links for fd in link.fds]
+    @property
+    def fd(self) -> int:
+        """A descriptor that is readable when a message may have come, and while `wakeup` is set."""
+        return self._selector.fileno()
+
+    @property
+    def has_input(self) -> bool:
+        """Whether that descriptor is readable."""
+        return bool(self._selector.select(0))
 
     def top_up(self, now_ns: int) -> None:
         """Read the sockets of a subscriber that nobody reads at the moment; for the node's control thread.
@@ -418,6 +393,8 @@ class Subscriber(Closing, Generic[T]):
                 link.close()
                 return
             self._links.append(link)
+            for fd in link.fds:
+                self._selector.register(fd, selectors.EVENT_READ)
             self._fast_receive.exhausted = False  # its descriptor shows nothing until it was found empty
             self._links_changed()
 
@@ -470,15 +447,21 @@ class Subscriber(Closing, Generic[T]):
 
     def _links_changed(self) -> None:
         self._open_fast_receive()
-        self._poll = None
-        self._generation += 1
         self.wakeup.set()
+
+    def _part(self, link: Link) -> None:
+        for fd in link.fds:  # before it is closed: its number may be given out again
+            self._selector.unregister(fd)
+        link.close()
 
     def dismiss(self, now_ns: int) -> None:
         """Close the connections to publishers that have left long enough ago; for the node."""
         if self._leaving and self._lock.acquire(blocking=False):
             try:
-                if not self._closed and self._intake.end_overdue(now_ns):
+                ended = [] if self._closed else self._intake.end_overdue(now_ns)
+                for link in ended:
+                    self._part(link)
+                if ended:
                     self._links_changed()
                 if self._queue:
                     self.wakeup.set()
@@ -500,13 +483,12 @@ class Subscriber(Closing, Generic[T]):
             self._closed = True
             self._fast_receive.open(None, None)
             self._queue.clear()
-            links = list(self._links)
+            for link in self._links:
+                self._part(link)
             self._links.clear()
             self._leaving.clear()
         if self._async_receiver is not None:
             self._async_receiver.stop()
-        for link in links:
-            link.close()
         self.wakeup.set()
         if self._on_close is not None:
             self._on_close(self)

@@ -223,7 +223,7 @@ def _rules_of(connection: Connection) -> list[Rule]:
 
 
 def _image(data: Buffer) -> messages.Image:
-    made = cdr.decode_record(data, "sensor_msgs/msg/Image")
+    made = cdr.decode(data, "sensor_msgs/msg/Image")
     dtype, channels = pixel_type(made.encoding)
     kind = dtype.newbyteorder(">" if made.is_bigendian else "<")
     rows = made.data.reshape(made.height, made.step)[:, : made.width * channels * dtype.itemsize]
@@ -237,7 +237,7 @@ def _image(data: Buffer) -> messages.Image:
 
 
 def _imu(data: Buffer) -> messages.Imu:
-    made = cdr.decode_record(data, "sensor_msgs/msg/Imu")
+    made = cdr.decode(data, "sensor_msgs/msg/Imu")
     return messages.Imu(
         stamp_ns=stamp_ns_of(made.header.stamp),
         specific_force=xyz(made.linear_acceleration),

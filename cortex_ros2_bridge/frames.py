@@ -9,12 +9,12 @@ forward.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict
 
 Vector = NDArray[np.float64]
 WORLD = "world"
@@ -29,25 +29,22 @@ FrameKind = Literal["world", "body", "heading"]
 class FrameNames:
     """What frames are called in ROS."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
     prefix: str = ""
     """Goes before all names but those in `rename`."""
     map: str = "map"
     """Name of Cortex's `world`."""
     odom: str = "odom"
     """Name of the frame in which a vehicle moves; its vehicle goes before it."""
-    rename: Mapping[str, str] = field(default_factory=dict)
+    rename: dict[str, str] = field(default_factory=dict)
     """Names in ROS of single frames, by their names in Cortex, such as {drone/base_link: base_link}."""
 
     def __post_init__(self) -> None:
         names = {"prefix": self.prefix or "ok", "map": self.map, "odom": self.odom}
         names |= {f"rename.{old}": new for old, new in self.rename.items()}
         for key, name in names.items():
-            if (
-                not isinstance(name, str)
-                or not name
-                or name.startswith("/")
-                or any(c.isspace() for c in name)
-            ):
+            if not name or name.startswith("/") or any(c.isspace() for c in name):
                 raise ValueError(
                     f"frames.{key} must be a name without spaces and a slash in front, got {name!r}"
                 )

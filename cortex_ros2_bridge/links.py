@@ -269,4 +269,4 @@ def _topic_of(type_name: str, seen: Seen) -> str | None:
 def _warm_up(ros_type: str) -> None:
     """Let code for a type be generated now: with the first message it would hold up a stream for 20 ms."""
     with contextlib.suppress(ValueError):  # what is wrong with the type is said where it is opened
-        cdr.decode_record(cdr.encode(message_class(ros_type)()), ros_type)
+        cdr.decode(cdr.encode(message_class(ros_type)()), ros_type)

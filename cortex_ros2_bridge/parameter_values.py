@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from cortex_ros2_bridge.msgs import message_class
 
 _KINDS: tuple[tuple[int, str, type, bool], ...] = (
@@ -39,8 +41,8 @@ def message_of(value: Any) -> Any:
 
 def value_of(message: Any) -> Any:
     """Return the value in a rcl_interfaces/ParameterValue; None if there is none."""
-    for number, field, _, is_array in _KINDS:
+    for number, field, _, _ in _KINDS:
         if number == message.type:
             value = getattr(message, field)
-            return list(value) if is_array else value
+            return value.tolist() if isinstance(value, np.ndarray) else value
     return None

@@ -6,30 +6,30 @@ import argparse
 import atexit
 import contextlib
 import faulthandler
-import functools
 import gc
+import importlib
 import logging
 import os
 import re
-import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from neurosim_core import __version__, docs
+from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
 from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
-from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
+from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once, raise_at_signals
 
 if TYPE_CHECKING:
     from neurosim_core.config import SimulationConfig
+    from neurosim_core.scene.reader import SceneReader
 
     _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -39,6 +39,11 @@ _PIPED_COLUMNS = 120
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
+    with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
+        return _run_command(argv)
+
+
+def _run_command(argv: Sequence[str] | None) -> int:
     gc.set_threshold(100_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not faulthandler.is_enabled():
@@ -52,22 +57,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
-    with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
-        if arguments.computes:
-            from neurosim_core.warp_start import start_warp
+    if arguments.computes:
+        from neurosim_core.warp_start import start_warp
 
-            start_warp()
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-        try:
-            return int(arguments.command(arguments))
-        except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
-            if arguments.debug:
-                raise
-            print(f"neurosim: {error}", file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            print(INTERRUPTED_LINE, file=sys.stderr)
-            return 130
+        start_warp()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        return int(arguments.command(arguments))
+    except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+        if arguments.debug:
+            raise
+        print(f"neurosim: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(INTERRUPTED_LINE, file=sys.stderr)
+        return 130
 
 
 class _Parser(argparse.ArgumentParser):
@@ -111,14 +115,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
     others = (
-        _add_gallery,
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
         fit.add_parser,
         bench.add_parser,
         learn.add_parsers,
-        docs.add_parser,
     )
     for add in (*parsers, *others):
         add(commands)
@@ -141,7 +143,7 @@ def _add_serve(commands: _Commands) -> None:
     serve = commands.add_parser("serve", help="simulate for controllers in other processes, over Cortex")
     add_settings(serve)
     _add_live(serve)
-    serve.set_defaults(command=_serve)
+    serve.set_defaults(command=_serve, computes=False)  # it starts Warp itself
 
 
 def _add_fly(commands: _Commands) -> None:
@@ -153,9 +155,6 @@ def _add_fly(commands: _Commands) -> None:
         default="motor_speeds",
         choices=["motor_speeds", "velocity", "position"],
         help="what to command (default: motor_speeds)",
-    )
-    fly.add_argument(
-        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
     )
     fly.add_argument(
         "--policy",
@@ -265,20 +264,6 @@ def _add_view(commands: _Commands) -> None:
     view.set_defaults(command=_view)
 
 
-def _add_gallery(commands: _Commands) -> None:
-    gallery = commands.add_parser(
-        "gallery", help="draw every sensor, pixel preset, lens and scene, and films, on one page"
-    )
-    gallery.add_argument(
-        "--out", type=Path, default=Path("gallery.html"), metavar="HTML", help="default: gallery.html"
-    )
-    gallery.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    gallery.add_argument(
-        "--only", metavar="SECTION", help="sensors, pixels, lenses, scenes or flights (default: all)"
-    )
-    gallery.set_defaults(command=_gallery)
-
-
 def _add_print_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
@@ -299,11 +284,22 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.print_config:
+        return _print_config(load_settings(arguments))
+    with _prepare(arguments, "neurosim_core.flight") as (config, reader):
+        from neurosim_core.flight import fly, new_folder
+
+        folder = new_folder(arguments.out, overwrite=arguments.overwrite)
+        report = fly(config, folder, rerun=not arguments.no_rrd, began_s=arguments.began_s, reader=reader)
+    return 130 if report.interrupted else 0
+
+
+@contextlib.contextmanager
+def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[SimulationConfig, SceneReader]]:
+    """Import a module, while a process reads the scene and a CUDA driver begins; give settings and reader."""
     from neurosim_core.scene.reader import SceneReader
     from neurosim_core.settings_file import unchecked_settings
 
-    if arguments.print_config:
-        return _print_config(load_settings(arguments))
     with SceneReader(unchecked_settings(arguments.config, settings_of(arguments))) as reader:
         from rich.console import Console
 
@@ -313,18 +309,10 @@ def _run(arguments: argparse.Namespace) -> int:
         ):
             from neurosim_core.warp_start import start_warp
 
-            aside.submit(start_warp)  # a CUDA driver begins while the libraries are imported
+            aside.submit(start_warp)
             config = load_settings(arguments)
-            from neurosim_core.flight import fly, new_folder
-        folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-        report = fly(
-            config,
-            folder,
-            rerun=not arguments.no_rrd,
-            began_s=arguments.began_s,
-            scene=functools.partial(reader.scene, config.scene),
-        )
-    return 130 if report.interrupted else 0
+            importlib.import_module(module)
+        yield config, reader
 
 
 def _print_config(config: SimulationConfig) -> int:
@@ -335,12 +323,12 @@ def _print_config(config: SimulationConfig) -> int:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    config = load_settings(arguments)
     if arguments.print_config:
-        return _print_config(config)
-    from neurosim_core.live.serve import serve
+        return _print_config(load_settings(arguments))
+    with _prepare(arguments, "neurosim_core.live.serve") as (config, reader):
+        from neurosim_core.live.serve import serve
 
-    return serve(config, record=arguments.record, overwrite=arguments.overwrite)
+        return serve(config, record=arguments.record, overwrite=arguments.overwrite, reader=reader)
 
 
 def _fly(arguments: argparse.Namespace) -> int:
@@ -351,8 +339,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.controller import fly
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
-    with handle_signals(signal.default_int_handler):
-        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
+    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
 
 
 def _up(arguments: argparse.Namespace) -> int:
@@ -367,15 +354,14 @@ def _up(arguments: argparse.Namespace) -> int:
 def _call(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.call import call
 
-    with handle_signals(signal.default_int_handler):
+    with raise_at_signals():
         return call(arguments)
 
 
 def _top(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.top import top
 
-    with handle_signals(signal.default_int_handler):
-        return top(once=arguments.once, timeout_s=arguments.timeout)
+    return top(once=arguments.once, timeout_s=arguments.timeout)
 
 
 def _scene(arguments: argparse.Namespace) -> int:
@@ -413,14 +399,3 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.view.rerun_viewer import show_file
 
     return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)
-
-
-def _gallery(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    with Console(stderr=True).status("drawing"):
-        from neurosim_core.view.gallery import save_gallery
-
-        save_gallery(arguments.out, device=arguments.device, only=arguments.only)
-    print(f"wrote {arguments.out}")
-    return 0

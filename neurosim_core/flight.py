@@ -24,7 +24,7 @@ from neurosim_core.flight_report import FlightReport, print_plan, print_report
 from neurosim_core.packets import Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
-from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.reader import SceneReader
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
@@ -60,7 +60,7 @@ def fly(
     rerun: bool = True,
     console: Console | None = None,
     began_s: float | None = None,
-    scene: Callable[..., Scene] | None = None,
+    reader: SceneReader | None = None,
 ) -> FlightReport:
     """Fly a configuration, hand its packets to its sinks, and leave config.yaml and their files in a folder.
 
@@ -75,7 +75,7 @@ def fly(
         rerun: Write flight.rrd, if that is among the sinks.
         console: Where to print; standard output if None.
         began_s: When the command began, as `time.perf_counter` says; None: now.
-        scene: Returns the scene of `config`, as its `load` does; None: it is loaded here.
+        reader: Reads the scene in another process; None: it is read here.
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
@@ -102,7 +102,7 @@ def fly(
         settings = to_yaml(config, comments=True)  # while another process reads the scene
         model = make_model(
             config,
-            scene=scene,
+            reader=reader,
             on_phase=lambda phase: status.update(f"preparing: {phase}"),
             meanwhile=functools.partial(_load, sinks=sinks),
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import functools
 import hashlib
 import os
@@ -14,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+if sys.platform != "win32":
+    import fcntl
 
 _NO_CUDA = ("NVIDIA CUDA driver", "no CUDA-capable device")
 """What Warp writes where there is no driver, and where there is no device."""
@@ -78,6 +80,8 @@ def _compile_once(compile_module: Callable[..., bool]) -> Callable[..., bool]:
 
 def _await_lock(file: int) -> None:
     """Lock a file; give up where there are no locks, or the process that has it seems to be stopped."""
+    if sys.platform == "win32":
+        return  # each process compiles for itself there
     deadline_s = time.monotonic() + _COMPILE_S
     while time.monotonic() < deadline_s:
         try:

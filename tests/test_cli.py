@@ -18,11 +18,13 @@ import pytest
 import yaml
 from PIL import Image
 
+import neurosim_core.live.serve
 from neurosim_core import cli
 from neurosim_core.config import load_config
 from neurosim_core.flight import new_folder
 from neurosim_core.packets import Events
 from neurosim_core.record import Recording
+from neurosim_core.scene.hall import HallConfig
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
 SETTINGS = {
@@ -284,6 +286,16 @@ def test_printed_settings_are_settings(tmp_path, capsys, command, live):
     assert sum(line.lstrip().startswith("#") for line in said.splitlines()) > 50
 
 
+def test_serve_has_its_scene_read_by_another_process(monkeypatch):
+    def serve(config, *, reader, **_):
+        assert len(reader.geometry(config.scene).faces) > 12
+        return 7
+
+    monkeypatch.setattr(neurosim_core.live.serve, "serve", serve)
+    monkeypatch.setattr(HallConfig, "load", None)
+    assert cli.main(["serve", "--set", "scene.kind=hall", "--set", "scene.seed=3"]) == 7
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -295,7 +307,7 @@ def test_printed_settings_are_settings(tmp_path, capsys, command, live):
         (["run", "--duration", "-1"], "--duration: Input should be greater than 0, got -1.0"),
         (["serve", "--factor", "-1"], "--factor: Input should be greater than or equal to 0, got -1.0"),
         (["serve", "--set", "live.mode=fast"], "--set live.mode: Input should be 'lockstep' or 'streaming'"),
-        (["bench", "streaming", "--device", "gpu", "--sampling-rate", "5"], "--device: must be auto, cpu"),
+        (["bench", "closed-loop", "--device", "gpu", "--rates", "5"], "--device: must be auto, cpu"),
         (["run", "--set", "scene={kind: mesh, file: nothing.glb}"], "nothing.glb"),
         (["scene", "nothing.glb"], "nothing.glb"),
         (["view", "nowhere"], "no flight at"),

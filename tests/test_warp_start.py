@@ -103,3 +103,25 @@ def test_a_process_that_stands_still_holds_up_nobody_for_ever(tmp_path, monkeypa
     with open(tmp_path / "locks" / "wp_module_0123", "a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         assert compile_or_wait(None, "cpu", tmp_path / "wp_module_0123")
+
+
+def test_windows_has_no_locks_of_files_and_computes_without_them(tmp_path):
+    program = f"""
+import sys
+import warp as wp
+wp.init()
+wp.config.kernel_cache_dir = {str(tmp_path)!r}
+sys.platform, sys.modules["fcntl"] = "win32", None
+from neurosim_core.warp_start import start_warp
+start_warp()
+
+@wp.kernel(enable_backward=False, module=wp.get_module("neurosim_core.first"))
+def store(out: wp.array[int]) -> None:
+    out[0] = 7
+
+out = wp.zeros(1, dtype=int, device="cpu")
+wp.launch(store, dim=1, outputs=[out], device="cpu")
+assert out.numpy()[0] == 7
+"""
+    (tmp_path / "store.py").write_text(program)
+    subprocess.run([sys.executable, tmp_path / "store.py"], check=True, cwd=Path(__file__).parents[1])

@@ -44,9 +44,7 @@ class Job:
     peer: str
     floats: int
     seconds: float = 0.5
-    """How long to publish [s], if ``count`` is 0."""
-    count: int = 0
-    """How many messages to publish; 0: as many as go into ``seconds``."""
+    """How long to publish [s]."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """What the peer wants to know besides: policy, way of receiving, and so on."""
     folder: Path = Path()

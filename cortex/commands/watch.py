@@ -1,4 +1,4 @@
-"""`cortex echo`, `hz`, `bw` and `delay`: what goes over a topic, and how regularly."""
+"""`cortex echo` and `hz`: what goes over a topic, and how regularly."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cortex.codec import MalformedMessage, codec_of
+from cortex.commands.interrupts import raise_again
 from cortex.commands.session import CommandError, Patience, hint, open_node
 from cortex.commands.text import bytes_of, message_lines, number_of, rate, seconds, to_plain
 from cortex.link import Info
@@ -27,7 +28,7 @@ _WAIT_S = 0.1
 _PERIOD_NS = 1_000_000_000
 _HEAD_EVERY = 20
 _QUEUE = 4096
-_WIDTHS = (9, 8, 10, 8, 8, 8, 8, 6)
+_WIDTHS = (9, 8, 8, 10, 8, 9, 8, 5)
 """Of the columns: 79 in all, with two blanks in between."""
 
 
@@ -39,6 +40,7 @@ def echo(options: argparse.Namespace) -> int:
         shown = 0
         try:
             while options.count is None or shown < options.count:
+                raise_again()
                 try:
                     info, body, schema = subscriber.recv_raw(_WAIT_S)
                 except TimeoutError:
@@ -71,33 +73,18 @@ def _print_json(info: Info, message: dict[str, Any]) -> None:
 
 
 def show_rate(options: argparse.Namespace) -> int:
-    """`cortex hz`: the time between messages as they were published, which our own delays do not change."""
-    last: dict[int, tuple[int, int]] = {}
-
-    def period(info: Info, _: Node) -> float | None:
-        sequence, publish_ns = last.get(info.source, (-1, 0))
-        last[info.source] = info.sequence, info.publish_ns
-        return (info.publish_ns - publish_ns) * 1e-9 if info.sequence == sequence + 1 > 0 else None
-
-    return _watch(options, period, "period", seconds)
-
-
-def show_bandwidth(options: argparse.Namespace) -> int:
-    """`cortex bw`."""
-    return _watch(options, lambda info, _: float(info.size), "size", bytes_of)
-
-
-def show_delay(options: argparse.Namespace) -> int:
-    """`cortex delay`."""
-    if not options.stamp:
-        return _watch(options, lambda info, _: info.latency_ns * 1e-9, "delay", seconds)
-
-    def age(info: Info, node: Node) -> float:
-        if info.stamp_ns is None:
-            raise CommandError(f"the messages of {info.topic} have no stamp_ns")
-        return (node.now_ns() - info.stamp_ns) * 1e-9
-
-    return _watch(options, age, "age", seconds)
+    """`cortex hz`: a line of statistics each second, over the last `--window` seconds."""
+    with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
+        patience = Patience(node, options.topic)
+        window: deque[_Second] = deque(maxlen=max(1, round(options.window)))
+        for printed, second in enumerate(_by_second(node, subscriber, patience, by_stamp=options.stamp)):
+            window.append(second)
+            if printed % _HEAD_EVERY == 0:
+                print(_line("rate", "std", "max", "bandwidth", "size", "delay p50", "p99", "lost"))
+            print(_statistics(window), flush=True)
+            if printed + 1 == options.count:
+                break
+    return 0
 
 
 @dataclass
@@ -106,40 +93,23 @@ class _Second:
 
     since_ns: int
     last_ns: int
-    values: list[float] = field(default_factory=list)
+    periods_s: list[float] = field(default_factory=list)
+    """Between messages as they were published, which our own delays do not change."""
+    delays_s: list[float] = field(default_factory=list)
     seen: int = 0
     bytes: int = 0
     missed: int = 0
     began_ns: int = field(default_factory=time.monotonic_ns)
 
 
-def _watch(
-    options: argparse.Namespace,
-    measure: Callable[[Info, Node], float | None],
-    what: str,
-    show: Callable[[float], str],
-) -> int:
-    """Print a line of statistics each second, over the last `--window` seconds."""
-    with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
-        patience = Patience(node, options.topic)
-        window: deque[_Second] = deque(maxlen=max(1, round(options.window)))
-        for printed, second in enumerate(_by_second(subscriber, lambda info: measure(info, node), patience)):
-            window.append(second)
-            if printed % _HEAD_EVERY == 0:
-                spread = "bandwidth" if what == "size" else "std"
-                print(_line("rate", what, spread, "min", "p50", "p99", "max", "lost"))
-            print(_statistics(window, show, with_bandwidth=what == "size"), flush=True)
-            if printed + 1 == options.count:
-                break
-    return 0
-
-
 def _by_second(
-    subscriber: Subscriber[Any], measure: Callable[[Info], float | None], patience: Patience
+    node: Node, subscriber: Subscriber[Any], patience: Patience, *, by_stamp: bool
 ) -> Iterator[_Second]:
     second: _Second | None = None
     before = 0
+    last: dict[int, Info] = {}
     while True:
+        raise_again()
         left_ns = 1 if second is None else second.began_ns + _PERIOD_NS - time.monotonic_ns()
         if second is not None and left_ns <= 0:
             missed = subscriber.counters.lost + subscriber.counters.overtaken
@@ -153,18 +123,22 @@ def _by_second(
             patience.check()
             continue
         patience.heard()
-        value = measure(info)
+        if by_stamp and info.stamp_ns is None:
+            raise CommandError(f"the messages of {info.topic} have no stamp_ns")
+        previous, last[info.source] = last.get(info.source), info
         if second is None:  # the first message begins the first second, and counts for none
             second = _Second(info.publish_ns, info.publish_ns)
             continue
+        if previous is not None and previous.sequence + 1 == info.sequence:
+            second.periods_s.append((info.publish_ns - previous.publish_ns) * 1e-9)
+        age_ns = info.latency_ns if info.stamp_ns is None or not by_stamp else node.now_ns() - info.stamp_ns
+        second.delays_s.append(age_ns * 1e-9)
         second.seen += 1
         second.bytes += info.size
         second.last_ns = max(second.last_ns, info.publish_ns)
-        if value is not None:
-            second.values.append(value)
 
 
-def _statistics(window: deque[_Second], show: Callable[[float], str], *, with_bandwidth: bool) -> str:
+def _statistics(window: deque[_Second]) -> str:
     seen = sum(second.seen for second in window)
     missed = sum(second.missed for second in window)
     silence_s = (time.monotonic_ns() - window[-1].last_ns) * 1e-9
@@ -177,13 +151,14 @@ def _statistics(window: deque[_Second], show: Callable[[float], str], *, with_ba
     # What we did not see was published, too; it is taken to be as large as the rest.
     published_hz = (seen + missed) / elapsed_s if elapsed_s > 0.0 else math.nan
     mean_bytes = sum(second.bytes for second in window) / seen
-    values = np.array([value for second in window for value in second.values] or [math.nan])
-    low, middle, high, top = np.percentile(values, (0, 50, 99, 100))
+    periods_s = np.array([each for second in window for each in second.periods_s] or [math.nan])
+    delays_s = np.percentile([each for second in window for each in second.delays_s], (50, 99))
     return _line(
         rate(published_hz),
-        show(float(values.mean())),
-        f"{bytes_of(mean_bytes * published_hz)}/s" if with_bandwidth else show(float(values.std())),
-        *map(show, (low, middle, high, top)),
+        *(seconds(float(each)) for each in (periods_s.std(), periods_s.max())),
+        f"{bytes_of(mean_bytes * published_hz)}/s",
+        bytes_of(mean_bytes),
+        *(seconds(float(each)) for each in delays_s),
         f"{missed:,}",
     )
 

@@ -8,6 +8,7 @@ import errno
 import json
 import logging
 import os
+import select
 import socket
 import threading
 import time
@@ -27,7 +28,7 @@ from cortex.node import Node
 from cortex.policy import Policy, reliable
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import SubscriberCounters
-from cortex.subscriber import Subscriber, watch
+from cortex.subscriber import Subscriber
 from cortex.wakeup import Wakeup
 
 logger = logging.getLogger(__name__)
@@ -280,18 +281,18 @@ class Recorder:
 
     def _ready(self, wait_ms: float) -> list[str]:
         """Topics on which something may have come; all of them if the wait was for nothing."""
-        poll, owners = watch(self._subscribers.values(), self._wakeup.fd)
+        poll, owners = select.poll(), {each.fd: each for each in self._subscribers.values()}
+        for fd in (self._wakeup.fd, *owners):
+            poll.register(fd, select.POLLIN)
         events = poll.poll(0.0 if self._busy else wait_ms)
+        self._wakeup.clear()
         if not events:
             return list(self._subscribers)
         ready = set(self._busy)
         for fd, _ in events:
-            subscriber = owners.get(fd)
-            if subscriber is not None:
+            if (subscriber := owners.get(fd)) is not None:
+                subscriber.wakeup.clear()
                 ready.add(subscriber.topic)
-            for wakeup in (self._wakeup, *([subscriber.wakeup] if subscriber else [])):
-                if fd == wakeup.fd:
-                    wakeup.clear()
         return list(ready)
 
     def _write(self, taken: list[_Taken]) -> int:

@@ -10,11 +10,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
-from cortex_ros2_bridge.typestore import DEFAULT_DISTRO
+from cortex_ros2_bridge.msgs import message_class
+from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, service_types
 
 _log = logging.getLogger(__name__)
 
@@ -358,6 +360,7 @@ class RclpyService(_Endpoint):
 
     def __init__(self, loop: _Loop, name: str, type_name: str, callback: Serve) -> None:
         self._callback = callback
+        self._types = service_types(type_name)
         self._busy = threading.RLock()
         super().__init__(loop, name, type_name, Qos())
 
@@ -367,9 +370,15 @@ class RclpyService(_Endpoint):
 
     def answer(self, request: Any, response: Any) -> Any:
         """Answer a request; an empty response where the callback raises, or once the service is closed."""
+        from rclpy.serialization import deserialize_message, serialize_message
+
         with self._busy:
             try:
-                return response if self.handle is None else self._callback(request, response)
+                if self.handle is None:
+                    return response
+                asked = cdr.decode(serialize_message(request), self._types[0])
+                answer = self._callback(asked, message_class(self._types[1])())
+                return deserialize_message(bytes(cdr.encode(answer)), type(response))
             except Exception:  # whatever it raises: the client gets an answer, and the node goes on
                 _log.exception("the service %s failed", self.topic)
                 return type(response)()

@@ -134,7 +134,7 @@ def encoded(function: Callable[..., Any]) -> Out:
 def _decoded(function: Callable[..., Any], ros_type: str) -> Callable[[Buffer, Context], Any]:
     @functools.wraps(function)
     def convert(data: Buffer, context: Context) -> Any:
-        return function(cdr.decode_record(data, ros_type), context)
+        return function(cdr.decode(data, ros_type), context)
 
     return convert
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from types import FrameType
 from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
@@ -21,6 +23,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import FollowMode, PathFollower
 from neurosim_core.live.messages import command_of
 from neurosim_core.live.topics import COMMANDS, SIMULATION, STATUS, command_topic, stream_topic
+from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 from neurosim_core.sim import plan_paths
 from neurosim_core.trajectory import Path
 
@@ -60,19 +63,16 @@ class PathController:
         *,
         lockstep: bool,
         rotor_speed: NDArray[np.float64],
-        delay_s: float = 0.0,
     ) -> None:
         """Connect.
 
         `follower`: makes the commands; for this controller only. `lockstep`: whether the simulator waits for
-        each command. `rotor_speed`: rotor speeds before any have arrived [rad/s], shape [R]. `delay_s`: how
-        long to sleep before each command [s].
+        each command. `rotor_speed`: rotor speeds before any have arrived [rad/s], shape [R].
         """
         self.vehicle = vehicle
         self.command_count = self.lost_count = self.missing_count = 0
         self.error_square_sum_m2 = 0.0
         self._follower = follower
-        self._delay_s = delay_s
         self._wait_s = _ROTORS_S["lockstep" if lockstep else "streaming"]
         self._newest = rotor_speed
         self._speeds: dict[int, NDArray[np.float64]] = {}
@@ -104,8 +104,6 @@ class PathController:
         except TimeoutError:
             return False
         rotor_speed = self._rotor_speed_of(odometry)
-        if self._delay_s > 0.0:
-            self._closed.wait(self._delay_s)
         command = self._follower.command(
             stamp_ns=odometry.stamp_ns,
             position=odometry.position,
@@ -194,11 +192,10 @@ class PathController:
 class _Fleet:
     """The controllers of all vehicles, a thread for each. A context manager."""
 
-    def __init__(self, node: Node, *, only: str | None, mode: FollowMode, delay_s: float) -> None:
+    def __init__(self, node: Node, *, only: str | None, mode: FollowMode) -> None:
         self.mode = mode
         self._node = node
         self._only = only
-        self._delay_s = delay_s
         self._planned: SimulationConfig | None = None
         self._paths: dict[str, Path] = {}
         self._controllers: list[PathController] = []
@@ -232,7 +229,6 @@ class _Fleet:
                 ),
                 lockstep=lockstep,
                 rotor_speed=np.full(airframe.rotor_count, airframe.hover_rotor_speed_rad_s),
-                delay_s=self._delay_s,
             )
             self._stack.callback(controller.close)  # before the pool waits for its threads
             self._controllers.append(controller)
@@ -278,7 +274,7 @@ class _Fleet:
         self.stop()
 
 
-def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, delay_s: float) -> int:
+def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> int:
     """Fly the vehicles of a simulator along their paths, until it ends or this is interrupted.
 
     It waits for a simulator, and for the next one when that has gone. After a collision it waits for a reset.
@@ -287,23 +283,28 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
         config: What is flown where; None: as the simulator says.
         vehicle: Fly only this one; None: all.
         mode: What to command: motor_speeds, velocity or position.
-        delay_s: How long to sleep before each command [s].
 
     Returns:
-        0: the simulator has flown all that it was to fly.
+        0: the simulator has flown all that it was to fly; 130: interrupted.
 
     Raises:
         ValueError: An argument is not allowed, there is no such vehicle, or no path.
     """
-    if not 0.0 <= delay_s < math.inf:
-        raise ValueError(f"delay_s must be >= 0, got {delay_s}")
     if mode not in get_args(FollowMode):
         raise ValueError(f"unknown mode {mode!r}, known: {', '.join(get_args(FollowMode))}")
-    console = Console(highlight=False)
+    console, stop = Console(highlight=False), threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if stop.is_set() or not fleet.vehicles:  # planning may take long, and libraries swallow exceptions
+            leave_at_once(number, frame)
+        stop.set()
+        node.stop_waiting()
+
     with (
         Node("controller") as node,
-        _Fleet(node, only=vehicle, mode=cast(FollowMode, mode), delay_s=delay_s) as fleet,
+        _Fleet(node, only=vehicle, mode=cast(FollowMode, mode)) as fleet,
         console.status("") as line,
+        handle_signals(on_signal),
     ):
         if config is not None:
             line.update("planning")
@@ -311,7 +312,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
         announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
         statuses = node.subscriber(STATUS, SimulatorStatus, policy=latest())
         run_on, said, source = True, "", 0
-        while True:
+        while not stop.is_set():
             found = _receive(announcements, 0.0 if fleet.vehicles else _LOOK_S)
             if found is not None and not (fleet.vehicles and found[1].source == source):
                 simulation, source = found[0], found[1].source  # the same again: its settings have changed
@@ -340,6 +341,8 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
                 console.print(text)
             if text or heard is not None:
                 said = text
+    print(INTERRUPTED_LINE, file=sys.stderr)
+    return 130
 
 
 def _owner(node: Node, source: int) -> str:

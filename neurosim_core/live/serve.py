@@ -23,6 +23,7 @@ from neurosim_core.live.call import describe_status
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import SIMULATION, command_topic
 from neurosim_core.live.vehicle import VehicleNode
+from neurosim_core.scene.reader import SceneReader
 from neurosim_core.signals import stop_at_signals
 
 _SWITCH_S = 2e-4
@@ -33,13 +34,20 @@ _SLOW_STATUSES = 5
 """Statuses in a row, five a second, after which a run is called slow."""
 
 
-def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bool = False) -> int:
+def serve(
+    config: SimulationConfig,
+    *,
+    record: Path | None = None,
+    overwrite: bool = False,
+    reader: SceneReader | None = None,
+) -> int:
     """Simulate for controllers in other processes until interrupted.
 
     Args:
         config: What to fly, and how.
         record: Folder to record to.
         overwrite: Replace a recording that exists.
+        reader: Reads the scene in another process; None: it is read here.
 
     Returns:
         The exit status: 0 done, 1 ended with an error, 130 interrupted.
@@ -66,6 +74,7 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
                 record=record,
                 overwrite=overwrite,
                 on_phase=show,
+                reader=reader,
             )
         gc.collect()
         gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from cortex import Node
@@ -26,6 +26,7 @@ from neurosim_core.live.status import RunStats, StatusPublisher, SubscriberMonit
 from neurosim_core.live.streaming import StreamingLoop
 from neurosim_core.live.vehicle import ResetState, VehicleCollisions, VehicleNode, make_reset
 from neurosim_core.packets import Packet
+from neurosim_core.scene.reader import SceneReader
 from neurosim_core.sim import Model, make_fleet, warm_flight, warm_up
 from neurosim_core.trajectory import PosesConfig
 from neurosim_core.vehicle import DynamicsError
@@ -57,6 +58,7 @@ class Simulator:
         record: Path | None = None,
         overwrite: bool = False,
         on_phase: Callable[[str], None] | None = None,
+        reader: SceneReader | None = None,
     ) -> None:
         """Prepare everything, and announce topics and services.
 
@@ -67,6 +69,7 @@ class Simulator:
             record: Folder to record to.
             overwrite: Replace a recording that exists.
             on_phase: Called with the name of each part of the preparation when it begins.
+            reader: Reads the scene in another process; None: it is read here.
 
         Raises:
             ValueError: The scene cannot be loaded, no path exists, there is no such device, or nothing can be
@@ -79,7 +82,7 @@ class Simulator:
             folders = open_folders(record, list(config.vehicles), overwrite=overwrite)
         self.config = config
         if models is None:
-            models = make_fleet(config, on_phase=on_phase, meanwhile=warm_flight)
+            models = make_fleet(config, reader=reader, on_phase=on_phase, meanwhile=warm_flight)
             if on_phase is not None:
                 on_phase("kernels (compiled on the first run, then cached)")
             for model in models.values():
@@ -218,7 +221,7 @@ class Simulator:
         begin_ns = time.monotonic_ns()
         end_ns = self._control.stamp_ns(self._tick + 1)
         try:
-            self._step()
+            self._step(self.vehicles)
         except DynamicsError as error:
             self._end_with(error)
             return
@@ -229,12 +232,19 @@ class Simulator:
             vehicle.prepare_step()
         self._end_period(end_ns)
 
-    def _step(self) -> None:
-        """Fly a control period; on a CUDA device, all vehicles at the same time."""
-        with contextlib.ExitStack() as stack:  # ends each step that has begun, whatever another one raises
-            for vehicle in self.vehicles:
-                stack.callback(vehicle.begin_step(self.stamp_ns))
+    def _step(self, vehicles: Sequence[VehicleNode]) -> None:
+        """Fly a control period; on a CUDA device, all vehicles at the same time.
+
+        Each step that has begun is ended, whatever another one raises.
+        """
+        if not vehicles:
             self._housekeep()  # while the device works
+            return
+        end_step = vehicles[0].begin_step(self.stamp_ns)
+        try:
+            self._step(vehicles[1:])
+        finally:
+            end_step()
 
     def _fly_streaming(self, streaming: StreamingLoop) -> None:
         """Fly a control period, and publish its packets when they are due."""

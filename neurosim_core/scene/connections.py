@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
+from neurosim_core.scene.components import connected_components
 from neurosim_core.scene.normals import edge_keys
 
 if TYPE_CHECKING:
@@ -54,6 +54,5 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         joined &= u & v
     sides = (normal.take(edges // 3, axis=0) for edges in (one, other))
     joined &= np.einsum("ec,ec->e", *sides) > _PLANE_COSINE
-    pairs = (one[joined] // 3, other[joined] // 3)
-    graph = scipy.sparse.coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
-    return neighbor, scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int32)
+    _, surface = connected_components(count, one[joined] // 3, other[joined] // 3)
+    return neighbor, surface.astype(np.int32)

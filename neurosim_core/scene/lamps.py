@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
 
+from neurosim_core.scene.components import connected_components
 from neurosim_core.scene.scene import Light, LinearRgb, extent
 from neurosim_core.scene.source import SceneError, Source, rgb
 
@@ -138,9 +138,8 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     full = np.zeros(shape, dtype=bool)
     full[tuple(index.T)] = True
     full[[0, -1]] = full[:, [0, -1]] = True  # nothing hangs outside
-    room = scipy.ndimage.distance_transform_edt(~full) * cell
-    # counts walls, hardly the floor
-    width = scipy.ndimage.distance_transform_edt(~full, sampling=(1.0, 1.0, 4.0))
+    room = _distance(full, (1.0, 1.0, 1.0)) * cell
+    width = _distance(full, (1.0, 1.0, 4.0))  # counts walls, hardly the floor
     floor = _gap(full) * cell
     standing = np.isfinite(floor) & (floor >= 1.2)
     how = "hung under the ceilings"
@@ -150,10 +149,11 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
         how = "hung inside at the height where a ceiling would be, for there is none"
         top = (shape[2] - 1 - np.arange(shape[2])) * cell
         places = standing & np.isinf(above) & (top >= 0.3) & (top <= 0.9) & (room >= 0.25)
-    air, _ = scipy.ndimage.label(room >= 1.5 * cell)
-    if not air[places].any():
+    air = room >= 1.5 * cell
+    if not (air & places).any():
         return _around(low, high), "placed above and around the scene, which has no room for them inside"
-    free = air == np.bincount(air[places & (air > 0)]).argmax()
+    region = _regions(air)
+    free = region == np.bincount(region[air & places]).argmax()
     places &= free
     lamps = [_widest(places, width)]
     reach = _steps_by_air(free, lamps[0]) * cell
@@ -176,6 +176,33 @@ def _around(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.f
     angles = np.array([0.6, 0.6 + 2.0 * math.pi / 3.0, 0.6 + 4.0 * math.pi / 3.0])
     directions = np.stack([np.cos(angles), np.sin(angles), np.full(3, 0.9)], axis=1)
     return np.asarray(centre + 1.2 * reach * directions / np.linalg.norm(directions[0]))
+
+
+def _distance(full: NDArray[np.bool_], spacing: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return the distance of each cell to the nearest full one; to import SciPy's takes 0.14 s."""
+    squared = np.where(full, 0.0, np.inf)
+    for axis, step in enumerate(spacing):
+        nearer = np.moveaxis(squared, axis, 0)  # the one array, seen along this axis
+        before = nearer.copy()
+        for cells in range(1, len(nearer)):
+            away = (step * cells) ** 2
+            if away >= nearer.max():
+                break
+            np.minimum(nearer[cells:], before[:-cells] + away, out=nearer[cells:])
+            np.minimum(nearer[:-cells], before[cells:] + away, out=nearer[:-cells])
+    return np.sqrt(squared)
+
+
+def _regions(free: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return a number for each cell that free cells share from which one gets to the other through faces."""
+    number = np.arange(free.size).reshape(free.shape)
+    pairs = []
+    for axis in range(free.ndim):
+        cell, is_free = np.moveaxis(number, axis, 0), np.moveaxis(free, axis, 0)
+        open_face = is_free[1:] & is_free[:-1]
+        pairs.append((cell[:-1][open_face], cell[1:][open_face]))
+    one, other = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    return connected_components(free.size, one, other)[1].reshape(free.shape)
 
 
 def _gap(full: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
+
+from neurosim_core.scene.components import connected_components
 
 CREASE_RAD = 0.7
 """Edges whose faces differ by more than this stay sharp [rad]; 40 degrees."""
@@ -62,13 +63,11 @@ def smooth_normals(
     same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
     joined_a = np.concatenate([first, head[first]])
     joined_b = np.concatenate([np.where(same, second, head[second]), np.where(same, head[second], second)])
-    linked = np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)
-    links = scipy.sparse.coo_matrix(linked, shape=(faces.size,) * 2)
-    count, label = scipy.sparse.csgraph.connected_components(links, directed=False)
+    count, label = connected_components(faces.size, joined_a, joined_b)
     weighted = (angle[:, :, None] * face_normal[:, None, :]).reshape(-1, 3)
-    total = np.empty((int(count), 3))
+    total = np.empty((count, 3))
     for axis in range(3):
-        total[:, axis] = np.bincount(label, weights=weighted[:, axis], minlength=int(count))
+        total[:, axis] = np.bincount(label, weights=weighted[:, axis], minlength=count)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     total /= np.where(length > 0.0, length, 1.0)
-    return total, label.reshape(-1, 3).astype(np.int64)
+    return total, label.reshape(-1, 3)

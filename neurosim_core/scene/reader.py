@@ -7,6 +7,8 @@ a name, which is mapped into memory.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import gc
 import json
 import mmap
@@ -16,10 +18,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 from neurosim_core.signals import end_with_parent
 
@@ -41,6 +43,8 @@ class SceneReader:
                 working directory.
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
+        self._answers: list[list[tuple[int, int]]] = []
+        """Where the parts of each answer are in the file, and how long they are."""
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
         with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
             # more than arguments may hold; nothing stays in a buffer
@@ -50,10 +54,17 @@ class SceneReader:
         self._process = subprocess.Popen(
             [sys.executable, "-c", program],
             stdin=self._file,  # which is to be written, too: its number may be 0 here, and is there
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
+
+    def geometry(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
+        """Wait for the triangles; return the scene without materials, some time before `scene` has all of it.
+
+        Arguments and errors are those of `scene`.
+        """
+        return self._answer(0, config) or config.load(pictures=pictures)
 
     def scene(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
         """Wait for the scene and return it; what the process could not read is read here.
@@ -65,19 +76,20 @@ class SceneReader:
         Raises:
             SceneError: A file cannot be used.
         """
-        if self._process.wait() == 0:
-            self._file.seek(0)
-            sizes, body = pickle.load(self._file)
-            data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
-            at, buffers = self._file.tell(), []
-            for size in sizes:
-                at += -at % _ALIGNMENT
-                buffers.append(data[at : at + size])
-                at += size
-            read, scene = pickle.loads(body, buffers=buffers)
-            if read == config:
-                return scene
-        return config.load(pictures=pictures)
+        return self._answer(1, config) or config.load(pictures=pictures)
+
+    def _answer(self, number: int, config: SceneConfig) -> Scene | None:
+        """Wait for an answer of the process; None if it gives none, or read something else."""
+        assert self._process.stdout is not None
+        while len(self._answers) <= number:
+            line = self._process.stdout.readline()
+            if not line:
+                return None
+            self._answers.append(json.loads(line))
+        data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
+        body, *buffers = (data[at : at + size] for at, size in self._answers[number])
+        read, scene = pickle.loads(body, buffers=buffers)
+        return scene if read == config else None
 
     def __enter__(self) -> SceneReader:
         return self
@@ -86,26 +98,25 @@ class SceneReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._process.kill()
-        self._process.wait()
+        self._process.communicate()  # closes the pipe
         self._file.close()
 
 
 def main() -> None:
-    """Be the process: read the settings in file 0, and write their scene in their place."""
+    """Be the process: read settings from file 0, write their scene in their place, and print where it is."""
     gc.disable()  # it ends soon
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    with open(0, "r+b") as file:
+    with open(0, "r+b") as file, open(os.dup(1), "w") as answers, open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)  # what libraries print is no answer
         settings = json.load(file)
         file.seek(0)
-        _write(settings, file)
+        _read(settings, functools.partial(_write, file=file, answers=answers))
 
 
-def _write(settings: Mapping[str, Any], file: BinaryIO) -> None:
-    """Read a scene, compute what its light and its pictures need, and write all to a file."""
+def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
+    """Read a scene and write its triangles; compute what its light and its pictures need, and write all."""
     from neurosim_core.registry import find
-    from neurosim_core.render.config import RenderConfig
-    from neurosim_core.render.refine import refine_within
     from neurosim_core.scene.mesh import scene_kind
 
     given = settings["scene"]
@@ -116,6 +127,10 @@ def _write(settings: Mapping[str, Any], file: BinaryIO) -> None:
     with ThreadPoolExecutor() as aside:
         for texture in {id(m.texture): m.texture for m in scene.materials if m.texture is not None}.values():
             aside.submit(texture.__getstate__)
+        write((config, dataclasses.replace(scene, materials=())))
+        from neurosim_core.render.config import RenderConfig
+        from neurosim_core.render.refine import refine_within
+
         render = RenderConfig.model_validate(settings["render"])
         edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
         if (mesh := refine_within(scene, edge_m)) is not None:
@@ -123,10 +138,17 @@ def _write(settings: Mapping[str, Any], file: BinaryIO) -> None:
             _ = mesh.corner_groups, mesh.corner_normals
         if render.samples_per_pixel == "adaptive":
             _ = scene.connections
+    write((config, scene))
+
+
+def _write(content: object, *, file: BinaryIO, answers: TextIO) -> None:
+    """Write an object and the arrays in it to a file, and print where each of them begins and its size."""
     buffers: list[pickle.PickleBuffer] = []
-    body = pickle.dumps((config, scene), protocol=5, buffer_callback=buffers.append)
-    views = [buffer.raw() for buffer in buffers]
-    pickle.dump(([view.nbytes for view in views], body), file)
-    for view in views:
+    body = pickle.dumps(content, protocol=5, buffer_callback=buffers.append)
+    places = []
+    for view in (memoryview(body), *(buffer.raw() for buffer in buffers)):
         file.write(bytes(-file.tell() % _ALIGNMENT))
+        places.append((file.tell(), view.nbytes))
         file.write(view)
+    file.flush()
+    print(json.dumps(places), file=answers, flush=True)

@@ -135,15 +135,13 @@ def read_cameras(
     with timed(state.wall_s, "camera read-back"):
         if not (state.pictures_in_place and _is_late(batch)):
             state.batch_done[batch.number % len(state.batch_done)].wait()
-    state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
+        seen = [begin_frames(*each, until_ns=batch.until_ns) for each in batch.seen]
+        for group, instants in batch.seen:
+            state.counts["renders"] += len(instants.stamps_ns)
+            packets += read_images(group, instants, borrow=borrow)
     for choice in batch.choices:
         state.counts["ticks left out"] += choice.left_out_count
         state.counts["coarse ticks"] += choice.coarse_count
-    with timed(state.wall_s, "events"):
-        seen = [begin_frames(*each, until_ns=batch.until_ns) for each in batch.seen]
-    with timed(state.wall_s, "camera read-back"):
-        for group, instants in batch.seen:
-            packets += read_images(group, instants, borrow=borrow)
     if meanwhile is not None:
         meanwhile()
     with timed(state.wall_s, "events"):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
@@ -111,29 +110,26 @@ def plan_batch(
     It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
     controller commands; otherwise the last command is held.
     """
-    number = state.launched_count
-    stamps_ns = [
-        state.launched_ns if begin_ns is None else begin_ns,
-        *(boundary.stamp_ns for boundary in stretch),
-    ]
-    elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
+    number, max_step_ns = state.launched_count, state.vehicle.max_step_ns
+    at_ns = state.launched_ns if begin_ns is None else begin_ns
+    elapsed_ns, pattern, step_count = [], [], 0
+    for boundary in stretch:
+        span_ns, at_ns = boundary.stamp_ns - at_ns, boundary.stamp_ns
+        elapsed_ns.append(span_ns)
+        pattern.append((span_ns, boundary.control, boundary.samplers))
+        step_count += -(-span_ns // max_step_ns)
+    commands = closed_loop and not isinstance(state.vehicle, Carrier)
     return Batch(
         boundaries=stretch,
         elapsed_ns=elapsed_ns,
-        pattern=tuple(
-            (span_ns, boundary.control, boundary.samplers)
-            for span_ns, boundary in zip(elapsed_ns, stretch, strict=True)
-        ),
+        pattern=tuple(pattern),
         closed_loop=closed_loop,
-        step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
-        command_count=sum(
-            closed_loop and boundary.control and not isinstance(state.vehicle, Carrier)
-            for boundary in stretch
-        ),
+        step_count=step_count,
+        command_count=sum(boundary.control for boundary in stretch) if commands else 0,
         number=number,
         slot=number % state.render_backlog * (state.trace.states.shape[0] // state.render_backlog),
         wanted=state.wanted,
-        until_ns=stamps_ns[-1],
+        until_ns=at_ns,
     )
 
 
@@ -214,8 +210,7 @@ def _fetch(state: State, batch: Batch) -> None:
 
 def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     """Return what was sampled in a batch that is flown, and collisions."""
-    with timed(state.wall_s, "read-back"):
-        rows = state.trace.numpy(batch.slot, len(batch.boundaries))
+    rows = state.trace.numpy(batch.slot, len(batch.boundaries))
     state.stamp_ns = batch.boundaries[-1].stamp_ns
     state.counts["steps"] += batch.step_count
     state.counts["commands"] += batch.command_count
@@ -223,11 +218,9 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     if any(status not in (0, int(STATUS_COLLISION)) for status in rows.status[-1].tolist()):
         state.failure = _failure(state.vehicle)
         state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
-    with timed(state.wall_s, "collision check"):
-        packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
+    packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
     batch.until_ns = state.stamp_ns
-    with timed(state.wall_s, "read-back"):
-        packets += _read_samplers(state, batch)
+    packets += _read_samplers(state, batch)
     reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]

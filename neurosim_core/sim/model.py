@@ -20,6 +20,7 @@ from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
 from neurosim_core.scene.bodies import Body, make_bodies
 from neurosim_core.scene.freespace import FreeSpace, make_free_space
+from neurosim_core.scene.reader import SceneReader
 from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
@@ -63,7 +64,7 @@ class Model:
 def make_model(
     config: SimulationConfig,
     *,
-    scene: Scene | Callable[..., Scene] | None = None,
+    reader: SceneReader | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> Model:
@@ -71,8 +72,7 @@ def make_model(
 
     Args:
         config: What to fly; one vehicle.
-        scene: Where to fly, in place of what `config` says, or what returns it, called as
-            `SceneConfig.load` is; None: as it says.
+        reader: Reads the scene in another process; None: it is read here.
         on_phase: Told the name of each part of the work when it begins.
         meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`), and
             with what says whether the scene is lit.
@@ -85,7 +85,7 @@ def make_model(
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
         )
-    return next(iter(make_fleet(config, scene=scene, on_phase=on_phase, meanwhile=meanwhile).values()))
+    return next(iter(make_fleet(config, reader=reader, on_phase=on_phase, meanwhile=meanwhile).values()))
 
 
 def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
@@ -113,7 +113,7 @@ def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Mo
 def make_fleet(
     config: SimulationConfig,
     *,
-    scene: Scene | Callable[..., Scene] | None = None,
+    reader: SceneReader | None = None,
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> dict[str, Model]:
@@ -134,17 +134,24 @@ def make_fleet(
         with phase("scene"):
             members = {name: config.of(name) for name in config.vehicles}
             seeing = any(plan_render_groups(member.sensors) for member in members.values())
-            if scene is None:
+            if reader is None:
                 scene = config.scene.load(pictures=seeing)
-            elif not isinstance(scene, Scene):
-                load_scipy()  # while another process reads
-                scene = scene(pictures=seeing)
+            else:
+                load_scipy()  # while the other process reads
+                scene = reader.geometry(config.scene, pictures=seeing)
             bodies = make_bodies(config.bodies) if seeing else ()
         beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
-        light = functools.partial(  # needs no path: both at once
-            upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
-        )
-        lit = aside.submit(light) if seeing else None
+
+        def light() -> tuple[Scene, Any]:
+            """Return the scene with all that is seen, here and on the device; needs no path: both at once."""
+            whole = scene if reader is None else reader.scene(config.scene, pictures=seeing)
+            if not seeing:
+                return whole, None
+            return whole, upload_scene(
+                whole, config.render, device=device, renderer=config.renderer, bodies=bodies
+            )
+
+        lit = aside.submit(light)
         with phase("free space"):
             free_space = make_free_space(scene, config.free_space, device=device)
         with phase("path"):
@@ -156,11 +163,11 @@ def make_fleet(
             )
 
         with phase("light"):
-            if meanwhile is not None and lit is not None:
+            if meanwhile is not None and seeing:
                 name, first = next(iter(members.items()))
                 blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
                 meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None), lit.done)
-            scene_on_device = None if lit is None else lit.result()
+            scene, scene_on_device = lit.result()
     return {name: model_of(name, config, scene_on_device) for name, config in members.items()}
 
 

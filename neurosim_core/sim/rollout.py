@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
+from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import launch_cameras, plan_ahead, read_cameras
 from neurosim_core.sim.integrate import (
     Command,
@@ -194,8 +195,9 @@ def integrate_period(
         batch = plan_batch(state, stretch, closed_loop=False)
         launch_flight(state, batch, *plan_flight(state, batch))
         batches.append(batch)
-        state.flown[batch.number % state.render_backlog].wait()
-        packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
+        with timed(state.wall_s, "read-back"):
+            state.flown[batch.number % state.render_backlog].wait()
+            packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
 
     if state.launched_count == 0:
         fly([everything(model.schedule)])

@@ -89,7 +89,7 @@ def read(
     with timed(state.wall_s, "read-back"):
         flown = state.flown if state.overlaps else state.batch_done  # one graph has one end
         flown[batch.number % len(flown)].wait()
-    packets = read_flight(model, state, batch)  # may end the run before the end of the batch
+        packets = read_flight(model, state, batch)  # may end the run before the end of the batch
     packets += read_cameras(state, batch, borrow=last and state.borrow_pictures, meanwhile=meanwhile)
     state.rendered_count += 1
     return in_order(model, packets, batch.until_ns)

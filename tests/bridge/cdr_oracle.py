@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import array
 import struct
 from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from cortex_ros2_bridge.msgs import Message, message_class
+from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.typestore import typestore
 
 FORMATS = {
     "bool": "?",
-    "byte": "B",
+    "byte": "b",
     "char": "B",
     "int8": "b",
     "uint8": "B",
@@ -41,7 +40,7 @@ class Writer:
         form = FORMATS[kind]
         size = struct.calcsize(form)
         self.body += bytes(-len(self.body) % size)
-        self.body += struct.pack(self.order + form, value[0] if kind == "byte" else value)
+        self.body += struct.pack(self.order + form, value)
 
     def text(self, value: str) -> None:
         coded = value.encode() + b"\0"
@@ -68,7 +67,7 @@ class Writer:
             self.value(desc, 0 if name == EMPTY else getattr(message, name))
 
 
-def write(message: Message, type_name: str, order: str = "<") -> bytes:
+def write(message: Any, type_name: str, order: str = "<") -> bytes:
     """Return a message as CDR, in an order of bytes: < little endian, > big endian."""
     writer = Writer(order)
     writer.message(type_name, message)
@@ -77,7 +76,7 @@ def write(message: Message, type_name: str, order: str = "<") -> bytes:
 
 
 def random_message(type_name: str, rng: np.random.Generator) -> Any:
-    """Return a stand-in all of whose fields are random; sequences have up to three elements."""
+    """Return a message all of whose fields are random; sequences have up to three elements."""
     message = message_class(type_name)()
     for name, desc in typestore().fielddefs[type_name][1]:
         if name != EMPTY:
@@ -93,13 +92,7 @@ def _random(desc: Any, rng: np.random.Generator) -> Any:
         return random_message(what, rng)
     element, size = what
     count = size if kind == Nodetype.ARRAY else int(rng.integers(0, min(size or 3, 3) + 1))
-    values = [_random(element, rng) for _ in range(count)]
-    base = element[1][0]
-    if element[0] != Nodetype.BASE or base in ("string", "bool", "byte"):
-        return values
-    if kind == Nodetype.ARRAY:
-        return np.array(values, "uint8" if base == "char" else base)
-    return array.array(FORMATS[base], values)
+    return [_random(element, rng) for _ in range(count)]
 
 
 def _random_base(base: str, rng: np.random.Generator) -> Any:
@@ -107,9 +100,7 @@ def _random_base(base: str, rng: np.random.Generator) -> Any:
         return "".join(chr(c) for c in rng.integers(32, 1000, rng.integers(0, 9)))
     if base == "bool":
         return bool(rng.integers(2))
-    if base == "byte":
-        return bytes([rng.integers(256)])
     if base.startswith("float"):
         return float(np.dtype(base).type(rng.normal()))
-    info = np.iinfo("uint8" if base == "char" else base)
+    info = np.iinfo({"char": "uint8", "byte": "int8"}.get(base, base))
     return int(rng.integers(info.min, info.max, dtype=info.dtype.type, endpoint=True))

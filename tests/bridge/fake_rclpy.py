@@ -16,6 +16,9 @@ from typing import Any
 
 import pytest
 
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.msgs import message_class
+
 
 class InvalidHandle(Exception):
     """Something destroyed was used."""
@@ -110,6 +113,16 @@ class Trigger:
         def message(self, value: str) -> None:
             assert isinstance(value, str), "The 'message' field must be of type 'str'"
             self._message = value
+
+
+def serialize_message(message: Trigger.Request) -> bytes:
+    return bytes(cdr.encode(message_class("std_srvs/srv/Trigger_Request")()))
+
+
+def deserialize_message(data: bytes, kind: type[Trigger.Response]) -> Trigger.Response:
+    made, record = kind(), cdr.decode(data, "std_srvs/srv/Trigger_Response")
+    made.success, made.message = record.success, record.message
+    return made
 
 
 NAMES = {String: "std_msgs/msg/String"}
@@ -501,6 +514,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
         "rclpy.event_handler": {
             "PublisherEventCallbacks": EventCallbacks,
             "SubscriptionEventCallbacks": EventCallbacks,
+        },
+        "rclpy.serialization": {
+            "serialize_message": serialize_message,
+            "deserialize_message": deserialize_message,
         },
         "rclpy.signals": {"SignalHandlerOptions": SignalHandlerOptions},
         "std_msgs": {},

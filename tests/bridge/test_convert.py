@@ -639,7 +639,7 @@ def test_every_way_out_is_tested():
 
 def test_event_image_is_drawn_until_its_period_is_over():
     data = event_image_bytes()
-    image = cdr.decode_record(data, "sensor_msgs/msg/Image")
+    image = cdr.decode(data, "sensor_msgs/msg/Image")
     pixels = image.data.reshape(5, 8, 3)
     white, _, blue = ([255, 255, 255], [220, 30, 30], [30, 60, 220])
     assert pixels[3, 7].tolist() == blue
@@ -866,7 +866,7 @@ def test_event_packets_are_decoded_again(encoding):
         events = many_events(count, begin_us)
         data = convert.event_packet(events, given)
         assert len(data) % 4 == 0
-        sent = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
+        sent = cdr.decode(data, "event_camera_msgs/msg/EventPacket")
         stamp_ns = sent.header.stamp.sec * 10**9 + sent.header.stamp.nanosec
         if encoding == "evt3":
             decoded = decoder.decode(sent.events, width=sent.width, height=sent.height)
@@ -982,17 +982,17 @@ def test_diagnostics_judge_the_last_period():
     assert told(wall_ns=200_000_001) is None
     assert told(wall_ns=300_000_001, phase="paused") is not None
     later = told(wall_ns=1_000_000_001, vehicles=quiet)
-    assert [status.level for status in later] == [b"\0"] * 4
+    assert [status.level for status in later] == [0] * 4
     assert (later[0].message, later[3].message) == ("running, 0.5 x real time", "commands: rates")
     assert {pair.key: pair.value for pair in later[0].values}["overrun_count"] == "4"
     more = [dataclasses.replace(quiet[0], refused_count=5)]
     again = told(wall_ns=3_000_000_001, overrun_count=7, vehicles=more)
-    assert again[0].level == b"\1"
+    assert again[0].level == 1
     assert "3 steps were late, and 0.000 s slipped in 2.0 s" in again[0].message
     assert again[3].message == "2 commands refused in 2.0 s; commands: rates"
     anew = told(wall_ns=5_000_000_001, overrun_count=1, vehicles=quiet)  # after a reset
     assert "1 steps were late" in anew[0].message
-    assert told(wall_ns=6_000_000_001, phase="ended", reason="it hit a wall")[0].level == b"\2"
+    assert told(wall_ns=6_000_000_001, phase="ended", reason="it hit a wall")[0].level == 2
 
 
 def test_a_picture_of_depths_becomes_a_cloud():

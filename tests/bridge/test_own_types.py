@@ -176,7 +176,7 @@ def test_a_shared_type_crosses_in_both_directions() -> None:
         assert (got.stamp_ns, got.width_m, got.label, got.raw) == (5, 0.08, "left", b"\1\2")
         np.testing.assert_array_equal(got.fingers, gripper.fingers)
         wrong = cdr.decode(ros.sent[0], "my_robot/msg/Gripper")
-        wrong.fingers_shape = [3, 2]
+        wrong.fingers_shape = np.array([3, 2], np.uint32)
         back.put(wrong)
         wait_for(lambda: rig.tally("/drone/wanted <- /drone/wanted").refused == 1)
 

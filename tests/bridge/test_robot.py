@@ -96,7 +96,7 @@ def test_packets_beyond_the_sensor_or_of_no_time():
     """Events beyond the sensor are left out; a time that no clock has is an error."""
     options = Context(vehicle="drone", options={"encoding": "mono"})
     data = conversion("Events", robot=False, direction="out")(window(1, 40), options)
-    packet = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
+    packet = cdr.decode(data, "event_camera_msgs/msg/EventPacket")
     into = conversion("Events", robot=True, direction="in")
     narrow = into(cdr.encode(dataclasses.replace(packet, width=20)), Context(vehicle="drone"))
     sent = window(1, 40)

@@ -1,11 +1,8 @@
-"""Message definitions, and stand-ins that behave as the classes of rclpy do."""
+"""Message definitions, and records of messages."""
 
 from __future__ import annotations
 
 import array
-import copy
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +13,15 @@ from cortex_ros2_bridge.convert import RULES
 from cortex_ros2_bridge.msgs import (
     Actuators,
     AttitudeTarget,
-    CameraInfo,
     DiagnosticStatus,
-    Empty,
-    Header,
     Image,
     Imu,
     KeyValue,
     NavSatStatus,
     PointCloud2,
     PointField,
-    PolygonStamped,
     PoseWithCovariance,
-    Quaternion,
     SimulatorStatus,
-    String,
     TFMessage,
     Vector3,
     message_class,
@@ -44,8 +35,6 @@ from cortex_ros2_bridge.typestore import (
     typestore,
 )
 
-WRONG = (AssertionError, OverflowError, TypeError, cdr.CdrError)
-"""What is raised where a value is set, with and without ROS_PYTHON_CHECK_FIELDS=1, or where it is encoded."""
 ROUTED = sorted({rule.ros_type for rule in RULES})
 HASHES = Path(__file__).with_name("golden") / "type_hashes.txt"
 REAL_HASHES = {
@@ -89,80 +78,14 @@ def test_all_definitions_are_in_the_store():
     assert definitions().keys() <= typestore().fielddefs.keys()
 
 
-FIELDS = {
-    # As `get_fields_and_field_types()` of rclpy's classes shows them.
-    Imu: {
-        "header": "std_msgs/Header",
-        "orientation": "geometry_msgs/Quaternion",
-        "orientation_covariance": "double[9]",
-        "angular_velocity": "geometry_msgs/Vector3",
-        "angular_velocity_covariance": "double[9]",
-        "linear_acceleration": "geometry_msgs/Vector3",
-        "linear_acceleration_covariance": "double[9]",
-    },
-    Image: {
-        "header": "std_msgs/Header",
-        "height": "uint32",
-        "width": "uint32",
-        "encoding": "string",
-        "is_bigendian": "uint8",
-        "step": "uint32",
-        "data": "sequence<uint8>",
-    },
-    PointCloud2: {
-        "header": "std_msgs/Header",
-        "height": "uint32",
-        "width": "uint32",
-        "fields": "sequence<sensor_msgs/PointField>",
-        "is_bigendian": "boolean",
-        "point_step": "uint32",
-        "row_step": "uint32",
-        "data": "sequence<uint8>",
-        "is_dense": "boolean",
-    },
-    DiagnosticStatus: {
-        "level": "octet",
-        "name": "string",
-        "message": "string",
-        "hardware_id": "string",
-        "values": "sequence<diagnostic_msgs/KeyValue>",
-    },
-    Actuators: {
-        "header": "std_msgs/Header",
-        "position": "sequence<double>",
-        "velocity": "sequence<double>",
-        "normalized": "sequence<double>",
-    },
-    Empty: {},
-}
-
-
-@pytest.mark.parametrize(("kind", "expected"), FIELDS.items(), ids=lambda v: getattr(v, "__name__", ""))
-def test_fields_and_their_types(kind, expected):
-    assert kind.get_fields_and_field_types() == expected
-    assert list(kind.get_fields_and_field_types()) == list(expected)
-    assert [slot for slot in kind.__slots__ if slot != "_check_fields"] == [f"_{name}" for name in expected]
-    kind.get_fields_and_field_types().clear()  # a copy
-    assert kind.get_fields_and_field_types() == expected
-
-
-def test_limits_are_part_of_a_type():
-    shape = message_class("shape_msgs/msg/SolidPrimitive")
-    assert shape.get_fields_and_field_types()["dimensions"] == "sequence<double, 3>"
-
-
 def test_defaults():
     imu = Imu()
     assert (imu.orientation.x, imu.orientation.w) == (0.0, 1.0)
-    assert Quaternion.W__DEFAULT == 1.0
     assert NavSatStatus().status == -2
     assert imu.header.frame_id == ""
     assert imu.orientation_covariance.tolist() == [0.0] * 9
     assert imu.orientation_covariance.dtype == np.float64
-    image = Image()
-    assert image.data == array.array("B")
-    assert image.data.typecode == "B"
-    assert DiagnosticStatus().level == b"\0"
+    assert (Image().data.dtype, len(Image().data)) == (np.uint8, 0)
     assert TFMessage().transforms == []
     assert Image().header is not Image().header
     first, second = PoseWithCovariance(), PoseWithCovariance()
@@ -172,24 +95,17 @@ def test_defaults():
 
 def test_constants_are_on_class_and_message():
     assert (PointField.FLOAT32, PointField().FLOAT32) == (7, 7)
-    assert DiagnosticStatus.ERROR == b"\x02"
+    assert DiagnosticStatus.ERROR == 2
     bits = "ROLL_RATE", "PITCH_RATE", "YAW_RATE", "THRUST", "ATTITUDE"
     assert [getattr(AttitudeTarget, f"IGNORE_{bit}") for bit in bits] == [1, 2, 4, 64, 128]
     assert SimulatorStatus.RUNNING == "running"
 
 
-def test_constructor_takes_fields_by_name_only():
-    message = Vector3(x=1.0, z=-2.0)
-    assert (message.x, message.y, message.z) == (1.0, 0.0, -2.0)
-    with pytest.raises(AssertionError, match="Invalid arguments passed to constructor: w"):
-        Vector3(w=1.0)
-    with pytest.raises(TypeError):
-        Vector3(1.0, 2.0, 3.0)
-
-
 def test_attributes_that_do_not_exist_cannot_be_set():
-    with pytest.raises(AttributeError):
+    with pytest.raises(AttributeError, match="Imu has no field 'acceleration', its fields are header"):
         Imu().acceleration = 3
+    with pytest.raises(AttributeError, match="no field 'w', its fields are x, y, z"):
+        Vector3(w=1.0)
 
 
 @pytest.mark.parametrize(
@@ -201,93 +117,47 @@ def test_attributes_that_do_not_exist_cannot_be_set():
         (lambda: Image(height=1.0), "cannot encode a sensor_msgs/msg/Image"),
         (lambda: Image(encoding=b"rgb8"), "cannot encode a sensor_msgs/msg/Image"),
         (lambda: Image(header=Vector3()), "cannot encode a sensor_msgs/msg/Image"),
-        (lambda: Image(data=[256]), "unsigned byte integer is greater than maximum"),
-        (lambda: Image(data="ab"), "cannot use a str"),
-        (lambda: Image(data=[0.5]), "float"),
-        (lambda: Image(data=array.array("f", [1.0])), "type code 'f' for one of 'B'"),
-        (lambda: Imu(orientation_covariance=np.zeros(9, np.float32)), "of float32 for one of"),
+        (lambda: Image(data=[256]), "256"),
+        (lambda: Image(data="ab"), "one axis, got 'ab'"),
+        (lambda: Image(data=[0.5]), r"\[0.5\] has numbers that are no uint8"),
+        (lambda: Image(data=np.zeros((2, 6), np.uint8)), "one axis"),
         (lambda: Imu(orientation_covariance=np.zeros(8)), "cannot encode a sensor_msgs/msg/Imu"),
         (lambda: Imu(orientation_covariance=[0.0] * 8), "cannot encode a sensor_msgs/msg/Imu"),
         (lambda: PointCloud2(fields=[Vector3()]), "cannot encode a sensor_msgs/msg/PointCloud2"),
-        (lambda: DiagnosticStatus(level=1), "cannot encode a diagnostic_msgs/msg/DiagnosticStatus"),
-        (lambda: DiagnosticStatus(level=b"12"), "cannot encode a diagnostic_msgs/msg/DiagnosticStatus"),
+        (lambda: DiagnosticStatus(level=b"1"), "cannot encode a diagnostic_msgs/msg/DiagnosticStatus"),
         (lambda: AttitudeTarget(thrust=1e39), "cannot encode a mavros_msgs/msg/AttitudeTarget"),
     ],
 )
 def test_values_of_a_wrong_type_or_range_are_refused(make, reason):
     """Where they are set, or at the latest where they are encoded."""
-    is_ours = issubclass(Imu, msgs.Message)
-    with pytest.raises(WRONG, match=reason if is_ours else None):  # rclpy has other words for each
+    with pytest.raises((TypeError, OverflowError, cdr.CdrError), match=reason):
         cdr.encode(make())
 
 
-def test_arrays_are_those_of_rclpy_whatever_they_are_made_of():
-    pixels = np.arange(12, dtype=np.uint8).reshape(2, 6)
-    flat = pixels.reshape(-1)
-    for data in (flat, pixels.tobytes(), bytearray(pixels), list(range(12)), array.array("B", range(12))):
-        assert Image(data=data).data == array.array("B", range(12))
+def test_rows_are_arrays_whatever_they_are_made_of():
+    flat = np.arange(12, dtype=np.uint8)
+    for data in (
+        flat,
+        flat.tobytes(),
+        bytearray(flat.tobytes()),
+        list(range(12)),
+        array.array("B", range(12)),
+    ):
+        image = Image(data=data)
+        assert image.data.tolist() == list(range(12))
+        assert image.data.dtype == np.uint8
     assert Image(data=flat[::2]).data.tolist() == [0, 2, 4, 6, 8, 10]
-    assert Actuators(velocity=[1, 2]).velocity == array.array("d", [1.0, 2.0])
-    imu = Imu(orientation_covariance=[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
-    assert imu.orientation_covariance.dtype == np.float64
+    assert Actuators(velocity=[1, 2]).velocity.dtype == np.float64
     ours = np.ones(9)
-    imu.orientation_covariance = ours
-    assert imu.orientation_covariance is ours
-    assert CameraInfo(k=[float(n) for n in range(9)]).k.shape == (9,)
-    assert CameraInfo(k=list(range(9))).k.tolist() == [float(n) for n in range(9)]
-    message = Actuators()
-    message.velocity.extend([3.0, 4.0])
-    assert message.velocity.tolist() == [3.0, 4.0]
-
-
-def test_an_array_of_more_dimensions_is_refused_as_rclpy_does():
-    """Else what was written without ROS would fail where ROS is."""
-    picture = np.zeros((2, 6), np.uint8)
-    with pytest.raises(WRONG):
-        Image(data=picture)
-    message = Image()
-    with pytest.raises(WRONG):
-        message.data = picture
-
-
-def test_equality():
-    one, other = Imu(), Imu()
-    assert one == other
-    other.angular_velocity_covariance[:] = 1.0  # where only some differ, the classes of Jazzy see none
-    assert one != other
-    assert Header(frame_id="a") != Header(frame_id="b")
-    assert Header() != String()
-    with pytest.raises(TypeError):
-        hash(Header())
-
-
-def test_text():
-    header = Header(frame_id="map")
-    assert repr(header) == (
-        "std_msgs.msg.Header(stamp=builtin_interfaces.msg.Time(sec=0, nanosec=0), frame_id='map')"
-    )
-    assert repr(Actuators(header=header, velocity=[1.0, 2.5])).endswith(
-        "position=[], velocity=[1.0, 2.5], normalized=[])"
-    )
-    assert repr(KeyValue(key="a", value="b")) == "diagnostic_msgs.msg.KeyValue(key='a', value='b')"
-
-
-def test_copies():
-    message = PolygonStamped()
-    message.header.frame_id = "map"
-    message.polygon.points.append(message_class("geometry_msgs/msg/Point32")(x=0.5))
-    same = copy.deepcopy(message)
-    assert same == message
-    same.polygon.points[0].x = 1.0
-    assert message.polygon.points[0].x == 0.5
+    assert Imu(orientation_covariance=ours).orientation_covariance is ours
 
 
 def test_every_type_has_a_class():
     for type_name in typestore().fielddefs:
         kind = message_class(type_name)
-        assert kind() == kind(), type_name
-        assert repr(kind()).startswith(type_name.replace("/", ".") + "(")
         assert message_class(type_name) is kind
+        data = bytes(cdr.encode(kind()))
+        assert bytes(cdr.encode(cdr.decode(data, kind))) == data, type_name
 
 
 def test_names_that_do_not_exist():
@@ -302,58 +172,6 @@ def test_packages_do_not_hide_each_other():
     """Names that are in two packages mean one of them, and always the same."""
     assert KeyValue is message_class("diagnostic_msgs/msg/KeyValue")
     assert msgs.GoalStatus is message_class("action_msgs/msg/GoalStatus")
-
-
-REAL = """
-class Imu:
-    @classmethod
-    def get_fields_and_field_types(cls):
-        return {}
-
-Imu.__module__ = "sensor_msgs.msg._imu"
-"""
-USER = """
-from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.msgs import Imu, Image
-
-print(Imu.__module__, Image.__module__, cdr.type_name_of(Imu()), cdr.type_name_of(Image()))
-"""
-
-
-def test_the_real_class_is_used_where_ros_is_sourced(tmp_path: Path):
-    """In a process of its own, which finds a package `sensor_msgs` that has Imu and no Image."""
-    package = tmp_path / "sensor_msgs" / "msg"
-    package.mkdir(parents=True)
-    (tmp_path / "sensor_msgs" / "__init__.py").touch()
-    (package / "__init__.py").write_text(REAL)
-    root = Path(__file__).resolve().parents[2]
-    said = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(root)!r}]\n{USER}"],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
-    assert said == [
-        "sensor_msgs.msg._imu",
-        "cortex_ros2_bridge.msgs",
-        "sensor_msgs/msg/Imu",
-        "sensor_msgs/msg/Image",
-    ]
-
-
-def test_stand_ins_conform_to_rclpy():
-    """Where ROS is sourced: fields, their types and defaults of the classes that it has."""
-    pytest.importorskip("rclpy")
-    compared = 0
-    for type_name in typestore().fielddefs:
-        real = msgs._ros_class(type_name)
-        if real is None:
-            continue
-        ours = msgs._make_class(type_name)
-        assert ours.get_fields_and_field_types() == real.get_fields_and_field_types(), type_name
-        assert repr(ours()) == repr(real()), type_name
-        compared += 1
-    assert compared > 50
 
 
 if __name__ == "__main__":

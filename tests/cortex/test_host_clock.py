@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 
-import numpy as np
 import pytest
 
 from cortex.clock import Clock, ClockEstimate
@@ -43,7 +42,7 @@ class Link:
 
     @property
     def error_ns(self) -> int:
-        return abs(self.estimate.offset_ns(self.now_ns) - self.truth_ns(self.now_ns))
+        return abs(self.estimate.offset_ns() - self.truth_ns(self.now_ns))
 
 
 def test_the_first_answer_tells_the_offset_to_half_a_round_trip():
@@ -52,24 +51,20 @@ def test_the_first_answer_tells_the_offset_to_half_a_round_trip():
     link.beat(0.25)
     clock = link.clock
     assert link.error_ns <= clock.error_ns < 2 * 10**7
-    assert clock.drift_ppm is None
 
 
 @pytest.mark.parametrize("drift_ppm", [-80.0, 0.0, 40.0])
-def test_offset_and_drift_over_a_link_with_jitter(drift_ppm):
-    """20 ms and exponential jitter of 5 ms each way: 1 ms after a minute, and the drift to 20 ppm."""
-    link = Link(ahead_ns=-3 * SECOND_NS, drift_ppm=drift_ppm, delay_ns=20 * 10**6, jitter_ns=5 * 10**6)
+@pytest.mark.parametrize(
+    ("delay_ns", "jitter_ns", "error_ns"), [(20 * 10**6, 5 * 10**6, 2 * 10**6), (10**5, 2 * 10**4, 10**5)]
+)
+def test_offset_over_a_link_with_jitter(drift_ppm, delay_ns, jitter_ns, error_ns):
+    """Exponential jitter each way: 2 ms after a minute by radio, 0.1 ms by cable."""
+    link = Link(ahead_ns=-3 * SECOND_NS, drift_ppm=drift_ppm, delay_ns=delay_ns, jitter_ns=jitter_ns)
     link.beat(60.0)
-    assert link.error_ns < 10**6
-    assert link.clock.drift_ppm == pytest.approx(-drift_ppm, abs=20.0)
-    assert link.clock.error_ns == pytest.approx(20 * 10**6, rel=0.1)
-
-
-def test_drift_over_a_cable():
-    link = Link(ahead_ns=0, drift_ppm=37.0, delay_ns=10**5, jitter_ns=2 * 10**4)
-    link.beat(30.0)
-    assert link.error_ns < 10**5
-    assert link.clock.drift_ppm == pytest.approx(-37.0, abs=2.0)
+    for _ in range(20):
+        link.beat(1.0)
+        assert link.error_ns < error_ns
+        assert link.error_ns <= link.clock.error_ns < 2 * delay_ns
 
 
 @pytest.mark.parametrize("step_ns", [-HOUR_NS, 10**8])
@@ -81,45 +76,21 @@ def test_a_registry_whose_clock_is_set(step_ns):
     assert link.error_ns < 2 * 10**6
 
 
-def test_a_drift_that_is_not_known_is_not_told():
-    link = Link(ahead_ns=0, drift_ppm=0.0, delay_ns=20 * 10**6, jitter_ns=5 * 10**6)
-    link.beat(9.0)
-    assert link.clock.drift_ppm is None
-    assert link.error_ns < 5 * 10**6
-
-
-def test_an_error_that_is_stated_holds_where_the_drift_is_not_known():
+def test_an_error_that_is_stated_holds_while_clocks_run_apart():
     """One quick answer, then a minute of slow ones: clocks that run apart make the quick one worse."""
     link = Link(ahead_ns=0, drift_ppm=80.0, delay_ns=10**6, jitter_ns=0)
     link.beat(0.25)
     link._jitter_ns = 100 * 10**6
     for _ in range(60):
         link.beat(1.0)
-        assert link.clock.drift_ppm is None
         assert link.error_ns <= link.clock.error_ns
-
-
-def test_other_threads_see_no_estimate_without_its_drift(monkeypatch):
-    """While a new line is worked out, `offset_ns` goes by the one before."""
-    link = Link(ahead_ns=0, drift_ppm=80.0, delay_ns=10**5, jitter_ns=10**4)
-    link.beat(60.0)
-    fit, errors = np.polyfit, []
-
-    def look(*arguments, **options):
-        errors.append(link.error_ns)
-        return fit(*arguments, **options)
-
-    monkeypatch.setattr(np, "polyfit", look)
-    link.beat(4.0)
-    assert errors
-    assert max(errors) < 10**5
 
 
 def test_a_slow_answer_moves_nothing():
     link = Link(ahead_ns=0, drift_ppm=0.0, delay_ns=10**6, jitter_ns=0)
     link.beat(20.0)
-    before_ns = link.estimate.offset_ns(link.now_ns)
+    before_ns = link.estimate.offset_ns()
     link.estimate.add(
         link.now_ns, link.now_ns + 400 * 10**6, link.now_ns + 401 * 10**6
     )  # one way took 400 ms
-    assert abs(link.estimate.offset_ns(link.now_ns) - before_ns) < 10**5
+    assert abs(link.estimate.offset_ns() - before_ns) < 10**5

@@ -41,7 +41,10 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     loaded = config.load()
     monkeypatch.setattr(MeshSceneConfig, "load", None)
     with SceneReader({"scene": {"file": str(file)}}) as reader:
+        geometry = reader.geometry(config)
         scene = reader.scene(config)
+    for name in ("vertices", "faces", "normals"):
+        np.testing.assert_array_equal(getattr(geometry, name), getattr(loaded, name), strict=True)
     for name, values in arrays_of(loaded).items():
         np.testing.assert_array_equal(getattr(scene, name), values, strict=True)
     (mesh,), wanted = scene.refined.values(), refine(loaded, 0.5)
@@ -71,6 +74,7 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
 def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
     with SceneReader({"scene": settings}) as reader:
+        assert reader.geometry(config).name == "room"
         assert reader.scene(config).name == "room"
 
 

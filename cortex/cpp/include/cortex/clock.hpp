@@ -10,7 +10,7 @@
 
 namespace cortex::detail {
 
-// The answer that tells most counts: one that was quick, or came just now. Python also estimates how far clocks run apart.
+// The answer that tells most counts: one that was quick, or came just now.
 class ClockEstimate {
  public:
   // CLOCK_REALTIME of the registry's host less CLOCK_MONOTONIC of this one; 0 before the first answer.
