@@ -81,7 +81,7 @@ class Fanout:
         reader = self.readers[key] = Reader(key, request, pub_socket)
         if request.shared_memory and pub_socket.local:
             self.ring.admit(reader, sequence)
-        reader.has_answer = reader.member is not None or not request.confirms_end
+        reader.has_answer = reader.member is not None or not request.strict
         self.route()
         answer = wire.answer_frame(key, wire.AttachAnswer(sequence, self.latched))
         if pub_socket.strict:
@@ -299,8 +299,7 @@ class Fanout:
 
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
-        confirms = reader.request.confirms and reader.member is None
-        return confirms and reader.confirmed < self._fast_send.sequence + reader.request.confirms_end
+        return reader.member is None and reader.confirmed <= self._fast_send.sequence
 
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""

@@ -316,10 +316,5 @@ def _explain(error: ValidationError) -> str:
         )
     if item["type"] == "missing":
         return f"{place} is missing"
-    words = _WORDS.get(item["type"])
-    place = place or "the settings"
-    return (
-        f"{place} {words}, got {item['input']!r:.80}"
-        if words
-        else f"{place}: {text}, got {item['input']!r:.80}"
-    )
+    words = f" {_WORDS[item['type']]}" if item["type"] in _WORDS else f": {text}"
+    return f"{place or 'the settings'}{words}, got {item['input']!r:.80}"
