@@ -108,8 +108,7 @@ class Publisher(Closing, Generic[T]):
         return self._fast_send(message)
 
     def _publish_slowly(self, message: T) -> bool:
-        self._lock.acquire()
-        try:
+        with self._lock:
             now_ns = monotonic_ns()
             if now_ns >= self._fast_send.refresh_ns:
                 self._prepare(now_ns)
@@ -125,8 +124,6 @@ class Publisher(Closing, Generic[T]):
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
             if isinstance(prepared, bytes):
                 return self._publish_inline(prepared, stamp_ns, now_ns)
-        finally:
-            self._lock.release()
         return self._publish_large(prepared, stamp_ns, now_ns)
 
     def _publish_large(self, prepared: Any, stamp_ns: int, now_ns: int) -> bool:
