@@ -11,7 +11,7 @@ from collections.abc import Iterator
 def no_collection() -> Iterator[None]:
     """Look for no garbage in a block, nor ever in what is there at its end; for a process that does it once.
 
-    Each look at the modules and settings of a flight takes 0.1 s, in the set-up or in the midst of the flight.
+    Each look at the modules and settings of a flight takes 0.1 s, in its set-up or in the midst of it.
     """
     was_enabled = gc.isenabled()
     gc.disable()
