@@ -52,7 +52,7 @@ class Reader:
     confirmed: int = 0
     """It has accounted for all messages below this; the end of the stream counts as one."""
     has_answer: bool = False
-    """Whether it has said so, or need not."""
+    """Whether it has confirmed its answer, or need not."""
 
     @property
     def timeout_s(self) -> float:

@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from cortex.commands import interrupts
+
 INTERRUPTED = 130
 TERMINATED = 143
 BROKEN_PIPE = 141
@@ -36,10 +38,6 @@ _EXAMPLES = """examples:
 T = TypeVar("T")
 
 
-class _Terminated(BaseException):
-    """SIGTERM: end as after Ctrl-C, with files closed and leave taken."""
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -54,14 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format=f"cortex {options.command}: %(message)s")
-    signal.signal(signal.SIGINT, _leave)  # imports may swallow an exception, or make another of it
-    signal.signal(signal.SIGTERM, _leave)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupts.leave)  # imports may swallow an exception, or make another of it
     try:
         status = _call(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
         status = options.interrupted
-    except _Terminated:
+    except interrupts.Terminated:
         status = TERMINATED
     except BrokenPipeError:
         # Whoever read our output has seen enough. Python would complain once more at exit.
@@ -75,8 +73,7 @@ def _call(options: argparse.Namespace) -> int:
     module, name = options.run
     try:
         run = getattr(importlib.import_module(f"cortex.commands.{module}"), name)
-        signal.signal(signal.SIGINT, _interrupt)
-        signal.signal(signal.SIGTERM, _terminate)
+        interrupts.raise_at_signals()
         return int(run(options))
     except BrokenPipeError:
         raise
@@ -86,21 +83,6 @@ def _call(options: argparse.Namespace) -> int:
             text = f"{error.filename}: {error.strerror}"
         print(f"cortex {options.command}: {text}", file=sys.stderr)
         return int(getattr(error, "status", 1))
-
-
-def _interrupt(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGINT, _leave)
-    raise KeyboardInterrupt
-
-
-def _leave(number: int, frame: object) -> NoReturn:
-    """Leave at once: nothing is open yet, or closing takes too long. No file is worse than after SIGKILL."""
-    os._exit(128 + number)
-
-
-def _terminate(number: int, frame: object) -> NoReturn:
-    signal.signal(signal.SIGTERM, _leave)
-    raise _Terminated
 
 
 class _Version(argparse.Action):

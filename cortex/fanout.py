@@ -21,8 +21,6 @@ READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
-FORGET_NS = 10_000_000_000
-"""After so long without a message the memory of large bodies that were sent is given back."""
 TELL_AGAIN_S = 0.02
 """A reader that was late when the publisher is closed is told this often how many messages there were."""
 
@@ -81,7 +79,7 @@ class Fanout:
         reader = self.readers[key] = Reader(key, request, pub_socket)
         if request.shared_memory and pub_socket.local:
             self.ring.admit(reader, sequence)
-        reader.has_answer = reader.member is not None or not request.confirms_end
+        reader.has_answer = reader.member is not None or not request.strict
         self.route()
         answer = wire.answer_frame(key, wire.AttachAnswer(sequence, self.latched))
         if pub_socket.strict:
@@ -139,8 +137,6 @@ class Fanout:
         if self.back_pressure.is_waiting:
             return
         sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
-        if silent_ns > FORGET_NS:
-            self.large.forget()
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
         if self.readers and silent_ns > self._tell_after_ns:
@@ -299,8 +295,7 @@ class Fanout:
 
     def _owes(self, reader: Reader) -> bool:
         """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
-        confirms = reader.request.confirms and reader.member is None
-        return confirms and reader.confirmed < self._fast_send.sequence + reader.request.confirms_end
+        return reader.member is None and reader.confirmed <= self._fast_send.sequence
 
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""

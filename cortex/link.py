@@ -111,7 +111,6 @@ class Link:
         """The highest sequence that the publisher is known to have reached."""
         self._begins_again = False
         """Whether the first answer told of a ring that we cannot read: another one follows."""
-        self._marks_end = True
         self._ended = -1
         """The sequence at which the publisher said that the stream ends."""
         self._complained: set[str] = set()
@@ -166,8 +165,6 @@ class Link:
             policy.reliable,
             min(policy.depth + 2, 255),
             min(int(policy.timeout_s * 1000.0), 2**32 - 1),
-            confirms=True,
-            confirms_end=policy.reliable,
         )
         self._key = wire.attach_key(key, stamped=self._stamped)
         self.socket.subscribe(self._key)
@@ -238,7 +235,7 @@ class Link:
     def _count_to(self, sequence: int, *, is_last: bool) -> None:
         """The publisher says which sequence comes next, or that none does."""
         if self.advance(sequence, 0):
-            if is_last or not self._marks_end:
+            if is_last:
                 self._ended = sequence
             if self._ring is None:
                 self._confirm(sequence + is_last)
@@ -289,7 +286,6 @@ class Link:
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
-        self._marks_end = answer.marks_end
         is_new = self.expected < 0 or self._begins_again
         if self.expected < 0:  # what is lost counts from here on, also in a ring that we cannot read
             self.expected = answer.sequence
@@ -380,7 +376,7 @@ class Link:
     @property
     def has_ended(self) -> bool:
         """Whether the publisher has said that nothing follows what has come."""
-        return self._marks_end and 0 <= self.expected == self._ended
+        return 0 <= self.expected == self._ended
 
     def end(self) -> None:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""

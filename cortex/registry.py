@@ -4,8 +4,7 @@ A node sends `Hello` with its record, and a `Heartbeat` every quarter of a secon
 first with `Welcome` (and, for a snapshot, every record as `Changed`), the second with `Alive`, and tells all
 others `Changed` and `Gone`, numbered one by one. A node that sees a number missing, another epoch, or that
 the registry has not its newest record, says `Hello` again. So nothing needs an acknowledgement, and a
-registry that was killed is whole again after one heartbeat of each node. Nodes speak the same words to each
-other directly when there is no registry (`Directory.answer`).
+registry that was killed is whole again after one heartbeat of each node.
 
 A node whose process on this host lives is given more time than a lease, so that a long call in C, which stops
 its heartbeats, cuts no stream. That a process of this host has ended the kernel tells at once (a pidfd), else

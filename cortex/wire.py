@@ -126,10 +126,6 @@ class AttachKey(NamedTuple):
     strict: bool
     quota: int
     timeout_ms: int
-    confirms: bool = False
-    """It says how far it has read, when it is told how many messages there have been."""
-    confirms_end: bool = False
-    """It says so of the answer, too, and of the end of the stream."""
 
 
 class AttachAnswer(NamedTuple):
@@ -137,8 +133,6 @@ class AttachAnswer(NamedTuple):
 
     sequence: int
     latched: bytes
-    marks_end: bool = True
-    """It will say when the stream ends; older versions did not."""
 
 
 KEY_SIZE = PREFIX_SIZE + _KEY.size
@@ -149,8 +143,6 @@ def attach_key(key: AttachKey, *, stamped: bool) -> bytes:
     options = (
         int(key.shared_memory)
         | int(key.strict) << 1
-        | int(key.confirms) << 2
-        | int(key.confirms_end) << 3
         | min(key.quota, 255) << 8
         | min(key.timeout_ms, 2**32 - 1) << 32
     )
@@ -163,9 +155,9 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
         return None
     source = int.from_bytes(data[8:16], "little")
     reader, options = _KEY.unpack_from(data, PREFIX_SIZE)
-    shared_memory, strict, confirms, confirms_end = (bool(options >> bit & 1) for bit in range(4))
-    limits = (options >> 8) & 0xFF, options >> 32
-    return AttachKey(source, reader, shared_memory, strict, *limits, confirms, confirms_end)
+    return AttachKey(
+        source, reader, bool(options & 1), bool(options & 2), (options >> 8) & 0xFF, options >> 32
+    )
 
 
 def resume_key(source: int, reader: int, sequence: int, *, stamped: bool) -> bytes:
@@ -182,7 +174,7 @@ def parse_resume_key(data: bytes) -> tuple[int, int, int] | None:
 
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:
     """The frame that answers a reader; `key` is the 32 bytes that it subscribed to."""
-    return key + _ANSWER.pack(answer.sequence, answer.marks_end, len(answer.latched), 0) + answer.latched
+    return key + _ANSWER.pack(answer.sequence, 1, len(answer.latched), 0) + answer.latched
 
 
 def parse_answer(frame: bytes) -> AttachAnswer:
@@ -194,7 +186,7 @@ def parse_answer(frame: bytes) -> AttachAnswer:
     start = KEY_SIZE + _ANSWER.size
     if len(frame) < start:
         raise MalformedMessage(f"an attach answer of {len(frame)} bytes is too short")
-    sequence, options, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
+    sequence, _, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
     if latched > BODY_LIMIT or len(frame) != start + latched:
         raise MalformedMessage(f"an attach answer of {len(frame)} bytes cannot hold {latched} bytes")
-    return AttachAnswer(sequence, frame[start:], bool(options & 1))
+    return AttachAnswer(sequence, frame[start:])

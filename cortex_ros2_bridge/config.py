@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import yaml
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictInt,
+    TypeAdapter,
+    ValidationError,
+)
+from typing_extensions import TypedDict
 
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.backend.names import NAME, check_kind, check_node_name
@@ -35,63 +46,155 @@ ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
 
 
 class ConfigError(ValueError):
-    """The settings are wrong; the message names the key, its value and what is allowed.
+    """The settings are wrong; the message names the key, its value and what is allowed."""
 
-    All that takes a key and its value here raises it.
-    """
+
+def is_ros_name(name: str) -> bool:
+    """Return whether ROS allows an absolute topic of this name."""
+    return NAME.fullmatch(name) is not None and "__" not in name and not name.endswith("_")
+
+
+def _ros_name(text: str) -> str:
+    if not is_ros_name(text):
+        raise ValueError(f"must be a ROS name such as '/drone/imu', parts begin with a letter, got {text!r}")
+    return text
+
+
+def _ros_pattern(text: str) -> str:
+    _ros_name(text.replace("{topic}", "/topic"))
+    return text
+
+
+def _namespace(value: str) -> str:
+    """Return a namespace with a slash in front and none behind; "" for none."""
+    text = value.strip("/")
+    return _ros_name(f"/{text}") if text else ""
+
+
+def _topic_pattern(text: str) -> str:
+    if not text.startswith(("/", "*")):
+        raise ValueError(f"must be a Cortex topic such as '/drone/imu' or a pattern, got {text!r}")
+    return text
+
+
+def to_ros_type(value: str) -> str:
+    """Return a type as ROS 2 writes it: sensor_msgs/msg/Imu, also for sensor_msgs/Imu."""
+    text = _SHORT_TYPE.sub(r"\1/msg/\2", value) if value.count("/") == 1 else value
+    if not _ROS_TYPE.fullmatch(text):
+        raise ValueError(f"must be a ROS type such as sensor_msgs/msg/Imu, got {value!r}")
+    return text
+
+
+def _distro(text: str) -> str:
+    if text not in DISTROS:
+        raise ValueError(f"must be one of {', '.join(DISTROS)}, got {text!r}")
+    return text
+
+
+def _named_qos(value: Any) -> Any:
+    if isinstance(value, str):
+        if value not in QOS:
+            raise ValueError(f"unknown quality of service {value!r}, known: {', '.join(QOS)}")
+        return asdict(QOS[value])
+    return value
+
+
+def _options(given: dict[str, Any]) -> dict[str, Any]:
+    for name, option in given.items():
+        if name not in OPTIONS:
+            raise ValueError(_unknown(name, list(OPTIONS)))
+        check_option(name, option)
+    return given
+
+
+def _unknown(name: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(name, known, 1)
+    return f"unknown key {name!r}, known: {', '.join(known)}" + (
+        f", did you mean {near[0]!r}?" if near else ""
+    )
+
+
+def _without_nulls(value: Any) -> Any:
+    """Leave out keys without a value: they have their default."""
+    return {k: v for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
+
+
+RosName = Annotated[str, AfterValidator(_ros_name)]
+TopicPattern = Annotated[str, AfterValidator(_topic_pattern)]
+_NO_OTHERS = ConfigDict(extra="forbid")
+
+
+class QosChanges(TypedDict, total=False):
+    """Elements of a quality of service that are different."""
+
+    __pydantic_config__ = _NO_OTHERS  # type: ignore[misc]
+
+    reliability: Literal["reliable", "best_effort"]
+    durability: Literal["volatile", "transient_local"]
+    depth: Annotated[StrictInt, Field(ge=1, le=100_000)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RouteChange:
     """One entry of `routes`: what is different for the routes that it fits, or a route of its own."""
 
-    cortex: str
+    __pydantic_config__: ClassVar[ConfigDict] = _NO_OTHERS
+
+    cortex: TopicPattern
     """Cortex topic, or a pattern with * and ?."""
-    type: str | None = None
+    type: Annotated[str, AfterValidator(to_ros_type)] | None = None
     """Only routes of this ROS type; where there is none by default, it is added."""
-    ros: str | None = None
+    ros: Annotated[str, AfterValidator(_ros_pattern)] | None = None
     """ROS topic instead of the default one; {topic} stands for the Cortex topic."""
-    qos: Mapping[str, Any] = field(default_factory=dict)
+    qos: Annotated[QosChanges, BeforeValidator(_named_qos)] = field(default_factory=QosChanges)
     """Elements of the quality of service that are different."""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Annotated[dict[str, Any], AfterValidator(_options)] = field(default_factory=dict)
     """Options of the conversion, see README.md."""
-    enabled: bool = True
+    enabled: StrictBool = True
     label: str = ""
     """Name of the entry among ROS parameters: `routes.LABEL.qos`."""
+
+    def __post_init__(self) -> None:
+        if self.ros and "{topic}" not in self.ros and any(c in self.cortex for c in "*?["):
+            raise ValueError(
+                f"ros: a pattern fits several topics: the name must contain {{topic}}, got {self.ros!r}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeConfig:
     """What the bridge does."""
 
-    backend: str = "auto"
+    __pydantic_config__: ClassVar[ConfigDict] = _NO_OTHERS
+
+    backend: Annotated[str, AfterValidator(check_kind)] = "auto"
     """auto, rclpy, dds, or the name of a bag: run.mcap."""
-    distro: str | None = None
+    distro: Annotated[str, AfterValidator(_distro)] | None = None
     """ROS distribution, such as jazzy; None: ROS_DISTRO, or what the other nodes show."""
-    cortex_domain: int | None = None
+    cortex_domain: Annotated[StrictInt, Field(ge=0)] | None = None
     """Domain of Cortex; None: CORTEX_DOMAIN. That of ROS is ROS_DOMAIN_ID."""
-    node: str = "cortex_bridge"
+    node: Annotated[str, AfterValidator(lambda name: check_node_name(name, "")[0])] = "cortex_bridge"
     """Name of the ROS node."""
-    namespace: str = ""
+    namespace: Annotated[str, AfterValidator(_namespace)] = ""
     """Goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
-    isolate: bool = False
+    isolate: StrictBool = False
     """Whether the namespace goes before these, too, and before the names of frames."""
-    frames: FrameNames = field(default_factory=FrameNames)
+    frames: Annotated[FrameNames, BeforeValidator(_without_nulls)] = field(default_factory=FrameNames)
     """Names of frames in ROS."""
-    autostart: bool = True
+    autostart: StrictBool = True
     """Whether it begins active; else ROS configures and activates it, as a managed node."""
-    defaults: bool = True
+    defaults: StrictBool = True
     """Whether topics have routes that no entry of `routes` asks for."""
-    robot: bool = False
+    robot: StrictBool = False
     """Whether a robot in ROS is flown by a controller in Cortex: then its odometry and events come in, its
     commands go out, and nothing else passes."""
-    include: tuple[str, ...] = ("*",)
+    include: tuple[TopicPattern, ...] = ("*",)
     """Cortex topics that may have routes: patterns with * and ?."""
-    exclude: tuple[str, ...] = ()
+    exclude: tuple[TopicPattern, ...] = ()
     """Cortex topics that may not."""
-    rename: Mapping[str, str] = field(default_factory=dict)
+    rename: dict[RosName, RosName] = field(default_factory=dict)
     """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
-    routes: tuple[RouteChange, ...] = ()
+    routes: tuple[Annotated[RouteChange, BeforeValidator(_without_nulls)], ...] = ()
     """Changes, in order; later ones win."""
     converters: tuple[str, ...] = ()
     """Modules, or .py files, that register conversions."""
@@ -100,9 +203,9 @@ class BridgeConfig:
 
     def __post_init__(self) -> None:
         if self.is_bag and not self.autostart:
-            raise ConfigError(f"autostart: false: nobody can activate a bag ({self.backend})")
+            raise ValueError(f"autostart: false: nobody can activate a bag ({self.backend})")
         if self.is_bag and self.robot:
-            raise ConfigError(f"robot: true: nothing comes out of a bag ({self.backend})")
+            raise ValueError(f"robot: true: nothing comes out of a bag ({self.backend})")
 
     @property
     def is_bag(self) -> bool:
@@ -148,50 +251,6 @@ def load(
         raise ConfigError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from None
 
 
-def _namespace(key: str, value: object) -> str:
-    """Return a namespace with a slash in front and none behind; "" for none."""
-    if not isinstance(value, str):
-        raise ConfigError(f"{key} must be a text, got {value!r:.80}")
-    text = value.strip("/")
-    return _ros_name(key, f"/{text}") if text else ""
-
-
-def is_ros_name(name: str) -> bool:
-    """Return whether ROS allows an absolute topic of this name."""
-    return NAME.fullmatch(name) is not None and "__" not in name and not name.endswith("_")
-
-
-def to_ros_type(key: str, value: object) -> str:
-    """Return a type as ROS 2 writes it: sensor_msgs/msg/Imu, also for sensor_msgs/Imu."""
-    text = _SHORT_TYPE.sub(r"\1/msg/\2", _text(key, value)) if str(value).count("/") == 1 else value
-    if not isinstance(text, str) or not _ROS_TYPE.fullmatch(text):
-        raise ConfigError(f"{key} must be a ROS type such as sensor_msgs/msg/Imu, got {value!r}")
-    return text
-
-
-def qos_changes(key: str, value: object) -> dict[str, Any]:
-    """Return the elements of a quality of service that YAML sets: a name of `QOS`, or a mapping."""
-    if isinstance(value, str):
-        if value not in QOS:
-            raise ConfigError(f"{key}: unknown quality of service {value!r}, known: {', '.join(QOS)}")
-        return {name.name: getattr(QOS[value], name.name) for name in fields(Qos)}
-    changes = _mapping(key, value)
-    allowed: dict[str, tuple[str, ...] | None] = {
-        "reliability": ("reliable", "best_effort"),
-        "durability": ("volatile", "transient_local"),
-        "depth": None,
-    }
-    _refuse_unknown(key, changes, allowed)
-    for name, element in changes.items():
-        known = allowed[name]
-        if known is None:
-            if isinstance(element, bool) or not isinstance(element, int) or not 1 <= element <= 100_000:
-                raise ConfigError(f"{key}.{name} must be an integer from 1 to 100000, got {element!r}")
-        elif element not in known:
-            raise ConfigError(f"{key}.{name} must be one of {', '.join(known)}, got {element!r}")
-    return dict(changes)
-
-
 def _merged(raw: object, parameters: Mapping[str, Any]) -> object:
     """Return settings with parameters put in."""
     if not parameters or not isinstance(raw, Mapping):
@@ -218,165 +277,44 @@ def _merged(raw: object, parameters: Mapping[str, Any]) -> object:
     return given
 
 
-def _bridge_config(raw: object) -> BridgeConfig:
-    given = dict(_mapping("the settings", raw))
-    if "domain" in given:  # its old name, which is easily taken for that of ROS
-        given.setdefault("cortex_domain", given.pop("domain"))
-    _refuse_unknown("", given, SETTINGS)
-    return BridgeConfig(
-        **{key: SETTINGS[key](key, value) for key, value in given.items() if value is not None}
-    )
-
-
-def _checked(key: str, check: Callable[..., Any], *values: Any) -> Any:
-    try:
-        return check(*values)
-    except ValueError as error:
-        raise ConfigError(f"{key}: {error}") from None
-
-
-def _backend(key: str, value: object) -> Any:
-    return _checked(key, check_kind, _text(key, value))
-
-
-def _distro(key: str, value: object) -> str:
-    text = _text(key, value)
-    if text not in DISTROS:
-        raise ConfigError(f"{key} must be one of {', '.join(DISTROS)}, got {text!r}")
-    return text
-
-
-def _cortex_domain(key: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise ConfigError(f"{key} must be an integer >= 0, got {value!r}")
-    return value
-
-
-def _node_name(key: str, value: object) -> Any:
-    return _checked(key, check_node_name, _text(key, value), "")[0]
-
-
-def _frame_names(key: str, value: object) -> FrameNames:
-    given = _mapping(key, value)
-    _refuse_unknown(key, given, [f.name for f in fields(FrameNames)])
-    try:
-        return FrameNames(**{name: text for name, text in given.items() if text is not None})
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(str(error)) from None
-
-
-def _patterns(key: str, value: object) -> tuple[str, ...]:
-    return tuple(_topic_pattern(f"{key}[{n}]", item) for n, item in _items(key, value))
-
-
-def _renames(key: str, value: object) -> dict[str, str]:
-    pairs = _mapping(key, value).items()
-    return {_ros_name(key, old): _ros_name(f"{key}.{old}", new) for old, new in pairs}
-
-
-def _options(key: str, value: object) -> dict[str, Any]:
-    given = _mapping(key, value)
-    _refuse_unknown(key, given, OPTIONS)
-    for name, option in given.items():
-        _checked(key, check_option, name, option)
-    return dict(given)
-
-
-def _route_change(key: str, value: object) -> RouteChange:
-    given = _mapping(key, value)
-    checks: dict[str, Callable[[str, object], Any]] = {
-        "cortex": _topic_pattern,
-        "type": to_ros_type,
-        "ros": _ros_pattern,
-        "qos": qos_changes,
-        "options": _options,
-        "enabled": _flag,
-        "label": _text,
-    }
-    _refuse_unknown(key, given, checks)
-    if "cortex" not in given:
-        raise ConfigError(f"{key}: `cortex` is missing: the topic, or a pattern such as '/*/imu'")
-    change = RouteChange(
-        **{name: checks[name](f"{key}.{name}", each) for name, each in given.items() if each is not None}
-    )
-    if change.ros and "{topic}" not in change.ros and any(c in change.cortex for c in "*?["):
-        raise ConfigError(
-            f"{key}.ros: a pattern fits several topics: the name must contain {{topic}}, got {change.ros!r}"
-        )
-    return change
-
-
-def _ros_pattern(key: str, value: object) -> str:
-    text = _text(key, value)
-    _ros_name(key, text.replace("{topic}", "/topic"))
-    return text
-
-
-def _refuse_unknown(key: str, given: Mapping[str, Any], known: Iterable[str]) -> None:
-    names = list(known)
-    for name in given:
-        if name not in names:
-            near = difflib.get_close_matches(str(name), names, 1)
-            hint = f", did you mean {near[0]!r}?" if near else ""
-            where = f"{key}: " if key else ""
-            raise ConfigError(f"{where}unknown key {name!r}, known: {', '.join(names)}{hint}")
-
-
-def _mapping(key: str, value: object) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{key} must be a mapping, got {value!r:.80}")
-    return value
-
-
-def _items(key: str, value: object) -> Iterable[tuple[int, object]]:
-    if not isinstance(value, list | tuple):
-        raise ConfigError(f"{key} must be a list, got {value!r:.80}")
-    return enumerate(value)
-
-
-def _text(key: str, value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise ConfigError(f"{key} must be a text that is not empty, got {value!r:.80}")
-    return value
-
-
-def _flag(key: str, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise ConfigError(f"{key} must be true or false, got {value!r:.80}")
-    return value
-
-
-def _topic_pattern(key: str, value: object) -> str:
-    text = _text(key, value)
-    if not text.startswith(("/", "*")):
-        raise ConfigError(f"{key} must be a Cortex topic such as '/drone/imu' or a pattern, got {text!r}")
-    return text
-
-
-def _ros_name(key: str, value: object) -> str:
-    text = _text(key, value)
-    if not is_ros_name(text):
-        raise ConfigError(
-            f"{key} must be a ROS name such as '/drone/imu', parts begin with a letter, got {text!r}"
-        )
-    return text
-
-
-SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
-    "backend": _backend,
-    "distro": _distro,
-    "cortex_domain": _cortex_domain,
-    "node": _node_name,
-    "namespace": _namespace,
-    "frames": _frame_names,
-    "isolate": _flag,
-    "autostart": _flag,
-    "defaults": _flag,
-    "robot": _flag,
-    "include": _patterns,
-    "exclude": _patterns,
-    "rename": _renames,
-    "converters": lambda key, value: tuple(_text(f"{key}[{n}]", item) for n, item in _items(key, value)),
-    "routes": lambda key, value: tuple(_route_change(f"{key}[{n}]", item) for n, item in _items(key, value)),
+SETTINGS = tuple(each.name for each in fields(BridgeConfig) if each.name != "ros")
+"""Names of all settings."""
+_WORDS = {
+    **dict.fromkeys(("dataclass_type", "dict_type"), "must be a mapping"),
+    **{"tuple_type": "must be a list", "bool_type": "must be true or false"},
 }
-"""What makes the value of each setting of what YAML says."""
+_OWNERS: dict[int | str, type[Any]] = {"routes": RouteChange, "frames": FrameNames, "qos": QosChanges}
+
+
+def _bridge_config(raw: object) -> BridgeConfig:
+    given = _without_nulls(raw)
+    if isinstance(given, dict) and "domain" in given:  # its old name, easily taken for that of ROS
+        given = {"cortex_domain": given["domain"], **{k: v for k, v in given.items() if k != "domain"}}
+    try:
+        return TypeAdapter(BridgeConfig).validate_python(given)
+    except ValidationError as error:
+        raise ConfigError(_explain(error)) from None
+
+
+def _explain(error: ValidationError) -> str:
+    """Say what the first of the errors is, and of which key."""
+    item = error.errors()[0]
+    loc, text = item["loc"], item["msg"].removeprefix("Value error, ")
+    *groups, key = ["", *(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)]
+    place = "".join(groups).lstrip(".")
+    if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        owner = next((_OWNERS[part] for part in reversed(loc[:-1]) if part in _OWNERS), None)
+        known = SETTINGS if owner is None else [n for n in owner.__annotations__ if not n.startswith("__")]
+        text = _unknown(str(loc[-1]), list(known))
+        return f"{place}: {text}" if place else text
+    place = f"{place}{key}".lstrip(".")
+    if item["type"] == "value_error":
+        return (
+            text
+            if not place or text.startswith(place)
+            else f"{place}{' ' if text.startswith('must') else ': '}{text}"
+        )
+    if item["type"] == "missing":
+        return f"{place} is missing"
+    words = f" {_WORDS[item['type']]}" if item["type"] in _WORDS else f": {text}"
+    return f"{place or 'the settings'}{words}, got {item['input']!r:.80}"

@@ -9,12 +9,12 @@ forward.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict
 
 Vector = NDArray[np.float64]
 WORLD = "world"
@@ -29,25 +29,22 @@ FrameKind = Literal["world", "body", "heading"]
 class FrameNames:
     """What frames are called in ROS."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
     prefix: str = ""
     """Goes before all names but those in `rename`."""
     map: str = "map"
     """Name of Cortex's `world`."""
     odom: str = "odom"
     """Name of the frame in which a vehicle moves; its vehicle goes before it."""
-    rename: Mapping[str, str] = field(default_factory=dict)
+    rename: dict[str, str] = field(default_factory=dict)
     """Names in ROS of single frames, by their names in Cortex, such as {drone/base_link: base_link}."""
 
     def __post_init__(self) -> None:
         names = {"prefix": self.prefix or "ok", "map": self.map, "odom": self.odom}
         names |= {f"rename.{old}": new for old, new in self.rename.items()}
         for key, name in names.items():
-            if (
-                not isinstance(name, str)
-                or not name
-                or name.startswith("/")
-                or any(c.isspace() for c in name)
-            ):
+            if not name or name.startswith("/") or any(c.isspace() for c in name):
                 raise ValueError(
                     f"frames.{key} must be a name without spaces and a slash in front, got {name!r}"
                 )
@@ -101,25 +98,3 @@ def yaw_rad(q: ArrayLike) -> float:
     """Return where a unit quaternion (xyzw) turns the x axis, counter-clockwise from east [rad]."""
     x, y, z, w = np.asarray(q, np.float64).tolist()
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def quaternion_of(roll: float, pitch: float, yaw: float) -> Vector:
-    """Return the quaternion (xyzw) of Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
-    half = 0.5 * np.array([roll, pitch, yaw])
-    (sr, sp, sy), (cr, cp, cy) = np.sin(half).tolist(), np.cos(half).tolist()
-    return np.array(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
-
-
-def roll_pitch_yaw(q: ArrayLike) -> list[float]:
-    """Return the angles of a unit quaternion (xyzw) [rad]; the inverse of `quaternion_of`."""
-    x, y, z, w = np.asarray(q, np.float64).tolist()
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    return [float(roll), float(pitch), yaw_rad(q)]

@@ -11,7 +11,6 @@ import importlib
 import logging
 import os
 import re
-import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -27,7 +26,7 @@ from neurosim_core.fit import command as fit
 from neurosim_core.garbage import no_collection
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
-from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
+from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once, raise_at_signals
 
 if TYPE_CHECKING:
     from neurosim_core.config import SimulationConfig
@@ -41,6 +40,11 @@ _PIPED_COLUMNS = 120
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
+    with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
+        return _run_command(argv)
+
+
+def _run_command(argv: Sequence[str] | None) -> int:
     gc.set_threshold(200_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not faulthandler.is_enabled():
@@ -54,22 +58,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
-    with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
-        if arguments.computes:
-            from neurosim_core.warp_start import start_warp
+    if arguments.computes:
+        from neurosim_core.warp_start import start_warp
 
-            start_warp()
-        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-        try:
-            return int(arguments.command(arguments))
-        except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
-            if arguments.debug:
-                raise
-            print(f"neurosim: {error}", file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            print(INTERRUPTED_LINE, file=sys.stderr)
-            return 130
+        start_warp()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        return int(arguments.command(arguments))
+    except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+        if arguments.debug:
+            raise
+        print(f"neurosim: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(INTERRUPTED_LINE, file=sys.stderr)
+        return 130
 
 
 class _Parser(argparse.ArgumentParser):
@@ -338,8 +341,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.controller import fly
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
-    with handle_signals(signal.default_int_handler):
-        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
+    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
 
 
 def _up(arguments: argparse.Namespace) -> int:
@@ -354,15 +356,14 @@ def _up(arguments: argparse.Namespace) -> int:
 def _call(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.call import call
 
-    with handle_signals(signal.default_int_handler):
+    with raise_at_signals():
         return call(arguments)
 
 
 def _top(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.top import top
 
-    with handle_signals(signal.default_int_handler):
-        return top(once=arguments.once, timeout_s=arguments.timeout)
+    return top(once=arguments.once, timeout_s=arguments.timeout)
 
 
 def _scene(arguments: argparse.Namespace) -> int:

@@ -90,6 +90,8 @@ def fly(
     sinks = {name: sink for name, sink in config.sinks.items() if rerun or sink.kind != "rerun"}
     for name, sink in sinks.items():
         sink.check(name, config.sensors)
+    for sink in sinks.values():
+        sink.prepare()
     if not has_kernels():
         console.print(
             "first flight here: its kernels are compiled, which takes 10 s to a minute, and kept in "

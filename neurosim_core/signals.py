@@ -51,8 +51,33 @@ def stop_at_signals(stop: threading.Event, *, on_stop: Callable[[], object] | No
         yield
 
 
+@contextlib.contextmanager
+def raise_at_signals() -> Iterator[Callable[[], None]]:
+    """Turn a signal into a `KeyboardInterrupt`; a second one ends the process on the spot.
+
+    Yields:
+        A function for loops to call: it raises again, as imports and libraries may have swallowed it.
+    """
+    caught: list[int] = []
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if caught:
+            leave_at_once(number, frame)
+        caught.append(number)
+        raise KeyboardInterrupt
+
+    def raise_again() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    with handle_signals(on_signal):
+        yield raise_again
+
+
 def leave_at_once(_signal: int, _frame: FrameType | None) -> None:
     """End the process on the spot, as long as nothing is open; imports may swallow a `KeyboardInterrupt`."""
+    for terminal in filter(os.isatty, (1, 2)):
+        os.write(terminal, b"\x1b[?25h")  # lines of progress hide the cursor
     os.write(2, f"{INTERRUPTED_LINE}\n".encode())
     os._exit(130)
 

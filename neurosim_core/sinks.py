@@ -87,9 +87,16 @@ class SinkConfig(Settings):
     again: ClassVar[str] = ""
     """What makes it again from flight.h5, where it was given up; {folder} is that of the flight."""
 
+    def is_installed(self) -> bool:
+        """Whether the library that it needs is there."""
+        return self.library is None or importlib.util.find_spec(self.library[0]) is not None
+
     def file(self, stem: str) -> str:
         """Return the name of its file; empty: it has none."""
         return ""
+
+    def prepare(self) -> None:
+        """Start a process that it needs, before other work."""
 
     def load(self) -> None:
         """Import what it needs, beside other work."""
@@ -117,7 +124,7 @@ class SinkConfig(Settings):
 
 @register("sink", "hdf5")
 class Hdf5SinkConfig(SinkConfig):
-    """The recording, flight.h5: all packets of all sensors."""
+    """The recording, flight.h5: all packets of all sensors. A process of its own writes it."""
 
     kind: Literal["hdf5"] = "hdf5"
     library = ("h5py", "record")
@@ -126,17 +133,18 @@ class Hdf5SinkConfig(SinkConfig):
         """Return the name of the recording."""
         return f"{stem}.h5"
 
-    def load(self) -> None:
-        """Import h5py."""
-        from neurosim_core.record.hdf5 import import_h5py
+    def prepare(self) -> None:
+        """Start the process that writes."""
+        from neurosim_core.record.process import start_process
 
-        import_h5py()
+        if self.is_installed():
+            start_process()
 
     def open(self, context: SinkContext) -> Sink:
-        """Return the writer."""
-        from neurosim_core.record.hdf5 import RecordingWriter
+        """Return what hands packets to that process."""
+        from neurosim_core.record.process import RecordingProcess
 
-        return RecordingWriter(context.folder / self.file(context.stem), context.header)
+        return RecordingProcess(context.folder / self.file(context.stem), context.header)
 
 
 @register("sink", "rerun")
@@ -298,7 +306,7 @@ class Sinks:
         with contextlib.ExitStack() as opened:
             opened.callback(self._abandon)
             for name, each in settings.items():
-                if each.library is not None and importlib.util.find_spec(each.library[0]) is None:
+                if each.library is not None and not each.is_installed():
                     say(f"{self._title(name)} is left out: {install_hint(each.library[1])}")
                     continue
                 self._open[name] = each.open(SinkContext(name=name, **context))

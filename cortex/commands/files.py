@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+from cortex.commands.interrupts import raise_again, raise_at_signals
 from cortex.commands.session import Patience, UsageError, hint, open_node
 from cortex.commands.text import bytes_of, number_of, plain, seconds, table
 from cortex.log import Log, Player, Recorder, RecordStats, open_log
@@ -117,9 +118,12 @@ def play(options: argparse.Namespace) -> int:
             progress.start()
             status = 0
             try:
+                raise_again()
+                raise_at_signals(player.stop)
                 player.run(
                     rate=options.rate, start_s=options.start, duration_s=options.duration, loop=options.loop
                 )
+                raise_again()
             except KeyboardInterrupt:
                 status = 0 if options.loop else int(options.interrupted)
             finally:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cortex.commands.interrupts import raise_again
 from cortex.commands.session import CommandError, hint, look_around, say_empty
 from cortex.commands.text import bytes_of, number_of, plain, rate, seconds, table
 from cortex.node import Node
@@ -112,6 +113,7 @@ def _show_live(
     live = not options.once and sys.stdout.isatty()
     counts = _Counts(node, topic)
     while True:
+        raise_again()
         time.sleep(_PERIOD_S)
         counts = _Counts(node, topic, counts)
         print((_CLEAR if live else "") + "\n".join(lines(node, counts)), flush=True)

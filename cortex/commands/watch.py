@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from cortex.codec import MalformedMessage, codec_of
+from cortex.commands.interrupts import raise_again
 from cortex.commands.session import CommandError, Patience, hint, open_node
 from cortex.commands.text import bytes_of, message_lines, number_of, rate, seconds, to_plain
 from cortex.link import Info
@@ -39,6 +40,7 @@ def echo(options: argparse.Namespace) -> int:
         shown = 0
         try:
             while options.count is None or shown < options.count:
+                raise_again()
                 try:
                     info, body, schema = subscriber.recv_raw(_WAIT_S)
                 except TimeoutError:
@@ -107,6 +109,7 @@ def _by_second(
     before = 0
     last: dict[int, Info] = {}
     while True:
+        raise_again()
         left_ns = 1 if second is None else second.began_ns + _PERIOD_NS - time.monotonic_ns()
         if second is not None and left_ns <= 0:
             missed = subscriber.counters.lost + subscriber.counters.overtaken

@@ -14,7 +14,8 @@ from neurosim_core.data.batch import FIELDS, Sample
 from neurosim_core.data.windows import AT_STAMP, ENCODINGS, WindowConfig, choose_sensors
 from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
 from neurosim_core.record.chunks import read_rows
-from neurosim_core.record.hdf5 import DSEC_NAMES, FORMAT, import_h5py
+from neurosim_core.record.hdf5 import FORMAT, import_h5py
+from neurosim_core.record.streams import DSEC_NAMES
 
 _BATCH_WINDOWS_MAX = 64
 

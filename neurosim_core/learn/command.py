@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import signal
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurosim_core.learn import need
-from neurosim_core.signals import handle_signals
 
 if TYPE_CHECKING:
     _Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -392,12 +390,11 @@ def _deploy(arguments: argparse.Namespace) -> int:
         return 0
     from neurosim_core.learn.deploy import deploy
 
-    with handle_signals(signal.default_int_handler):  # it ends a bridge, and says how fast it was
-        return deploy(
-            file,
-            vehicle=arguments.vehicle,
-            events=arguments.events,
-            duration_s=arguments.duration,
-            ros=arguments.ros,
-            max_thrust_n=arguments.max_thrust,
-        )
+    return deploy(
+        file,
+        vehicle=arguments.vehicle,
+        events=arguments.events,
+        duration_s=arguments.duration,
+        ros=arguments.ros,
+        max_thrust_n=arguments.max_thrust,
+    )

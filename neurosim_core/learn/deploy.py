@@ -20,6 +20,7 @@ from cortex import Closed, Node, synchronised
 from cortex.messages import Events, Odometry, RateThrustCommand
 from neurosim_core.install import check_cortex
 from neurosim_core.learn.pilot import CAMERA, Pilot, card_airframe
+from neurosim_core.signals import raise_at_signals
 
 check_cortex()
 
@@ -45,6 +46,7 @@ def deploy(
     """
     pilot = Pilot(policy)
     with contextlib.ExitStack() as stack:
+        raise_again = stack.enter_context(raise_at_signals())
         domain = None if ros is None else _BRIDGED_DOMAIN
         node = stack.enter_context(Node("policy", domain=domain))
         if ros is not None:
@@ -62,6 +64,7 @@ def deploy(
                 (f"/{vehicle}/odometry", Odometry),
                 events=(f"/{vehicle}/{events}", Events, float(pilot.card["rate_hz"])),
             ):
+                raise_again()
                 if state.stamp_ns < last_ns or count == 0:
                     pilot.reset()
                     say(f"flying {vehicle} by {policy} ({pilot.card['task']})")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from types import FrameType
 from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
@@ -21,6 +23,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import FollowMode, PathFollower
 from neurosim_core.live.messages import command_of
 from neurosim_core.live.topics import COMMANDS, SIMULATION, STATUS, command_topic, stream_topic
+from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 from neurosim_core.sim import plan_paths
 from neurosim_core.trajectory import Path
 
@@ -282,18 +285,26 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
         mode: What to command: motor_speeds, velocity or position.
 
     Returns:
-        0: the simulator has flown all that it was to fly.
+        0: the simulator has flown all that it was to fly; 130: interrupted.
 
     Raises:
         ValueError: An argument is not allowed, there is no such vehicle, or no path.
     """
     if mode not in get_args(FollowMode):
         raise ValueError(f"unknown mode {mode!r}, known: {', '.join(get_args(FollowMode))}")
-    console = Console(highlight=False)
+    console, stop = Console(highlight=False), threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if stop.is_set() or not fleet.vehicles:  # planning may take long, and libraries swallow exceptions
+            leave_at_once(number, frame)
+        stop.set()
+        node.stop_waiting()
+
     with (
         Node("controller") as node,
         _Fleet(node, only=vehicle, mode=cast(FollowMode, mode)) as fleet,
         console.status("") as line,
+        handle_signals(on_signal),
     ):
         if config is not None:
             line.update("planning")
@@ -301,7 +312,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
         announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
         statuses = node.subscriber(STATUS, SimulatorStatus, policy=latest())
         run_on, said, source = True, "", 0
-        while True:
+        while not stop.is_set():
             found = _receive(announcements, 0.0 if fleet.vehicles else _LOOK_S)
             if found is not None and not (fleet.vehicles and found[1].source == source):
                 simulation, source = found[0], found[1].source  # the same again: its settings have changed
@@ -330,6 +341,8 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
                 console.print(text)
             if text or heard is not None:
                 said = text
+    print(INTERRUPTED_LINE, file=sys.stderr)
+    return 130
 
 
 def _owner(node: Node, source: int) -> str:

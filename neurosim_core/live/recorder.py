@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import logging
 import threading
@@ -70,7 +69,7 @@ class Recorder:
             raise ValueError("none of `sinks` records a live run: add one, such as {recording: {kind: hdf5}}")
         for model in models.values():
             for sink_name, sink in _live_sinks(model).items():
-                if sink.library is not None and importlib.util.find_spec(sink.library[0]) is None:
+                if sink.library is not None and not sink.is_installed():
                     raise ImportError(f"{sink.library[0]} is not installed: {install_hint(sink.library[1])}")
                 sink.check(sink_name, model.config.sensors)
         for name, folder in folders.items():

@@ -14,6 +14,7 @@ from cortex import Node, latest
 from cortex.messages import SimulatorStatus
 from neurosim_core.live.call import SensorRates, describe_status, no_simulator
 from neurosim_core.live.topics import STATUS
+from neurosim_core.signals import raise_at_signals
 
 _BARS = " ▁▂▃▄▅▆▇█"
 _HISTORY = 60
@@ -45,7 +46,11 @@ def top(*, once: bool = False, timeout_s: float = 10.0) -> int:
     `once`: print the screen after two statuses, and stop. `timeout_s`: how long to wait for a simulator [s].
     """
     console, dashboard = Console(highlight=False), Dashboard()
-    with Node("top") as node, node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses:
+    with (
+        raise_at_signals() as raise_again,
+        Node("top") as node,
+        node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses,
+    ):
         try:
             screen = dashboard.update(statuses.recv(timeout_s))
         except TimeoutError:
@@ -57,6 +62,7 @@ def top(*, once: bool = False, timeout_s: float = 10.0) -> int:
             return 0
         with Live(screen, console=console, screen=console.is_terminal, auto_refresh=False) as live:
             while True:
+                raise_again()
                 try:
                     status = statuses.recv(_LOST_AFTER_S)
                 except TimeoutError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import zlib
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.record.chunks import import_isal
 
-_KEPT_BYTES = 65536
+_KEPT_BYTES = 4096
 """Pictures and arrays of varying length are kept, not copied, from this size on. A smaller one may be part
 of a large block of memory, which it would hold."""
 _PARTS_MAX = 64
@@ -48,6 +49,11 @@ class Column:
         self._taken: tuple[list[NDArray[Any]], int, int, list[Chunks]] | None = None
         """Rows, begin, end and chunks for `write_rows`."""
 
+    @property
+    def is_full(self) -> bool:
+        """Whether a whole chunk has come."""
+        return self._end - self._begin >= self.chunk
+
     def check(self, rows: NDArray[Any]) -> None:
         """Refuse, with a TypeError, rows of a type that the column cannot hold."""
         if not np.can_cast(rows.dtype, self._dtype, casting="same_kind"):
@@ -55,11 +61,11 @@ class Column:
 
     def append(self, rows: NDArray[Any]) -> int:
         """Add rows; return their size [bytes]."""
-        is_copied = not self.deflates or rows.nbytes < _KEPT_BYTES
-        block = rows.astype(self._dtype, casting="same_kind", copy=is_copied)
-        self._rows.append(block)
-        self._end += len(block)
-        return block.nbytes
+        if rows.dtype != self._dtype or not self.deflates or rows.nbytes < _KEPT_BYTES:
+            rows = rows.astype(self._dtype, casting="same_kind")
+        self._rows.append(rows)
+        self._end += len(rows)
+        return rows.nbytes
 
     def cut(self, *, partly: bool) -> tuple[int, list[NDArray[Any]]]:
         """Return the first row and the rows of chunks to compress: those that are full, or the last one."""
@@ -135,22 +141,28 @@ def deflate(columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list[
 
 def _deflate_column(parts: Sequence[NDArray[Any]], length: int) -> list[bytes]:
     compress = (import_isal() or zlib).compress
-    size, width = length * int(np.prod(parts[0].shape[1:])), parts[0].itemsize
-    # Memory that comes and goes is mapped under the interpreter's lock, on which the flight waits.
-    if getattr(_scratch, "octets", np.empty(0)).size < size * width:
-        _scratch.octets = np.empty(size * width, np.uint8)
-    planes = _scratch.octets[: size * width].reshape(width, size)
-    chunks, filled = [], 0
-    for part in parts:
-        octets = np.ascontiguousarray(part).reshape(-1, 1).view(np.uint8)
-        while len(octets):
-            taken = octets[: size - filled]
-            planes[:, filled : filled + len(taken)] = taken.T
-            octets, filled = octets[len(taken) :], filled + len(taken)
-            if filled == size:
-                chunks.append(compress(planes, 1))
-                filled = 0
-    if filled:
-        planes[:, filled:] = 0
+    width = parts[0].itemsize
+    size = length * math.prod(parts[0].shape[1:])
+    items = [np.ascontiguousarray(part).reshape(-1) for part in parts]
+    # Few calls, and memory that stays: each takes the interpreter's lock, on which others wait.
+    if len(items) > 1:
+        joined = _scratch_bytes("joined", sum(part.nbytes for part in items)).view(items[0].dtype)
+        items = [np.concatenate(items, out=joined)]
+    planes = _scratch_bytes("planes", size * width).reshape(width, size)
+    octets = items[0].view(np.uint8).reshape(-1, width)
+    chunks = []
+    for begin in range(0, len(octets), size):
+        rows = octets[begin : begin + size]
+        planes[:, : len(rows)] = rows.T
+        planes[:, len(rows) :] = 0
         chunks.append(compress(planes, 1))
     return chunks
+
+
+def _scratch_bytes(name: str, size: int) -> NDArray[np.uint8]:
+    """Return memory of this thread."""
+    kept: NDArray[np.uint8] | None = getattr(_scratch, name, None)
+    if kept is None or kept.size < size:
+        kept = np.empty(size, np.uint8)
+        setattr(_scratch, name, kept)
+    return kept[:size]

@@ -20,6 +20,9 @@ class Disk:
         self._path = path
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
         self._error: OSError | None = None
+        self.taken_bytes = 0
+        """What the disk took so far [bytes]."""
+        self._is_ours = True
         self._offset = 0
         self._sealed_size = 0
         self._held: dict[tuple[int, int], bytes] = {}
@@ -36,6 +39,10 @@ class Disk:
     def close(self) -> None:
         """Close the file; what was not sealed is lost."""
         self._file.close()
+
+    def disown(self) -> None:
+        """Only pretend to write from now on."""
+        self._is_ours = False
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move, as a file object does."""
@@ -57,8 +64,7 @@ class Disk:
 
     def readinto(self, buffer: memoryview) -> int:
         """Read what was written last, held back or not."""
-        self._file.seek(self._offset)
-        found = self._file.readinto(buffer)
+        found = os.preadv(self._file.fileno(), [buffer], self._offset)  # forked processes share the position
         for (offset, size), data in self._held.items():
             low, high = max(offset, self._offset), min(offset + size, self._offset + len(buffer))
             if low < high:
@@ -79,7 +85,7 @@ class Disk:
 
     def truncate(self, size: int) -> int:
         """Cut the file, as a file object does."""
-        if self._error is None:
+        if self._error is None and self._is_ours:
             try:
                 self._file.truncate(size)
             except OSError as error:
@@ -90,10 +96,10 @@ class Disk:
         """Do nothing: HDF5 asks before everything is consistent; `seal` says when it is."""
 
     def _write(self, offset: int, data: memoryview) -> None:
-        while self._error is None and len(data):
+        while self._error is None and self._is_ours and len(data):
             try:
-                self._file.seek(offset)
-                written = self._file.write(data)
+                written = os.pwrite(self._file.fileno(), data, offset)
+                self.taken_bytes += written
                 offset, data = offset + written, data[written:]
             except OSError as error:
                 self._error = error

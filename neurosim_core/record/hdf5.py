@@ -37,46 +37,53 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
+import logging
 import os
+import queue
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from neurosim_core.clock import NS_PER_S
 from neurosim_core.install import need
-from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, schema_of
-from neurosim_core.record.columns import Chunks, Column, deflate
+from neurosim_core.packets import Packet
 from neurosim_core.record.disk import Disk
+from neurosim_core.record.forked import disown_when_forked, forked_error
 from neurosim_core.record.header import RecordingHeader
+from neurosim_core.record.streams import Stream
+
+log = logging.getLogger(__name__)
 
 FORMAT = "neurosim.flight"
 FORMAT_VERSION = 2
-HEADER_COLUMNS = ("stamp_ns", "sequence", "order")
-DSEC_NAMES = {"t": "events/t", "x": "events/x", "y": "events/y", "polarity": "events/p"}
-"""Where the fields of packets of events are stored."""
-LARGE_ROW_BYTES = 4096
-"""Rows of at least this size, such as pictures, are stored and read one at a time."""
-
-_FLAT_CHUNK = 65536
-"""Rows of a chunk of arrays of varying length; of events as many as there are pixels, at most 262,144."""
-_ROW_CHUNK = 1024
 _FIRST_FLUSH_BYTES = 65536
-_ATTRIBUTE_MAX_BYTES = 60000
 _DEFLATE_THREADS = 8
 _EXIT_S = 5.0
-"""A flush is waited for so long when the interpreter ends [s]."""
+"""When the interpreter ends, a disk that takes nothing for so long is given up [s]."""
+
+
+class _Flush(NamedTuple):
+    """What the thread that writes is to bring into the file."""
+
+    streams: list[Stream]
+    newest_ns: int
+    complete: bool | None = None
+    """Whether the recording is, if this is its end."""
 
 
 class RecordingWriter:
     """Writes packets to a file while they are measured. A context manager.
 
-    Without `close` the file is that of a killed run: what came after the last flush is lost.
+    Without `close` it is closed when the interpreter ends, and not marked as complete. A process that is
+    forked leaves it to its parent.
 
-    Packets of one sensor must come in the order of their stamps. Arrays of 64 kB and more, such as pictures
+    Packets of one sensor must come in the order of their stamps. Arrays of 4 kB and more, such as pictures
     and columns of events, are read later and must not change; smaller ones are copied. The first flushes come
     early, so that a disk that is full soon still holds most of what came.
 
@@ -110,15 +117,19 @@ class RecordingWriter:
         self._path = Path(path)
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
-        self._streams: dict[str, _Stream] = {}
+        self._streams: dict[str, Stream] = {}
         self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS, os.cpu_count() or 1), "deflate")
         self._order = 0
         self._newest_ns = 0
         self.kept_ns = 0
         """The file holds the packets up to this stamp, whatever happens [ns]."""
         self._pending_bytes = self._flushing_bytes = 0
-        self._flushing: threading.Thread | None = None
+        self._flushes: queue.SimpleQueue[_Flush | None] = queue.SimpleQueue()
+        self._is_idle = threading.Event()
+        """Whether all flushes are done."""
+        self._is_idle.set()
         self._failure: Exception | None = None
+        self._closed = False
         self._is_told = False
         """Whether the failure was raised."""
         self._flushed_bytes = 4 * _FIRST_FLUSH_BYTES
@@ -140,7 +151,11 @@ class RecordingWriter:
             raise
         cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
         self._root_camera = cameras[0] if cameras else None
-        atexit.register(self._abandon)
+        # A daemon, which works until the interpreter has called all its exit handlers.
+        threading.Thread(target=self._write_flushes, name="recording", daemon=True).start()
+        self._close_at_exit = functools.partial(self.close, complete=False, patience_s=_EXIT_S)
+        atexit.register(self._close_at_exit)
+        disown_when_forked(self)
 
     @property
     def pending_bytes(self) -> int:
@@ -156,7 +171,9 @@ class RecordingWriter:
                 class, a constant or a fixed shape has changed; or it has no sensor name.
             TypeError: A field of the packet's class is of a type that cannot be recorded.
         """
-        is_flushing = self._flushing is not None and self._flushing.is_alive()
+        if self._closed:
+            raise ValueError(f"{self._path} is closed")
+        is_flushing = not self._is_idle.is_set()
         if not is_flushing:
             self._finish_flush()
         stream = self._streams.get(packet.sensor) or self._open_stream(packet)
@@ -176,30 +193,39 @@ class RecordingWriter:
         self._begin_flush()
         self._finish_flush()
 
-    def close(self, *, complete: bool = True) -> None:
+    def close(self, *, complete: bool = True, patience_s: float | None = None) -> None:
         """Write what is left, and mark the file as complete unless it is not. Closing twice is allowed.
 
         Args:
             complete: All that was to be recorded was written.
+            patience_s: If the disk takes nothing for so long, end the process at once, and say what is lost:
+                a thread that hangs in HDF5 would never let it end [s]; None: wait.
 
         Raises:
             OSError: The disk is full or gone.
         """
-        if not self._file:
+        if self._closed:
             return
-        atexit.unregister(self._abandon)
+        self._closed = True
+        atexit.unregister(self._close_at_exit)
         try:
             if not self._is_told:  # a failure is reported once
+                self._finish_flush(patience_s)
                 for stream in self._streams.values():
                     stream.finish()
-                self.flush()
-                self._file.attrs["clean"] = complete
-                self._file.flush()
-                self._disk.seal()
+                self._begin_flush(complete)
+                self._finish_flush(patience_s)
         finally:
+            self._flushes.put(None)
             self._pool.shutdown()
             self._file.close()
             self._disk.close()
+
+    def disown(self) -> None:
+        """Leave the file to the process that this one was forked from."""
+        self._disk.disown()
+        self._is_idle.set()
+        self._failure, self._is_told = forked_error(self._path), True
 
     def __enter__(self) -> RecordingWriter:
         return self
@@ -211,246 +237,65 @@ class RecordingWriter:
             with contextlib.suppress(OSError):
                 self.close()
 
-    def _begin_flush(self) -> None:
-        """Let a thread write everything that came. A daemon: a disk that hangs must not hold up the exit."""
+    def _begin_flush(self, complete: bool | None = None) -> None:
+        """Let the thread write everything that came."""
         self._finish_flush()
         for stream in self._streams.values():
             stream.take()
         self._flushing_bytes, self._pending_bytes = self._pending_bytes, 0
         self._flushed_bytes += self._flushing_bytes
         self._flushed_s = time.monotonic()
-        self._flushing = threading.Thread(
-            target=self._flush,
-            args=([*self._streams.values()], self._newest_ns),
-            name="recording",
-            daemon=True,
-        )
-        self._flushing.start()
+        self._is_idle.clear()
+        self._flushes.put(_Flush([*self._streams.values()], self._newest_ns, complete))
 
-    def _finish_flush(self) -> None:
+    def _finish_flush(self, patience_s: float | None = None) -> None:
         """Wait for the flush that is under way, and raise what went wrong."""
-        if self._flushing is not None:
-            self._flushing.join()
-            self._flushing = None
-            self._flushing_bytes = 0
+        taken_bytes = self._disk.taken_bytes
+        while not self._is_idle.wait(patience_s):
+            if self._disk.taken_bytes == taken_bytes:
+                kept = f"it is kept up to {self.kept_ns / NS_PER_S:.3f} s"
+                log.error("%s: the disk took nothing for %g s; %s", self._path, patience_s, kept)
+                sys.stdout.flush()
+                os._exit(1)
+            taken_bytes = self._disk.taken_bytes
+        self._flushing_bytes = 0
         if self._failure is not None:
             self._is_told = True
             raise self._failure
 
-    def _flush(self, streams: list[_Stream], newest_ns: int) -> None:
-        try:
-            for stream in streams:
-                stream.write_rows()
-            self._file.flush()
-            self._disk.seal()
-            for stream in streams:
-                stream.commit()
-            self._file.flush()
-            self._disk.seal()
-            self.kept_ns = newest_ns
-        except Exception as error:  # raised by `_finish_flush`
-            self._failure = error
+    def _write_flushes(self) -> None:
+        while (flush := self._flushes.get()) is not None:
+            try:
+                self._flush(*flush)
+            except Exception as error:  # raised by `_finish_flush`
+                self._failure = error
+            self._is_idle.set()
 
-    def _abandon(self) -> None:
-        """Close the file as it is: HDF5 would do it when there is no interpreter to call, and hang."""
-        flushing = self._flushing
-        if flushing is not None:
-            flushing.join(_EXIT_S)
-        if flushing is None or not flushing.is_alive():
-            self._file.close()
-            self._disk.close()
+    def _flush(self, streams: list[Stream], newest_ns: int, complete: bool | None) -> None:
+        for stream in streams:
+            stream.write_rows()
+        self._file.flush()
+        self._disk.seal()
+        for stream in streams:
+            stream.commit()
+        if complete is not None:
+            self._file.attrs["clean"] = complete
+        self._file.flush()
+        self._disk.seal()
+        self.kept_ns = newest_ns
 
-    def _open_stream(self, packet: Packet) -> _Stream:
+    def _open_stream(self, packet: Packet) -> Stream:
         name = packet.sensor
         if not name or "/" in name:
             raise ValueError(f"a packet needs a sensor name without '/', got {name!r}")
         self._finish_flush()  # which would otherwise find half of a stream
         group = self._described.get(name) or self._file["sensors"].require_group(name)
-        stream = self._streams[name] = _Stream(group, packet, self._pool)
-        if isinstance(packet, Events) and self._root_camera in (None, name):
+        stream = self._streams[name] = Stream(group, packet, self._pool)
+        if stream.is_events and self._root_camera in (None, name):
             self._root_camera = name
             for key in ("events", "ms_to_idx", "t_offset"):
                 self._file[key] = group[key]
         return stream
-
-
-class _Stream:
-    """The packets of one sensor in the file."""
-
-    def __init__(self, group: Any, first: Packet, pool: ThreadPoolExecutor) -> None:
-        self._group = group
-        self._pool = pool
-        self._type = type(first)
-        self._columns: dict[str, Column] = {}
-        self._last_ns: int | None = None
-        self._written = self._taken_count = 0
-        schema = schema_of(self._type)
-        self._fields = schema.fields
-        self._varying = {field.name: field.varying for field in schema.fields}
-        """Name of the length of each field that differs from packet to packet; empty if none does."""
-        for name in (field.name for field in schema.fields):
-            if name in (*HEADER_COLUMNS, "packet_count") or name.endswith("_end"):
-                raise ValueError(f"a field of a packet cannot be called {name!r}: recordings use this name")
-        values = self._values(first)
-        self._fixed = self._fixed_part(values)
-        group.attrs["packet"], group.attrs["schema"] = schema.name, schema.to_json()
-        self._packet_count = group.create_dataset("packet_count", data=np.int64(0))
-        self._is_events = isinstance(first, Events)
-        self._flat_chunk = _FLAT_CHUNK
-        if isinstance(first, Events):
-            self._flat_chunk = 1 << min(max((first.width * first.height).bit_length() - 1, 16), 18)
-        for name in HEADER_COLUMNS:
-            self._add_rows(name, np.int64)
-        for field in self._fields:
-            if field.constant:
-                _write_constant(group, field.name, self._fixed[field.name])
-            else:
-                self._add_field(field, values[field.name])
-        self._ends = {field.varying: 0 for field in self._fields if field.varying}
-        for name in self._ends:
-            self._add_rows(f"{name}_end", np.int64)
-        self._numbers: list[tuple[int, ...]] = []
-        """Of the packets since the last flush: stamp, sequence, order, ends."""
-        self._deflating = [column for column in self._columns.values() if column.deflates]
-        self._ms_count = 0
-        if self._is_events:
-            group.create_dataset("t_offset", data=np.int64(0))
-            self._add_rows("ms_to_idx", np.uint64)
-
-    def append(self, packet: Packet, order: int) -> int:
-        """Keep a packet for the next flush; return its size [bytes]."""
-        if type(packet) is not self._type:
-            raise ValueError(
-                f"sensor {packet.sensor!r} sends {self._type.__name__}, got a {type(packet).__name__}"
-            )
-        if self._last_ns is not None and packet.stamp_ns < self._last_ns:
-            raise ValueError(
-                f"sensor {packet.sensor!r}: stamp {packet.stamp_ns} ns comes after {self._last_ns} ns"
-            )
-        values = self._values(packet)
-        fixed = self._fixed_part(values)
-        if fixed != self._fixed:
-            raise ValueError(f"sensor {packet.sensor!r} was {self._fixed} before, got {fixed}")
-        for field in self._fields:  # before any column has grown: a packet is written whole, or not at all
-            if not field.constant:
-                self._columns[field.name].check(values[field.name])
-        size = 0
-        if self._is_events:
-            size += self._append_index(values["t"], packet.stamp_ns)
-        for field in self._fields:
-            if not field.constant:
-                value = values[field.name]
-                size += self._columns[field.name].append(value if self._varying[field.name] else value[None])
-        for length, count in {v: len(values[name]) for name, v in self._varying.items() if v}.items():
-            self._ends[length] += count
-        self._numbers.append((packet.stamp_ns, packet.sequence, order, *self._ends.values()))
-        self._last_ns = packet.stamp_ns
-        self._written += 1
-        self._deflate(partly=False)
-        return size + 8 * len(self._numbers[-1])
-
-    def take(self) -> None:
-        """Set aside for `write_rows` and `commit` what came since the last flush."""
-        self._deflate(partly=True)
-        if self._numbers:
-            names = (*HEADER_COLUMNS, *(f"{name}_end" for name in self._ends))
-            for name, numbers in zip(names, np.array(self._numbers, np.int64).T, strict=True):
-                self._columns[name].append(numbers)
-            self._numbers = []
-        for column in self._columns.values():
-            column.take()
-        self._taken_count = self._written
-
-    def write_rows(self) -> None:
-        for column in self._columns.values():
-            column.write_rows()
-
-    def commit(self) -> None:
-        """Declare what is in the file as complete."""
-        self._packet_count[()] = self._taken_count
-
-    def finish(self) -> None:
-        """End the millisecond index one entry after the last event: windows up to the end can be read."""
-        if self._is_events:
-            self._columns["ms_to_idx"].append(np.array([self._ends["event"]], dtype=np.uint64))
-
-    def _deflate(self, *, partly: bool) -> None:
-        """Let the pool compress chunks, those of all columns in one task."""
-        cut = [(column, *column.cut(partly=partly)) for column in self._deflating]
-        cut = [(column, first, parts) for column, first, parts in cut if parts]
-        if cut:
-            future = self._pool.submit(deflate, [(parts, column.chunk) for column, _, parts in cut])
-            for position, (column, first, _) in enumerate(cut):
-                column.note(Chunks(first, future, position))
-
-    def _add_rows(self, name: str, dtype: Any) -> None:
-        self._columns[name] = Column(self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False)
-
-    def _add_field(self, field: FieldSchema, value: NDArray[Any]) -> None:
-        path = DSEC_NAMES.get(field.name, field.name) if issubclass(self._type, Events) else field.name
-        dtype: Any = value.dtype if field.dtype == "any" else field.dtype
-        if dtype == "str":
-            dtype = import_h5py().string_dtype()
-        shape = value.shape[1:] if field.varying else value.shape
-        count = max(1, int(np.prod(shape)))
-        chunk, compressed = _ROW_CHUNK, False
-        if field.varying:
-            chunk, compressed = max(1, self._flat_chunk // count), True
-        elif count * value.dtype.itemsize >= LARGE_ROW_BYTES:
-            chunk, compressed = 1, True
-        self._columns[field.name] = Column(
-            self._group, path, shape, dtype, chunk=chunk, compressed=compressed
-        )
-
-    def _values(self, packet: Packet) -> dict[str, NDArray[Any]]:
-        """Return the fields of a packet as arrays; refuse shapes that the schema does not allow."""
-        values = {field.name: as_numpy(getattr(packet, field.name)) for field in self._fields}
-        lengths: dict[str, int] = {}
-        for field in self._fields:
-            found, wanted, varying = values[field.name].shape, field.shape, self._varying[field.name]
-            if varying and found:
-                wanted = (lengths.setdefault(varying, found[0]), *wanted[1:])
-            fits = len(found) == len(wanted) or "..." in wanted
-            if not fits or any(isinstance(n, int) and n != m for n, m in zip(wanted, found, strict=False)):
-                raise ValueError(
-                    f"sensor {packet.sensor!r}: {field.name} must have shape {list(wanted)}, "
-                    f"got {list(found)}"
-                )
-        return values
-
-    def _fixed_part(self, values: dict[str, NDArray[Any]]) -> dict[str, Any]:
-        """Return what all packets of the sensor have in common."""
-        fixed: dict[str, Any] = {}
-        for field in self._fields:
-            value = values[field.name]
-            if field.constant:
-                fixed[field.name] = value.item()
-            elif field.dtype == "any" or any(isinstance(length, str) for length in field.shape):
-                fixed[field.name] = value.shape[1:] if self._varying[field.name] else value.shape
-                if field.dtype == "any":
-                    fixed[field.name] = (*fixed[field.name], value.dtype.name)
-        return fixed
-
-    def _append_index(self, t: NDArray[np.int64], stamp_ns: int) -> int:
-        """Add the milliseconds up to a packet's stamp: events of later packets are not older than that."""
-        milliseconds = np.arange(self._ms_count, stamp_ns // 1_000_000 + 1)
-        first = np.searchsorted(t, milliseconds * 1000) + self._ends["event"]
-        self._ms_count += len(milliseconds)
-        return self._columns["ms_to_idx"].append(first.astype(np.uint64))
-
-
-def _write_constant(group: Any, name: str, value: Any) -> None:
-    """Write a constant as an attribute; a long text, which no attribute can hold, as a dataset."""
-    if isinstance(value, str) and len(value.encode()) > _ATTRIBUTE_MAX_BYTES:
-        group.create_dataset(name, data=value)
-    else:
-        group.attrs[name] = value
-
-
-def read_constant(group: Any, name: str) -> Any:
-    """Return a constant of the packets of a sensor."""
-    value = group.attrs[name] if name in group.attrs else group[name].asstr()[()]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:

@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import EventArrays, Events, GenericPacket, Packet, PacketSchema, packet_class
 from neurosim_core.record.chunks import read_rows
-from neurosim_core.record.hdf5 import (
-    DSEC_NAMES,
-    FORMAT,
-    FORMAT_VERSION,
-    HEADER_COLUMNS,
-    LARGE_ROW_BYTES,
-    import_h5py,
-    read_constant,
-)
+from neurosim_core.record.hdf5 import FORMAT, FORMAT_VERSION, import_h5py
 from neurosim_core.record.header import Intrinsics, RecordingHeader, SensorDescription
+from neurosim_core.record.streams import DSEC_NAMES, HEADER_COLUMNS, LARGE_ROW_BYTES, read_constant
 from neurosim_core.registry import load_plugins
 
 log = logging.getLogger(__name__)

@@ -145,6 +145,7 @@ def _make_fleet(
     device = find_device(config.device)
     members = {name: config.of(name) for name in config.vehicles}
     seeing = any(plan_render_groups(member.sensors) for member in members.values())
+    bodies = make_bodies(config.bodies) if seeing else ()
     with ThreadPoolExecutor(max_workers=4) as aside:
         beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
         if reader is None:
@@ -167,7 +168,6 @@ def _make_fleet(
             )
 
         with phase("scene"):
-            bodies = make_bodies(config.bodies) if seeing else ()
             mapping, lighting = aside.submit(map_scene), aside.submit(light_scene)
             if reader is not None:
                 load_scipy()  # while the other process reads, and distances are mapped
@@ -192,7 +192,11 @@ def _make_fleet(
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
-    """Return the paths of vehicles (None: of all) by name, as `make_fleet` plans them.
+    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
+
+    Args:
+        config: What to fly.
+        vehicles: Names of vehicles; None: all.
 
     Raises:
         KeyError: There is no such vehicle.
@@ -206,6 +210,10 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
 
 def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
     """Return the path of the only vehicle.
+
+    Args:
+        config: What to fly.
+        free_space: Where it can fly in the scene of `config`.
 
     Raises:
         ValueError: No path exists, or it begins inside a solid.

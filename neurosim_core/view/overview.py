@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +97,8 @@ class FlightSummary:
         self._recent: dict[str, deque[Events]] = {}
         self._waiting_ns: int | None = None
         self._next_ns = 0
-        self._best: tuple[float, Snapshot] | None = None
+        self._best_interest = -np.inf
+        self._best: _Moment | None = None
         self._series: dict[str, list[tuple[FieldSchema, _Rows]]] = {}
         self._pose = _Rows()
         self._pose_sensor = ""
@@ -139,7 +140,7 @@ class FlightSummary:
         if self._waiting_ns is not None:
             self._next_ns = 0
             self._consider(self._waiting_ns)
-        return self._look(self._stamp_ns) if self._best is None else self._best[1]
+        return (self._best or self._moment(self._stamp_ns)).snapshot(self._window_ns)
 
     def track(self) -> Track:
         """Return where the vehicle was so far, at no more than 20 000 times."""
@@ -166,19 +167,9 @@ class FlightSummary:
             row = np.concatenate([packet.position, packet.velocity, packet.orientation])
             self._pose.add(packet.stamp_ns, row)
 
-    def _look(self, stamp_ns: int) -> Snapshot:
-        begin_us, end_us = (stamp_ns - self._window_ns) // 1000, stamp_ns // 1000
-        views = {}
-        for name, recent in self._recent.items():
-            joined = join_events([packet.numpy() for packet in recent])
-            begin, end = np.searchsorted(joined.t, [begin_us + 1, end_us + 1])
-            views[name] = EventView(
-                events=joined.rows(slice(begin, end)),
-                width=recent[-1].width,
-                height=recent[-1].height,
-                window_ns=self._window_ns,
-            )
-        return Snapshot(stamp_ns=stamp_ns, packets=dict(self._latest), events=views)
+    def _moment(self, stamp_ns: int) -> _Moment:
+        recent = {name: tuple(packets) for name, packets in self._recent.items()}
+        return _Moment(stamp_ns, dict(self._latest), recent)
 
     def _consider(self, stamp_ns: int) -> None:
         """Keep the moment if there is more to see than at the best one so far."""
@@ -202,8 +193,31 @@ class FlightSummary:
             covered = max(covered, float(seen.mean()))
         # most at a third: more is a thicket
         interest = (1.0 + contrast) * (0.01 + covered * (1.0 - covered) ** 2) * (0.1 + depth_m)
-        if self._best is None or interest >= self._best[0]:
-            self._best = (interest, self._look(stamp_ns))
+        if interest >= self._best_interest:
+            self._best_interest, self._best = interest, self._moment(stamp_ns)
+
+
+class _Moment(NamedTuple):
+    """The packets of which a snapshot is made: most moments are given up for better ones before that."""
+
+    stamp_ns: int
+    packets: dict[str, Packet]
+    recent: dict[str, tuple[Events, ...]]
+    """Packets of events, by camera, of at least the window before."""
+
+    def snapshot(self, window_ns: int) -> Snapshot:
+        begin_us, end_us = (self.stamp_ns - window_ns) // 1000, self.stamp_ns // 1000
+        views = {}
+        for name, packets in self.recent.items():
+            joined = join_events([packet.numpy() for packet in packets])
+            begin, end = np.searchsorted(joined.t, [begin_us + 1, end_us + 1])
+            views[name] = EventView(
+                events=joined.rows(slice(begin, end)),
+                width=packets[-1].width,
+                height=packets[-1].height,
+                window_ns=window_ns,
+            )
+        return Snapshot(stamp_ns=self.stamp_ns, packets=self.packets, events=views)
 
 
 class _Rows:

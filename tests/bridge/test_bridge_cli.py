@@ -144,8 +144,8 @@ def test_list_without_anything(capsys, monkeypatch):
     [
         (["--config", "nothing.yaml"], "cannot read nothing.yaml: No such file or directory"),
         (["--namespace", "a b"], "namespace must be a ROS name"),
-        (["--domain", "-1"], "cortex_domain must be an integer >= 0, got -1"),
-        (["--cortex-domain", "-1"], "cortex_domain must be an integer >= 0, got -1"),
+        (["--domain", "-1"], "cortex_domain: Input should be greater than or equal to 0, got -1"),
+        (["--cortex-domain", "-1"], "cortex_domain: Input should be greater than or equal to 0, got -1"),
         (["--backend", "carrier-pigeon"], "carrier-pigeon"),
         (["--distro", "hydro", "--backend", "dds"], "hydro"),
     ],

@@ -95,7 +95,10 @@ def test_parameters_come_from_files_and_the_command_line(tmp_path: Path) -> None
         (["-p", "a:=[1"], "not YAML"),
         (["-r", "__node:=a b"], "invalid ROS name '/a b'"),
         (["-p", "include:=3"], "include must be a list, got 3"),
-        (["-p", "routes.x.qos.depth:=0", "-p", "routes.x.cortex:=/a"], "depth must be an integer from 1"),
+        (
+            ["-p", "routes.x.qos.depth:=0", "-p", "routes.x.cortex:=/a"],
+            "depth: Input should be greater than or equal to 1",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused(arguments: list[str], reason: str) -> None:
@@ -178,7 +181,7 @@ def test_routes_change_while_it_runs(parameters: Any) -> None:
     assert change(parameters=[parameter(f"{label}.enabled", type=1, bool_value=True)]).results[0].successful
     rig.opens("/drone/imu")
     for name, value, reason in (
-        (f"{label}.qos.depth", {"type": 2, "integer_value": 0}, "must be an integer from 1"),
+        (f"{label}.qos.depth", {"type": 2, "integer_value": 0}, "greater than or equal to 1"),
         ("namespace", {"type": 4, "string_value": "/x"}, "from the start to the end"),
         ("nothing", {"type": 4, "string_value": "/x"}, "unknown parameter 'nothing'"),
     ):

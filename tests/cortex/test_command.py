@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,8 +29,10 @@ from processes import ROOT, SOON_S, Beside, wait_for
 
 from cortex import Array, Node, Publisher, Unit, keep_last, reliable
 from cortex.cli import main
+from cortex.codec import RawMessage
+from cortex.commands import watch
 from cortex.commands.text import bytes_of, message_lines, number_of, plain, rate, seconds, to_plain
-from cortex.log import Recorder, open_log
+from cortex.log import Recorder, open_log, player
 from cortex.message import message
 from cortex.schema import schema_of
 
@@ -417,6 +419,43 @@ def test_a_signal_before_recording_has_begun_leaves_a_whole_file(runtime, tmp_pa
     assert errors.endswith("\ncortex record: nothing was recorded: no message of any topic has come\n")
     with open_log(path) as log:
         assert (log.cut, log.message_count) == ("", 0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_command_though_what_it_interrupts_swallows_exceptions(
+    make_node, tmp_path, monkeypatch, number
+):
+    """As imports may do: not all messages are shown that there are, nor is a log played to its end."""
+
+    def swallowing(function: Callable[..., Any]) -> Callable[..., Any]:
+        def interrupted(*arguments: Any, **options: Any) -> Any:
+            with suppress(BaseException):
+                signal.raise_signal(number)
+            return function(*arguments, **options)
+
+        return interrupted
+
+    path, robot = tmp_path / "run.mcap", make_node("robot")
+    publisher = robot.publisher("/number", Number)
+
+    def publish_two() -> None:
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        for i in range(2):
+            publisher.publish(Number(i, i))
+
+    with Recorder(robot, path, ["/number"]) as recorder:
+        publish_two()
+        wait_for(lambda: recorder.stats.written == 2)
+    monkeypatch.setattr(watch, "message_lines", swallowing(message_lines))
+    with Beside(publish_two):
+        status, output, _ = cortex("echo", "/number", "-n", 2)
+    assert (status, output.count("---")) == ({signal.SIGINT: 0, signal.SIGTERM: 143}[number], 1)
+    monkeypatch.setattr(player, "RawMessage", swallowing(RawMessage))
+    subscriber = robot.subscriber("/number", Number)
+    assert cortex("play", path)[0] == 128 + number
+    assert subscriber.recv(SOON_S) == Number(0, 0)
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.1)
 
 
 def test_a_file_is_not_overwritten_unless_told(runtime, tmp_path):

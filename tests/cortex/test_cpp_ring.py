@@ -30,7 +30,6 @@ pytestmark = needs_compiler
 
 SIZES = [10, 20_000, 4000, 0, 50_000]
 """Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
-"""Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
 
 
 def share_a_ring(peer: Peer, other: int) -> bool:
@@ -182,13 +181,11 @@ def test_what_a_closed_cpp_publisher_has_taken_stays(start, make_node, monkeypat
     assert scans.counters.rejected == scans.counters.cut_off == 0
 
 
-@pytest.mark.parametrize("confirms_end", [True, False], ids=["", "to an older version"])
-def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(start, make_node, confirms_end):
+def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(start, make_node):
     """To a reader of its socket: what libzmq has no room for gets lost without a word."""
     start("fill", "/scan", 5, 10)
     source, address = place_of(make_node(), "/scan")
-    asked = wire.AttachKey(source, 1, False, True, 10, 60_000, True, confirms_end)
-    key = wire.attach_key(asked, stamped=True)
+    key = wire.attach_key(wire.AttachKey(source, 1, False, True, 10, 60_000), stamped=True)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
         reader = context.socket(zmq.SUB)
@@ -196,10 +193,9 @@ def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(start, m
         for kind in (wire.MESSAGE, wire.NEXT):
             reader.subscribe(wire.prefix(kind, source, stamped=True))
         reader.subscribe(key)
-        if confirms_end:  # it counts once it has its answer
-            assert wire.parse_answer(reader.recv()) == (0, b"", True)
-            assert not reader.poll(100.0)
-            reader.subscribe(wire.resume_key(source, 1, 0, stamped=True))
+        assert wire.parse_answer(reader.recv()) == (0, b"")
+        assert not reader.poll(100.0)  # it counts once it has confirmed its answer
+        reader.subscribe(wire.resume_key(source, 1, 0, stamped=True))
         kinds = []
         while kinds.count(b"N") < 4:
             assert reader.poll(1e3 * SOON_S), kinds
@@ -208,10 +204,9 @@ def test_the_end_of_a_cpp_publisher_is_said_again_until_it_is_confirmed(start, m
             assert kinds[-1] != b"N" or (sequence_of(frame), aux_of(frame)) == (5, wire.LAST)
         assert kinds.count(b"M") == 5
         reader.subscribe(wire.resume_key(source, 1, 5, stamped=True))
-        if confirms_end:
-            for _ in range(10):
-                assert reader.recv()[3:4] == b"N"
-            reader.subscribe(wire.resume_key(source, 1, 6, stamped=True))
+        for _ in range(10):
+            assert reader.recv()[3:4] == b"N"
+        reader.subscribe(wire.resume_key(source, 1, 6, stamped=True))
         while reader.poll(100.0):  # five times the time after which it would be said again
             assert reader.recv()[3:4] == b"N"
     finally:

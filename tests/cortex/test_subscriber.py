@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import signal
+import sys
 import threading
 import time
 
@@ -78,6 +79,28 @@ def test_a_handler_that_uses_the_subscriber_it_has_interrupted_is_told_so(number
         signal.signal(signal.SIGALRM, before)
     publisher.publish(Number(0, 7))
     assert subscriber.recv(SOON_S) == Number(0, 7)
+
+
+def test_an_exception_of_a_handler_where_the_lock_changes_hands_blocks_nobody(numbers, monkeypatch):
+    """As Ctrl-C may come between the end of a block and the release of its lock."""
+    publisher, subscriber = numbers
+    monkeypatch.setattr(receive_lock, "PATIENCE_S", 0.05)
+
+    def interrupt(frame, event, argument):
+        if frame.f_code is receive_lock.ReceiveLock.__exit__.__code__:
+            sys.settrace(None)
+            raise KeyboardInterrupt
+
+    sys.settrace(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _ = subscriber.carriers
+    finally:
+        sys.settrace(None)
+    publisher.publish(Number(0, 7))
+    with Beside(lambda: (subscriber.carriers, subscriber.recv(SOON_S), subscriber.close())) as using:
+        pass
+    assert using.results[0][1] == Number(0, 7)
 
 
 def test_a_message_wakes_who_waits(numbers):

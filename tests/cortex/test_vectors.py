@@ -102,13 +102,11 @@ def written(fields: dict[str, Any]) -> bytes:
         return resume_key(source, fields["reader"], fields["sequence"], stamped=stamped)
     if kind == b"A":
         options = fields["options"]
-        memory, strict, confirms, confirms_end = (bool(options & bit) for bit in (1, 2, 4, 8))
-        asked = (memory, strict, options >> 8 & 255, options >> 32, confirms, confirms_end)
+        asked = (bool(options & 1), bool(options & 2), options >> 8 & 255, options >> 32)
         key = attach_key(AttachKey(source, fields["reader"], *asked), stamped=stamped)
         if "next" not in fields:
             return key
-        latched, marks_end = bytes.fromhex(fields["latched"]), bool(fields["answer_options"])
-        return answer_frame(key, AttachAnswer(fields["next"], latched, marks_end))
+        return answer_frame(key, AttachAnswer(fields["next"], bytes.fromhex(fields["latched"])))
     names = ("fingerprint", "sequence", "stamp_ns", "publish_ns", "body_size", "aux")
     header = Header(kind, source, *(fields[name] for name in names))
     header = header if stamped else header._replace(stamp_ns=None)
@@ -124,7 +122,7 @@ def test_frames(case):
     assert frame[3:4].decode() == fields["kind"]
     places = {"source": 8, "fingerprint": 16, "sequence": 24, "body_size": 48, "aux": 56}
     if fields["kind"] in "AR":
-        places = {"source": 8, "reader": 16, "options": 24, "next": 32, "answer_options": 40} | (
+        places = {"source": 8, "reader": 16, "options": 24, "next": 32} | (
             {"sequence": 24} if fields["kind"] == "R" else {}
         )
     for name, offset in places.items():

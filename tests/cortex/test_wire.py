@@ -77,8 +77,6 @@ keys = st.builds(
     strict=st.booleans(),
     quota=u8,
     timeout_ms=u32,
-    confirms=st.booleans(),
-    confirms_end=st.booleans(),
 )
 
 
@@ -95,7 +93,7 @@ def test_other_subscriptions_are_no_attach_keys(data):
     assert parse_attach_key(prefix(MESSAGE, 1, stamped=False) + bytes(16)) is None
 
 
-answers = st.builds(AttachAnswer, sequence=u64, latched=st.binary(max_size=200), marks_end=st.booleans())
+answers = st.builds(AttachAnswer, sequence=u64, latched=st.binary(max_size=200))
 
 
 @given(keys, answers, st.data())

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from processes import SOON_S, wait_for
+from rich.status import Status
 
 from cortex import Node, reliable
 from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
@@ -378,6 +379,22 @@ def test_fly_takes_the_vehicles_that_it_is_told(start_fly, tmp_path):
         process.process.send_signal(signal.SIGTERM)
         assert process.process.wait(SOON_S) == 130
     assert "interrupted" in process.said
+
+
+def test_a_signal_ends_fly_though_what_it_interrupts_swallows_exceptions(shared_runtime, monkeypatch, capsys):
+    """As imports, and libraries in C, may do."""
+    with Node("simulator") as node:
+        simulator = Simulator(node, CONFIG)
+
+        def update(self: Status, text: str) -> None:
+            if text.startswith("drone: "):
+                with contextlib.suppress(BaseException):
+                    signal.raise_signal(signal.SIGTERM)
+                simulator.say("ended")
+
+        monkeypatch.setattr(Status, "update", update)
+        assert fly(None, vehicle=None, mode="position") == 130
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_wrong_use_is_refused(shared_runtime):

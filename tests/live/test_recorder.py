@@ -19,7 +19,8 @@ from neurosim_core.live import recorder as recorder_module
 from neurosim_core.live.recorder import Recorder, open_folders
 from neurosim_core.live.services import change_parameters
 from neurosim_core.packets import ImuSample
-from neurosim_core.record import Recording, RecordingWriter
+from neurosim_core.record import Recording
+from neurosim_core.record.process import RecordingProcess
 
 
 def imu(number: int) -> ImuSample:
@@ -47,13 +48,13 @@ def test_a_slow_disk_holds_up_the_run(tmp_path: Path, monkeypatch: pytest.Monkey
     """The queue holds two packets; the third waits until one is written."""
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
     gate = threading.Semaphore(0)
-    write = RecordingWriter.write
+    write = RecordingProcess.write
 
-    def slow(self: RecordingWriter, packet: Any) -> None:
+    def slow(self: RecordingProcess, packet: Any) -> None:
         assert gate.acquire(timeout=SOON_S)
         write(self, packet)
 
-    monkeypatch.setattr(RecordingWriter, "write", slow)
+    monkeypatch.setattr(RecordingProcess, "write", slow)
     recorder = make_recorder(tmp_path)
     written = []
 
@@ -78,10 +79,10 @@ def test_a_slow_disk_holds_up_the_run(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_disk_that_fails_is_told_and_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
 
-    def fail(self: RecordingWriter, packet: Any) -> None:
+    def fail(self: RecordingProcess, packet: Any) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(RecordingWriter, "write", fail)
+    monkeypatch.setattr(RecordingProcess, "write", fail)
     recorder = make_recorder(tmp_path)
     with pytest.raises(OSError, match="no space left"):
         all(recorder.write("drone", imu(number)) is None for number in range(100))
@@ -106,15 +107,15 @@ def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkey
     monkeypatch.setattr(recorder_module, "STOPPED_S", 0.1)
     monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", SOON_S)
     gate, begun = threading.Event(), threading.Event()
-    write = RecordingWriter.write
+    write = RecordingProcess.write
 
-    def slow(self: RecordingWriter, packet: Any) -> None:
+    def slow(self: RecordingProcess, packet: Any) -> None:
         if packet.sequence == 2:
             begun.set()
             assert gate.wait(SOON_S)
         write(self, packet)
 
-    monkeypatch.setattr(RecordingWriter, "write", slow)
+    monkeypatch.setattr(RecordingProcess, "write", slow)
     recorder = make_recorder(tmp_path)
     stop = recorder.stop
 
@@ -151,11 +152,11 @@ def test_a_disk_that_hangs_hangs_nobody(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", 0.05)
     gate, begun = threading.Event(), threading.Event()
 
-    def hang(self: RecordingWriter, packet: Any) -> None:
+    def hang(self: RecordingProcess, packet: Any) -> None:
         begun.set()
         gate.wait(SOON_S)
 
-    monkeypatch.setattr(RecordingWriter, "write", hang)
+    monkeypatch.setattr(RecordingProcess, "write", hang)
     recorder = make_recorder(tmp_path)
     for number in range(5):
         recorder.write("drone", imu(number))

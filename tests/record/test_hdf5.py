@@ -26,7 +26,7 @@ from neurosim_core.record import (
     RecordingHeader,
     RecordingWriter,
     SensorDescription,
-    hdf5,
+    streams,
 )
 from neurosim_core.record.disk import Disk
 
@@ -390,19 +390,79 @@ def test_killed_run_leaves_a_readable_file(tmp_path, then, caplog):
         assert file["events/t"].shape[0] >= len(t)
 
 
+def run_child(path: Path, then: str, *, first: str = "") -> tuple[int, str, str]:
+    command = [sys.executable, "-c", first + CHILD.format(then=then), str(path), str(Path(__file__).parent)]
+    done = subprocess.run(command, timeout=60, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout.removeprefix("ready\n"), done.stderr
+
+
 @pytest.mark.parametrize(
-    "then", ["", "raise SystemExit(0)", "writer.write(packets[60]); writer._begin_flush()"]
+    ("then", "count"),
+    [
+        ("", 60),
+        ("raise SystemExit(0)", 60),
+        ("writer.write(packets[60]); writer._begin_flush()", 61),
+        ("import atexit; atexit.register(lambda: [*map(writer.write, packets[60:90])])", 90),
+    ],
 )
-def test_a_program_that_does_not_close_ends_and_leaves_what_was_flushed(tmp_path, then):
-    command = [sys.executable, "-c", CHILD.format(then=then), str(tmp_path / "f.h5")]
-    done = subprocess.run(
-        [*command, str(Path(__file__).parent)], timeout=60, capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+def test_a_program_that_does_not_close_leaves_all_that_it_wrote(tmp_path, then, count):
+    """Also what it writes as it ends, when threads and pools take nothing any more."""
+    assert run_child(tmp_path / "f.h5", then) == (0, "", "")
     with Recording(tmp_path / "f.h5") as flight:
         assert not flight.clean
         packets = make_flight(5, [700, 0, 900, 30, 1, 500] * 4)[:-1]
-        assert_same(list(flight.packets()), packets[: 61 if "flush" in then else 50])
+        assert_same(list(flight.packets()), packets[:count])
+
+
+DISK = """
+import os, time
+from neurosim_core.record import hdf5
+hdf5._EXIT_S = 1.0
+wait_s, write = 0.0, os.pwrite
+def late(*arguments):
+    time.sleep(wait_s)
+    return write(*arguments)
+os.pwrite = late
+"""
+
+
+def test_a_program_that_ends_waits_for_a_slow_disk(tmp_path):
+    """A flush may take longer than the disk may hang."""
+    assert run_child(tmp_path / "f.h5", "wait_s = 0.05", first=DISK) == (0, "", "")
+    with Recording(tmp_path / "f.h5") as flight:
+        assert len(list(flight.packets())) == 60
+
+
+def test_a_program_that_ends_does_not_wait_for_a_disk_that_hangs(tmp_path):
+    status, _, errors = run_child(tmp_path / "f.h5", "wait_s = 1e6", first=DISK)
+    assert status == 1
+    assert "f.h5: the disk took nothing for 1 s; it is kept up to 0.1" in errors
+    with Recording(tmp_path / "f.h5") as flight:
+        assert len(list(flight.packets())) == 50
+
+
+@pytest.mark.parametrize("leave", ["sys.exit()", "writer.close(); sys.exit()", "writer.flush()"])
+def test_a_forked_process_leaves_the_file_to_its_parent(tmp_path, leave):
+    then = f"""
+import os
+child = os.fork()
+if child == 0:
+    try:
+        writer.write(packets[60])
+    except RuntimeError as error:
+        print(error, flush=True)
+    {leave}
+os.waitpid(child, 0)
+writer.write(packets[60])
+writer.close()
+"""
+    status, found, _ = run_child(tmp_path / "f.h5", then)
+    assert status == 0
+    assert "only its parent can write to it" in found
+    with Recording(tmp_path / "f.h5") as flight:
+        assert flight.clean
+        packets = make_flight(5, [700, 0, 900, 30, 1, 500] * 4)[:-1]
+        assert_same(list(flight.packets()), packets[:61])
 
 
 def test_writing_waits_for_a_slow_disk(tmp_path, monkeypatch):
@@ -548,7 +608,7 @@ def test_a_thread_that_fails_is_reported_once_and_leaves_what_was_flushed(tmp_pa
     def fail(*_: object) -> list[bytes]:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(hdf5, "deflate", fail)
+    monkeypatch.setattr(streams, "deflate", fail)
     writer.write(image(stamp_ns=2, shape=(90, 90)))
     with pytest.raises(MemoryError, match="no room"):
         writer.flush()

@@ -86,7 +86,7 @@ class Link {
   }
 
   // Whether the publisher has said that nothing follows what has come.
-  bool has_ended() const noexcept { return marks_end_ && known_ && expected_ + 1 == ended_; }
+  bool has_ended() const noexcept { return known_ && expected_ + 1 == ended_; }
 
   // The publisher has left, and all that came of it has been read: what it has published besides is lost.
   void end() {
@@ -152,9 +152,9 @@ class Link {
   void attach(bool shared_memory) {
     using wire::Key;
     const auto quota = std::min<std::uint64_t>(policy_.depth + 2, 255), timeout_ms = static_cast<std::uint64_t>(policy_.timeout.count());
-    const std::uint64_t options = (shared_memory ? Key::shared_memory : 0) | (policy_.is_reliable ? Key::strict | Key::confirms_end : 0);
+    const std::uint64_t options = (shared_memory ? Key::shared_memory : 0) | (policy_.is_reliable ? Key::strict : 0);
     reader_ = random_number();
-    key_ = Key('A', flags(), source_, reader_, options | Key::confirms | quota << 8 | timeout_ms << 32).bytes();
+    key_ = Key('A', flags(), source_, reader_, options | quota << 8 | timeout_ms << 32).bytes();
     if (shared_memory && net::is_ipc(address_)) {
       end_ = RingReader::open(address_.substr(6, address_.rfind('.') - 6) + ".ring", source_, reader_);
     }
@@ -272,7 +272,7 @@ class Link {
     if (header.body_size != 0 || arrival.bytes.size() != wire::header_size) throw MalformedMessage("a body where there is none");
     if (!advance(header.sequence, 0)) return;
     const std::uint64_t last = header.aux & wire::last;
-    if (last != 0 || !marks_end_) ended_ = header.sequence + 1;
+    if (last != 0) ended_ = header.sequence + 1;
     if (!in_ring_) confirm(header.sequence + last);
   }
 
@@ -294,7 +294,6 @@ class Link {
     const bool first = !attached_;
     attached_ = true;
     reached_ = std::max(reached_, answer.sequence);
-    marks_end_ = answer.marks_end;
     const bool is_new = !known_ || std::exchange(begins_again_, false);
     if (!std::exchange(known_, true)) expected_ = answer.sequence;  // what is lost counts, also in a ring that we cannot read
     if (first && !use_ring()) {
@@ -366,7 +365,6 @@ class Link {
   bool attached_ = false;
   bool known_ = false;  // whether `expected_` is
   bool begins_again_ = false;  // the first answer told of a ring that we cannot read: the next brings the latched message
-  bool marks_end_ = true;
   std::uint64_t ended_ = 0;  // one more than the number at which the publisher said that the stream ends
   std::uint64_t expected_ = 0;
   std::uint64_t reached_ = 0;  // the highest number below which all has been given away

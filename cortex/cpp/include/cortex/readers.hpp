@@ -25,7 +25,7 @@ struct Reader {
   PubSocket* pub_socket = nullptr;
   int member = -1;  // its number in the ring, through which its frames go; -1: through the socket
   std::uint64_t confirmed = 0;  // it has accounted for all below this; the end of the stream counts as one
-  bool has_answer = false;      // whether it has said so, or need not
+  bool has_answer = false;      // whether it has confirmed its answer, or need not
   bool is_moving = false;       // it was sent from the ring to its socket, and has not come there yet
 };
 
@@ -57,7 +57,7 @@ class Readers {
     reader->timeout_ms = std::min(request.timeout_ms(), max_wait_ms);
     reader->pub_socket = &pub_socket;
     if (request.has(wire::Key::shared_memory)) join(*reader, first, listener);
-    reader->has_answer = reader->member >= 0 || !request.has(wire::Key::confirms_end);
+    reader->has_answer = reader->member >= 0 || !request.has(wire::Key::strict);
     ++(reader->member >= 0 ? members_ : pub_socket.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -142,9 +142,7 @@ class Readers {
   void settle(std::uint64_t sequence) noexcept {
     ring_.reset();  // its readers keep what is in it
     const auto is_settled = [&](const auto& reader) {
-      const auto& request = reader->request;
-      return reader->member >= 0 || !request.has(wire::Key::confirms) ||
-             reader->confirmed >= sequence + (request.has(wire::Key::confirms_end) ? 1 : 0);
+      return reader->member >= 0 || reader->confirmed > sequence;
     };
     all_.erase(std::remove_if(all_.begin(), all_.end(), is_settled), all_.end());
     const auto strict = std::count_if(all_.begin(), all_.end(), [](const auto& reader) { return reader->pub_socket->strict; });

@@ -107,8 +107,6 @@ inline Span<const std::uint8_t> body_of(const Header& header, Span<const std::ui
 // that all below a sequence is accounted for.
 struct Key {
   static constexpr std::uint64_t shared_memory = 1, strict = 2;
-  static constexpr std::uint64_t confirms = 4;      // it says how far it has read, when it is told how many messages there have been
-  static constexpr std::uint64_t confirms_end = 8;  // it says so of the answer, too, and of the end of the stream
 
   Key() = default;
   Key(char letter, std::uint8_t bits, std::uint64_t from, std::uint64_t number, std::uint64_t rest) noexcept
@@ -138,7 +136,6 @@ inline Key read_key(Span<const std::uint8_t> bytes) noexcept {
 struct AttachAnswer {
   std::uint64_t sequence = 0;
   Span<const std::uint8_t> latched;
-  bool marks_end = true;  // it will say when the stream ends; older versions did not
 };
 
 inline std::string pack_answer(const std::string& key, const AttachAnswer& answer) {
@@ -146,7 +143,7 @@ inline std::string pack_answer(const std::string& key, const AttachAnswer& answe
   std::memcpy(frame.data(), key.data(), key_size);
   auto* out = reinterpret_cast<std::uint8_t*>(frame.data()) + key_size;
   store(out, answer.sequence);
-  store(out + 8, static_cast<std::uint64_t>(answer.marks_end ? 1 : 0));
+  store(out + 8, std::uint64_t{1});
   store(out + 16, static_cast<std::uint64_t>(answer.latched.size()));
   frame.append(reinterpret_cast<const char*>(answer.latched.data()), answer.latched.size());
   return frame;
@@ -157,7 +154,6 @@ inline AttachAnswer read_answer(Span<const std::uint8_t> frame) {
   const std::uint8_t* at = frame.data() + key_size;
   AttachAnswer answer;
   answer.sequence = load<std::uint64_t>(at);
-  answer.marks_end = (load<std::uint64_t>(at + 8) & 1) != 0;
   const auto latched = load<std::uint64_t>(at + 16);
   if (latched > body_limit + header_size || frame.size() != header_size + latched) {
     throw MalformedMessage("an attach answer cannot hold its latched message");

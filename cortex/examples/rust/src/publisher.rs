@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use zmq::{Context, DONTWAIT, Socket, XPUB};
 
 use crate::node::{Node, clock_ns};
-use crate::wire::{CONFIRMS, CONFIRMS_END, Header, MARKS_END, STRICT, number};
+use crate::wire::{END, Header, STRICT, number};
 use crate::{body, schema};
 
 /// The longest that a reader may ask for [A7], and that we wait at the end for one that asked for less.
@@ -138,9 +138,9 @@ impl Publisher {
         }
         match (kind, on) {
             (b'A', 1) => {
-                let confirmed = (last & CONFIRMS_END == 0).then_some(0);
+                let confirmed = (last & STRICT == 0).then_some(0);
                 self.readers.insert(key.to_vec(), Reader { options: last, confirmed });
-                self.send(&[key, &[self.next, MARKS_END, 0, 0].map(u64::to_le_bytes).concat()].concat(), 0)?;
+                self.send(&[key, &[self.next, 1, 0, 0].map(u64::to_le_bytes).concat()].concat(), 0)?;
             }
             (b'A', _) => drop(self.readers.remove(key)),
             (b'R', 1) => {
@@ -164,11 +164,7 @@ impl Publisher {
     /// Say that the stream is over [E1], and wait until those that say so have read all of it [E2].
     pub fn close(mut self) -> Result<()> {
         let (begin, wait) = (Instant::now(), Duration::from_millis(self.wait_ms().max(LINGER_MS)));
-        let owes = |next, reader: &Reader| match reader.options & (CONFIRMS | CONFIRMS_END) {
-            0 => false,
-            options => reader.confirmed < Some(next + (options & CONFIRMS_END != 0) as u64),
-        };
-        while !self.tell(MARKS_END)? || self.readers.values().any(|reader| owes(self.next, reader)) {
+        while !self.tell(END)? || self.readers.values().any(|reader| reader.confirmed <= Some(self.next)) {
             if begin.elapsed() >= wait {
                 break;
             }

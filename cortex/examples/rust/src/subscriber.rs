@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use zmq::{Context, DONTWAIT, POLLIN, SUB, Socket};
 
 use crate::node::Node;
-use crate::wire::{BODY_MAX, CONFIRMS, CONFIRMS_END, HEADER, Header, MARKS_END, STRICT, number, parse_answer};
+use crate::wire::{BODY_MAX, END, HEADER, Header, STRICT, number, parse_answer};
 use crate::{body, schema};
 
 const JUMP_MAX: u64 = 1 << 32;
@@ -39,8 +39,6 @@ pub struct Link {
     expected: Option<u64>,
     /// The publisher has given away all sequences below this.
     reached: u64,
-    /// Whether the publisher will mark the end; an older one only says which sequence comes next [E6].
-    marks_end: bool,
     /// The sequence at which the publisher said that the stream ends.
     end: Option<u64>,
     /// When the publisher was seen to have left.
@@ -55,15 +53,15 @@ impl Link {
         ensure!(publisher["fingerprint"] == fingerprint, "another fingerprint than its schema's [S7]");
         let source = publisher["source"].as_u64().unwrap_or(0);
         let head = Header { source, fingerprint, stamped, ..Header::default() };
-        let options = if reliable { TIMEOUT_MS << 32 | STRICT | CONFIRMS | CONFIRMS_END } else { 0 };
+        let options = if reliable { TIMEOUT_MS << 32 | STRICT } else { 0 };
         let (socket, key) = (context.socket(SUB)?, head.key(b'A', rand::random(), options));
         socket.set_maxmsgsize(BODY_MAX as i64 + 4096)?;
         socket.connect(address)?;
         for wanted in [head.prefix(b'M'), head.prefix(b'N'), head.prefix(b'L'), key.clone()] {
             socket.set_subscribe(&wanted)?;
         }
-        let (expected, reached, marks_end, end, left) = (None, 0, true, None, None);
-        Ok(Link { socket, schema, head, reliable, key, expected, reached, marks_end, end, left })
+        let (expected, reached, end, left) = (None, 0, None, None);
+        Ok(Link { socket, schema, head, reliable, key, expected, reached, end, left })
     }
 
     /// Account for messages from a sequence on; false if they were seen before [K2, K3, E3].
@@ -75,7 +73,7 @@ impl Link {
         }
         self.expected = Some(sequence + count);
         counters.lost += sequence - expected;
-        if sequence > expected {
+        if sequence > expected && self.reliable {
             self.confirm(sequence)?;
         }
         Ok(true)
@@ -83,22 +81,21 @@ impl Link {
 
     /// Tell the publisher that all below a sequence is accounted for [E3].
     fn confirm(&self, sequence: u64) -> Result<()> {
-        if self.reliable {
-            let confirmed = self.head.key(b'R', number(&self.key, 16), sequence);
-            self.socket.set_subscribe(&confirmed)?;
-            self.socket.set_unsubscribe(&confirmed)?;
-        }
-        Ok(())
+        let confirmed = self.head.key(b'R', number(&self.key, 16), sequence);
+        self.socket.set_subscribe(&confirmed)?;
+        Ok(self.socket.set_unsubscribe(&confirmed)?)
     }
 
     /// The body that a ZeroMQ message brings, if any.
     pub fn take(&mut self, frames: &[Vec<u8>], counters: &mut Counters) -> Result<Option<Vec<u8>>> {
         let frame = &frames[0];
         if frame.starts_with(&self.key) {
-            let (next, marks_end, latched) = parse_answer(frame)?;
-            (self.marks_end, self.reached) = (marks_end, self.reached.max(next));
+            let (next, latched) = parse_answer(frame)?;
+            self.reached = self.reached.max(next);
             let known = self.expected.replace(self.expected.unwrap_or(next));
-            self.confirm(known.unwrap_or(next))?;
+            if self.reliable {
+                self.confirm(known.unwrap_or(next))?;
+            }
             if known.is_some() || latched.is_empty() {
                 return Ok(None);
             }
@@ -121,8 +118,8 @@ impl Link {
         };
         let is_new = self.advance(header.sequence, count, counters)?;
         if is_new && count == 0 {
-            self.end = (header.aux & MARKS_END != 0 || !self.marks_end).then_some(header.sequence).or(self.end);
-            self.confirm(header.sequence + (header.aux & MARKS_END))?;
+            self.end = (header.aux & END != 0).then_some(header.sequence).or(self.end);
+            self.confirm(header.sequence + (header.aux & END))?;
         }
         Ok((is_new && count == 1).then(|| body.to_vec()))
     }

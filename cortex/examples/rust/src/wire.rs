@@ -9,12 +9,10 @@ use crate::{body, schema};
 
 pub const HEADER: usize = 64;
 pub const BODY_MAX: u64 = 1 << 30;
-/// Options of an attach key: it is reliable, it confirms, and does so with its answer and the end.
+/// An option of an attach key: it is reliable.
 pub const STRICT: u64 = 1 << 1;
-pub const CONFIRMS: u64 = 1 << 2;
-pub const CONFIRMS_END: u64 = 1 << 3;
-/// In an answer: the end of the stream will be marked [E1]. In `aux` of kind `N`: it is here.
-pub const MARKS_END: u64 = 1;
+/// In `aux` of kind `N`: the end of the stream [E1].
+pub const END: u64 = 1;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Header {
@@ -61,10 +59,10 @@ impl Header {
     }
 }
 
-/// Sequence of an answer, whether its publisher marks the end of its stream, and the latched message [A4].
-pub fn parse_answer(frame: &[u8]) -> Result<(u64, bool, &[u8])> {
+/// Sequence of an answer, and the latched message [A4].
+pub fn parse_answer(frame: &[u8]) -> Result<(u64, &[u8])> {
     ensure!(frame.len() >= 64 && frame.len() as u64 - 64 == number(frame, 48), "an answer of {} bytes", frame.len());
-    Ok((number(frame, 32), number(frame, 40) & MARKS_END != 0, &frame[64..]))
+    Ok((number(frame, 32), &frame[64..]))
 }
 
 /// Fingerprints and schemas of the control messages, by name.

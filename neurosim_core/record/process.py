@@ -1,0 +1,272 @@
+"""A recording that a process of its own compresses and writes.
+
+Both would take Python's interpreter lock from the thread that flies. Packets go through a socket: as a
+pickled list, and after it their arrays as they are. Where the stream ends, also because the process that flew
+was killed, the file is closed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import pickle
+import queue
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
+from neurosim_core.record.forked import disown_when_forked, forked_error
+from neurosim_core.record.hdf5 import RecordingWriter, import_h5py
+from neurosim_core.record.header import RecordingHeader
+
+_QUEUE_BYTES = 32_000_000
+"""What may wait to be sent [bytes]."""
+_COPIED_BYTES = 4096
+"""Smaller arrays are copied at once."""
+_SIZES = struct.Struct("<QQ")
+"""Sizes of what is pickled, and of the arrays behind it [bytes]."""
+_SCALARS = (int, float, bool, str)
+_ENVIRONMENT = {
+    "OPENBLAS_NUM_THREADS": "1",  # its threads take time to start
+    "MALLOC_MMAP_THRESHOLD_": "1000000000",  # glibc keeps what is freed: to map memory anew takes time
+    "MALLOC_TRIM_THRESHOLD_": "1000000000",
+}
+
+
+class _Process:
+    """A process that writes a recording, or waits for one."""
+
+    def __init__(self) -> None:
+        self.socket, theirs = socket.socketpair()
+        # `-m` would look for modules in the working directory first, where a yaml.py may lie
+        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        with theirs:
+            self.popen = subprocess.Popen(
+                [sys.executable, "-c", program],
+                stdin=theirs.fileno(),
+                stdout=subprocess.PIPE,
+                env=dict(os.environ) | _ENVIRONMENT,
+                start_new_session=True,  # Ctrl-C is for the one that flies, which then closes the recording
+            )
+        disown_when_forked(self)
+
+    def disown(self) -> None:
+        """Let it see the end of the stream when the process ends that this one was forked from."""
+        self.socket.close()
+
+
+_spare: list[_Process] = []
+
+
+def start_process() -> None:
+    """Start the process of the next recording, beside other work: it takes 0.2 s. Again: does nothing."""
+    if not _spare:
+        _spare.append(_Process())
+
+
+class RecordingProcess:
+    """Writes packets to a file as `RecordingWriter` does, in a process of its own.
+
+    `write` hands a packet over, and waits only where the process is far behind. Arrays of 4 kB and more are
+    read later and must not change. What goes wrong in the process is raised by the next call. Without `close`
+    the file holds what was sent until this process ended, and is not marked as complete.
+    """
+
+    def __init__(self, path: Path, header: RecordingHeader) -> None:
+        """Create the file, replacing one that exists.
+
+        Raises:
+            OSError: The file cannot be created.
+        """
+        try:
+            path.open("wb").close()
+        except OSError as error:
+            raise OSError(f"cannot write {path}: {error.strerror}") from error
+        self._path = path
+        self.kept_ns: int | None = None
+        """When writing has failed: the file holds the packets up to this stamp [ns]; None: unknown."""
+        self._process = _spare.pop() if _spare else _Process()
+        self._failure: Exception | None = None
+        self._closed = False
+        self._classes: dict[type[Packet], tuple[int, tuple[str, ...]]] = {}
+        self._queue: queue.SimpleQueue[tuple[int, list[Any]] | None] = queue.SimpleQueue()
+        self._put_bytes = self._sent_bytes = 0
+        self._is_sending = True
+        self._progress = threading.Event()
+        self._thread = threading.Thread(target=self._send, name="recording", daemon=True)
+        self._thread.start()
+        self._put((os.fspath(path.absolute()), header))
+        disown_when_forked(self)
+
+    def write(self, packet: Packet) -> None:
+        """Hand one packet over.
+
+        Raises:
+            OSError: The disk is full or gone, or the process has ended.
+            ValueError, TypeError: A packet before this one cannot be recorded, see `RecordingWriter.write`.
+        """
+        if self._failure is not None:
+            raise self._failure
+        kind = type(packet)
+        if kind not in self._classes:
+            names = tuple(field.name for field in fields(kind))
+            self._classes[kind] = len(self._classes), names
+            self._put((*self._classes[kind], schema_of(kind).to_json()))
+        number, names = self._classes[kind]
+        values: list[Any] = []
+        arrays: list[NDArray[Any]] = []
+        size = 0  # of them
+        for name in names:
+            value = getattr(packet, name)
+            if type(value) not in _SCALARS:
+                array = as_numpy(value)
+                place: bytes | int = size
+                if array.nbytes >= _COPIED_BYTES:
+                    arrays.append(np.ascontiguousarray(array))
+                    size += array.nbytes
+                else:
+                    place = array.tobytes()
+                value = array.dtype.str, array.shape, place
+            values.append(value)
+        self._put((number, values), arrays)
+        if self._put_bytes - self._sent_bytes > _QUEUE_BYTES:
+            self._wait()
+        if not self._is_sending:
+            self._end()
+
+    def close(self, *, complete: bool = True) -> None:
+        """Wait until all is written, and mark the file as complete unless it is not. Again: does nothing.
+
+        Args:
+            complete: All that was to be recorded was written.
+
+        Raises:
+            OSError: The disk is full or gone, or the process has ended.
+        """
+        if not self._closed:
+            self._put(complete)
+            self._queue.put(None)
+            self._thread.join()
+            self._end()
+
+    def disown(self) -> None:
+        """Leave the recording to the process that this one was forked from."""
+        self._closed, self._failure = True, forked_error(self._path)
+
+    def _put(self, content: Any, arrays: Sequence[NDArray[Any]] = ()) -> None:
+        body = pickle.dumps(content)
+        sizes = len(body), sum(array.nbytes for array in arrays)
+        size = _SIZES.size + sum(sizes)
+        self._put_bytes += size
+        self._queue.put((size, [_SIZES.pack(*sizes) + body, *arrays]))
+
+    def _send(self) -> None:
+        """Send what is put, until that is None or the process has ended."""
+        with contextlib.suppress(OSError):  # why it has ended, `_end` finds out
+            while (entry := self._queue.get()) is not None:
+                size, parts = entry
+                count = self._process.socket.sendmsg(parts)
+                if count < size:  # a signal came
+                    self._process.socket.sendall(b"".join(parts)[count:])
+                self._sent_bytes += size
+                self._progress.set()
+        self._is_sending = False
+        self._progress.set()
+
+    def _wait(self) -> None:
+        """Wait until there is room in the queue."""
+        while True:
+            self._progress.clear()
+            if self._put_bytes - self._sent_bytes <= _QUEUE_BYTES or not self._is_sending:
+                return
+            self._progress.wait()
+
+    def _end(self) -> None:
+        """Wait for the end of the process, and raise what went wrong."""
+        self._closed = True
+        self._process.socket.close()
+        report = self._process.popen.communicate()[0]
+        status = self._process.popen.returncode
+        if status:
+            how = f"by signal {-status}" if status < 0 else f"with exit status {status}"
+            self._failure = OSError(f"cannot write {self._path}: the process that writes it ended {how}")
+        else:
+            self._failure, self.kept_ns = pickle.loads(report)
+        if self._failure is not None:
+            raise self._failure
+
+
+def main() -> None:
+    """Be the process: write what comes from file 0, the socket, and report on file 1."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends with the one that flies
+    gc.disable()  # packets have no cycles
+    failure, kept_ns = None, None
+    with socket.socket(fileno=0) as source:
+        try:
+            import_h5py()
+            (path, header), _ = _receive(source)
+            writer = RecordingWriter(path, header)
+            try:
+                _write(writer, source)
+            finally:
+                kept_ns = writer.kept_ns
+        except EOFError:  # nothing is recorded
+            return
+        except Exception as error:  # raised by `_end`
+            failure = error
+    with contextlib.suppress(BrokenPipeError), open(1, "wb") as report:
+        pickle.dump((failure, kept_ns), report)
+
+
+def _write(writer: RecordingWriter, source: socket.socket) -> None:
+    """Write what comes until the stream ends; what is cut off is dropped."""
+    classes: dict[int, tuple[Any, Sequence[str]]] = {}
+    complete = False
+    try:
+        while True:
+            content, arrays = _receive(source)
+            if isinstance(content, bool):
+                complete = content
+                return
+            number, values, *schema = content
+            if schema:
+                classes[number] = packet_class(PacketSchema.from_json(*schema)), values
+                continue
+            for index, value in enumerate(values):
+                if type(value) is tuple:
+                    dtype, shape, place = value
+                    at = (place, 0) if isinstance(place, bytes) else (arrays, place)
+                    values[index] = np.ndarray(shape, dtype, *at)
+            kind, names = classes[number]
+            writer.write(kind(**dict(zip(names, values, strict=True))))
+    except EOFError:
+        pass
+    finally:
+        writer.close(complete=complete)
+
+
+def _receive(source: socket.socket) -> tuple[Any, NDArray[np.uint8]]:
+    """Return the next content that was put, and the bytes of its arrays.
+
+    Raises:
+        EOFError: The stream has ended.
+    """
+    sizes = source.recv(_SIZES.size, socket.MSG_WAITALL)
+    if len(sizes) < _SIZES.size:
+        raise EOFError
+    parts: list[Any] = [np.empty(size, np.uint8) for size in _SIZES.unpack(sizes)]
+    if source.recvmsg_into(parts, 0, socket.MSG_WAITALL)[0] < len(parts[0]) + len(parts[1]):
+        raise EOFError
+    return pickle.loads(parts[0]), parts[1]
