@@ -172,7 +172,11 @@ def make_fleet(
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
-    """Return the paths of vehicles (None: of all) by name, as `make_fleet` plans them.
+    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
+
+    Args:
+        config: What to fly.
+        vehicles: Names of vehicles; None: all.
 
     Raises:
         KeyError: There is no such vehicle.
@@ -186,6 +190,10 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
 
 def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
     """Return the path of the only vehicle.
+
+    Args:
+        config: What to fly.
+        free_space: Where it can fly in the scene of `config`.
 
     Raises:
         ValueError: No path exists, or it begins inside a solid.
