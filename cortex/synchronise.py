@@ -94,9 +94,9 @@ def synchronised(
     These are all messages after the stamp before and up to this one. One that is due by then and has not come
     is waited for, so the result does not depend on who was faster: a controller in lockstep that acts on what
     it is given here flies the same flight to the last bit. The first leader comes
-    with nothing: what belongs to it may have been sent before this node came, and some sensors have no message
-    of stamp 0. A leader that is sent again, as to a controller that has just come, is yielded again with
-    nothing new. Where time begins again, so do all topics.
+    with nothing: what belongs to it may have been sent before this node came, and some sensors have no
+    message of stamp 0. A leader that is sent again, as to a controller that has just come, is yielded again
+    with nothing new. Where time begins again, so do all topics.
 
     Args:
         node: Subscribes to all topics, and holds up their publishers rather than lose messages.
