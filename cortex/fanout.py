@@ -21,8 +21,6 @@ READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
-FORGET_NS = 10_000_000_000
-"""After so long without a message the memory of large bodies that were sent is given back."""
 TELL_AGAIN_S = 0.02
 """A reader that was late when the publisher is closed is told this often how many messages there were."""
 
@@ -139,8 +137,6 @@ class Fanout:
         if self.back_pressure.is_waiting:
             return
         sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
-        if silent_ns > FORGET_NS:
-            self.large.forget()
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
         if self.readers and silent_ns > self._tell_after_ns:

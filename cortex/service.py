@@ -69,7 +69,6 @@ class Server:
         self._lock = threading.Lock()
         self._services: dict[int, Service] = {}
         self._pending = 0
-        self.rejected = 0
 
     def add(self, service: Service) -> None:
         """Offer a service.

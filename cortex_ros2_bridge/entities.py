@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
+import scipy  # which imports its parts when they are used
 import yaml
 
 from cortex import messages as msg
@@ -125,7 +126,10 @@ class Entities:
         self._call("/set_parameters", msg.Parameters.of({f"bodies.{request.entity}.present": False}))
 
     def _place(self, name: str, position: Vector, q: Vector) -> None:
-        values = {"position_m": position.tolist(), "rpy_rad": frames.roll_pitch_yaw(q)}
+        values = {
+            "position_m": position.tolist(),
+            "rpy_rad": scipy.spatial.transform.Rotation.from_quat(q).as_euler("xyz").tolist(),
+        }
         given = {f"bodies.{name}.motion.{key}": str(value) for key, value in values.items()}
         self._call("/set_parameters", msg.Parameters.of({f"bodies.{name}.present": True, **given}))
 
@@ -178,7 +182,8 @@ class Entities:
         if body is not None:
             stamp_ns = self._news("/status", msg.SimulatorStatus).stamp_ns
             motion = body["motion"]
-            values = motion["position_m"], frames.quaternion_of(*motion["rpy_rad"]), zero, zero
+            q = scipy.spatial.transform.Rotation.from_euler("xyz", motion["rpy_rad"]).as_quat()
+            values = motion["position_m"], q, zero, zero
         else:
             seen = self._news(f"/{name}/odometry", msg.Odometry)
             stamp_ns, turning = seen.stamp_ns, frames.rotate(seen.orientation, seen.body_rate)

@@ -98,25 +98,3 @@ def yaw_rad(q: ArrayLike) -> float:
     """Return where a unit quaternion (xyzw) turns the x axis, counter-clockwise from east [rad]."""
     x, y, z, w = np.asarray(q, np.float64).tolist()
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def quaternion_of(roll: float, pitch: float, yaw: float) -> Vector:
-    """Return the quaternion (xyzw) of Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
-    half = 0.5 * np.array([roll, pitch, yaw])
-    (sr, sp, sy), (cr, cp, cy) = np.sin(half).tolist(), np.cos(half).tolist()
-    return np.array(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
-
-
-def roll_pitch_yaw(q: ArrayLike) -> list[float]:
-    """Return the angles of a unit quaternion (xyzw) [rad]; the inverse of `quaternion_of`."""
-    x, y, z, w = np.asarray(q, np.float64).tolist()
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    return [float(roll), float(pitch), yaw_rad(q)]

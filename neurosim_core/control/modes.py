@@ -156,7 +156,10 @@ MODES: dict[str, Mode] = {
 def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
     """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time.
 
-    It compensates the given `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only applies the limits.
+    Args:
+        mode: Name of the mode, a key of `MODES`.
+        terms: Aerodynamic terms that it compensates, some of `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds`
+            only applies the limits.
 
     Raises:
         ValueError: There is no such mode.

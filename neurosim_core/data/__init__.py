@@ -24,7 +24,6 @@ if TYPE_CHECKING:  # isort: off
         Dataset as Dataset,
         Stream as Stream,
     )
-    from neurosim_core.data.tonic import TonicDataset as TonicDataset
     from neurosim_core.data.torch_loader import (
         Loader as Loader,
         as_tensors as as_tensors,

@@ -80,7 +80,16 @@ def is_event_file(path: Path) -> bool:
 
 
 def check_events(path: Path) -> None:
-    """Look whether there are events in a file of a format that is used for other things as well."""
+    """Look whether there are events in a file of a format that is used for other things as well.
+
+    Args:
+        path: A file or folder of which `is_event_file` is true; formats of events alone, and recordings,
+            are not opened.
+
+    Raises:
+        NoEventsError: There are none.
+        EventFileError: The file cannot be read.
+    """
     if path.is_dir() or (path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path)):
         return
     if (name := _format_in(path)) in (*_UNITLESS, "mvsec"):

@@ -37,20 +37,14 @@ class _Shown:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TimeSurface(_Shown):
-    """exp(-(now - t) / tau) of the last event of each pixel: channels off and on for each tau.
-
-    Reference: Lagorce et al. (2017), "HOTS", eq. (3).
-    """
-
-    tau_s: tuple[float, ...] = (0.01, 0.05)
+class _Fading(_Shown):
+    tau_s: tuple[float, ...] = (0.01,)
     """Time constants [s]."""
-
-    uint8_levels: ClassVar[tuple[float, float]] = (255.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_tau(self.tau_s)
+        if not self.tau_s or not all(0.0 < tau < float("inf") for tau in self.tau_s):
+            raise ValueError(f"tau_s must be one or more numbers > 0, got {self.tau_s}")
 
     @property
     def channel_count(self) -> int:
@@ -59,25 +53,25 @@ class TimeSurface(_Shown):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeakySurface(_Shown):
+class TimeSurface(_Fading):
+    """exp(-(now - t) / tau) of the last event of each pixel: channels off and on for each tau.
+
+    Reference: Lagorce et al. (2017), "HOTS", eq. (3).
+    """
+
+    tau_s: tuple[float, ...] = (0.01, 0.05)
+    """Time constants [s]."""
+    uint8_levels: ClassVar[tuple[float, float]] = (255.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeakySurface(_Fading):
     """The sum of exp(-(now - t) / tau) over all events of a pixel: channels off and on for each tau.
 
     It shows how recent and how frequent events are.
     """
 
-    tau_s: tuple[float, ...] = (0.01,)
-    """Time constants [s]."""
-
     uint8_levels: ClassVar[tuple[float, float]] = (16.0, 0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_tau(self.tau_s)
-
-    @property
-    def channel_count(self) -> int:
-        """Two for each time constant."""
-        return 2 * len(self.tau_s)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,14 +128,9 @@ SURFACES: dict[str, type[SurfaceConfig]] = {
 def surface_like(kind: str, surface: SurfaceConfig) -> SurfaceConfig:
     """Return a surface of a kind of `SURFACES`, with the time constants of another one if both have some."""
     made = SURFACES[kind]()
-    if isinstance(made, TimeSurface | LeakySurface) and isinstance(surface, TimeSurface | LeakySurface):
+    if isinstance(made, _Fading) and isinstance(surface, _Fading):
         return replace(made, tau_s=surface.tau_s)
     return made
-
-
-def _check_tau(tau_s: tuple[float, ...]) -> None:
-    if not tau_s or not all(0.0 < tau < float("inf") for tau in tau_s):
-        raise ValueError(f"tau_s must be one or more numbers > 0, got {tau_s}")
 
 
 @wp.func
@@ -224,24 +213,6 @@ def _add_leaky(
         for scale in range(tau_us.shape[0]):
             channel = 2 * scale + int(polarity[event])
             _add(sums, world, channel, int(y[event]), int(x[event]), wp.exp(-age_us / tau_us[scale]))
-        event += stride
-
-
-@wp.kernel
-def _add_counts(
-    # In:
-    x: wp.array[wp.uint16],
-    y: wp.array[wp.uint16],
-    polarity: wp.array[wp.uint8],
-    offsets: wp.array[wp.int32],
-    stride: int,
-    # In/out:
-    sums: wp.array4d[wp.int32],
-) -> None:
-    world, lane = wp.tid()
-    event = offsets[world] + lane
-    while event < offsets[world + 1]:
-        _add(sums, world, int(polarity[event]), int(y[event]), int(x[event]), 1.0)
         event += stride
 
 
@@ -412,10 +383,9 @@ class EventSurface:
             self._launch(_note_last, dim, [events.t, *where, self._lanes], [self._last])
         elif isinstance(self.config, LeakySurface):
             self._launch(_add_leaky, dim, [self._tau_us, events.t, *where, end_ns, self._lanes], [self._sums])
-        elif isinstance(self.config, Counts):
-            self._launch(_add_counts, dim, [*where, self._lanes], [self._sums])
-        else:
-            inputs = [events.t, *where, end_ns, self._step_us, self.config.bins, self._lanes]
+        else:  # counts are one bin with polarities apart
+            bins = 1 if isinstance(self.config, Counts) else self.config.bins
+            inputs = [events.t, *where, end_ns, self._step_us, bins, self._lanes]
             self._launch(_add_voxels, dim, inputs, [self._sums])
 
     def show(self, now_ns: Any) -> None:

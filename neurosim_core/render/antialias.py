@@ -351,18 +351,7 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         unresolved = unresolved_bits[0]
         if unresolved != 0:
             cast_pixels(
-                scene,
-                view,
-                rays,
-                first_ray,
-                FAR_M,
-                instant,
-                top,
-                left,
-                rows,
-                columns,
-                unresolved,
-                radiance,
+                scene, view, rays, first_ray, FAR_M, instant, top, left, rows, columns, unresolved, radiance
             )
         if out.log_radiance.shape[0] > 0:
             _write_log(scene, radiance, instant, top, left, rows, columns, out.log_radiance)

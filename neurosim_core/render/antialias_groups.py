@@ -284,11 +284,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 pose = find_pose(at.instant, 0, at.row * view.width + at.col, view)
                 toward = wp.quat_rotate(view.q_WC[pose], _xyz(ray_C))
                 radiance = shade_part(
-                    scene,
-                    out.face[at.instant, at.row, at.col],
-                    view.p_WC[pose],
-                    toward,
-                    SHARPNESS * ray_C[3],
+                    scene, out.face[at.instant, at.row, at.col], view.p_WC[pose], toward, SHARPNESS * ray_C[3]
                 )
             write_radiance(scene, radiance, 1, at.instant, at.slot, at.row, at.col, out)
         for pair in range(INSTANTS // 2):
@@ -435,15 +431,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                 if wp.static(terms.bodies):
                     hit, body = intersect_bodies(bodies, pose, direction_C, q, hit)
                 light = radiance_of(
-                    scene,
-                    bodies,
-                    pose,
-                    body,
-                    q,
-                    direction,
-                    origin,
-                    RAY_WIDTH * rays[0, at.ray][3],
-                    hit,
+                    scene, bodies, pose, body, q, direction, origin, RAY_WIDTH * rays[0, at.ray][3], hit
                 )
             light = _ray_sum(light)
             if wanted != 0 and index % RAY_COUNT == 0:

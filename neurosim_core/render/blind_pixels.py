@@ -63,14 +63,7 @@ def _darken_pixels(
 class BlindPixels:
     """The pixels that see nothing, of one lens or of several."""
 
-    def __init__(
-        self,
-        lenses: Sequence[Lens],
-        lens_of_world: Any,
-        *,
-        stride: int,
-        dark_floor: float,
-    ) -> None:
+    def __init__(self, lenses: Sequence[Lens], lens_of_world: Any, *, stride: int, dark_floor: float) -> None:
         """Bring them to the device; lenses are of one size, and each world has at most `stride` instants."""
         masks = [lens.blind_pixels() for lens in lenses]
         found = [np.zeros((0, 2), int) if mask is None else np.argwhere(mask) for mask in masks]

@@ -149,16 +149,7 @@ class CandidateLists:
         launch_split(
             frustum_search_kernel(self._lanes),
             dim=groups * self.data.bounds.shape[0] * self._lanes,
-            inputs=[
-                self._tree,
-                rays,
-                self._width,
-                self._height,
-                self._extent_m,
-                instant_count,
-                p_WC,
-                q_WC,
-            ],
+            inputs=[self._tree, rays, self._width, self._height, self._extent_m, instant_count, p_WC, q_WC],
             outputs=[self.data],
             device=self._device,
             thread_count=self._thread_count,

@@ -301,11 +301,7 @@ def _source() -> bytes:
 
 
 def _light_groups(
-    scene: Scene,
-    mesh: RefinedMesh,
-    config: LightingConfig,
-    occluders: wp.Mesh | EmbreeTree,
-    device: str,
+    scene: Scene, mesh: RefinedMesh, config: LightingConfig, occluders: wp.Mesh | EmbreeTree, device: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return light, shape [G, 2, 3], and openness, [G, 2], of each group of corners on both sides."""
     group, example = mesh.corner_groups

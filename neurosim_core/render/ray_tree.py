@@ -63,11 +63,7 @@ def _bound_nodes(mesh: wp.uint64, bounds: wp.array[int]) -> None:
 
 @wp.kernel
 def _lay_out(
-    mesh: wp.uint64,
-    first: int,
-    root: wp.array[int],
-    nodes: wp.array[wp.vec4],
-    triangles: wp.array[wp.vec4],
+    mesh: wp.uint64, first: int, root: wp.array[int], nodes: wp.array[wp.vec4], triangles: wp.array[wp.vec4]
 ) -> None:
     _lay_out_node(mesh, wp.tid(), first, root, nodes, triangles)
 

@@ -220,41 +220,17 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                         if wp.static(requested.geometry):
                             if slot >= 0 and layer == 0:
                                 write_geometry(
-                                    scene,
-                                    ray[lane],
-                                    ray_C[2],
-                                    ray_C[3],
-                                    hit,
-                                    slot,
-                                    top + y,
-                                    left + x,
-                                    out,
+                                    scene, ray[lane], ray_C[2], ray_C[3], hit, slot, top + y, left + x, out
                                 )
             if wp.static(packed):
                 if layers == 1 or layer > 0:
-                    shade_packet(
-                        scene,
-                        ray,
-                        spread_rad,
-                        face,
-                        t,
-                        u,
-                        v,
-                        normal,
-                        radiance,
-                    )
+                    shade_packet(scene, ray, spread_rad, face, t, u, v, normal, radiance)
         if wp.static(requested.radiance):
             share = 1.0 / float(wp.max(layers - 1, 1))
             for y in range(rows):
                 for x in range(columns):
                     write_radiance(
-                        scene,
-                        share * radiance[side * y + x],
-                        instant,
-                        slot,
-                        top + y,
-                        left + x,
-                        out,
+                        scene, share * radiance[side * y + x], instant, slot, top + y, left + x, out
                     )
 
     return raycast_packets

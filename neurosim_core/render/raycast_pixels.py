@@ -281,17 +281,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                                 )
                         if wp.static(requested.geometry):
                             if slot >= 0 and layer == 0:
-                                write_geometry(
-                                    scene,
-                                    ray,
-                                    ray_C[2],
-                                    ray_C[3],
-                                    hit,
-                                    slot,
-                                    row,
-                                    col,
-                                    out,
-                                )
+                                write_geometry(scene, ray, ray_C[2], ray_C[3], hit, slot, row, col, out)
                 if layer == layer_count - 1:
                     mark_pixel(
                         unresolved,
@@ -301,16 +291,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                     )
                     if wp.static(requested.radiance):
                         if rendered and not unresolved:
-                            write_radiance(
-                                scene,
-                                radiance,
-                                layer_count,
-                                instant,
-                                slot,
-                                row,
-                                col,
-                                out,
-                            )
+                            write_radiance(scene, radiance, layer_count, instant, slot, row, col, out)
                     radiance = wp.vec3(0.0)
                     unresolved = bool(False)
 

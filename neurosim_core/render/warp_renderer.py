@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.antialias import Antialiasing
 from neurosim_core.render.blind_pixels import BlindPixels
-from neurosim_core.render.body_arrays import (
-    make_body_data,
-    place_camera,
-)
+from neurosim_core.render.body_arrays import make_body_data, place_camera
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.candidate_data import TILE, CandidateListData
 from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists

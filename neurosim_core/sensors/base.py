@@ -119,17 +119,28 @@ class Sampler(ABC):
 
     @abstractmethod
     def measure(self, slot: int) -> None:
-        """Measure all vehicles at their present state into a slot of the arrays; launches only."""
+        """Measure all vehicles at their present state; launches only.
+
+        Args:
+            slot: Index into the first axis of `arrays` that the sample is written to.
+        """
 
     @abstractmethod
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
         """Return one sample of one world as a packet; None: it is lost, and the sequence shows the gap.
 
-        `rows` has the sample's element of each array, on the host; the packet passes the header on.
+        Args:
+            rows: The sample's element of each of `arrays`, by name, on the host: shape [...] of [slot, world,
+                ...].
+            header: `stamp_ns`, `sequence` and `sensor`, which the packet passes on.
         """
 
     def reset(self, mask: Any) -> None:  # noqa: B027  (most sensors have no memory)
-        """Begin anew where the mask is not 0, device array of int32, shape [world]; launches only."""
+        """Begin anew in some worlds; launches only.
+
+        Args:
+            mask: Not 0 where a world begins anew, device array of int32, shape [world].
+        """
 
 
 class StateSensorConfig(SensorConfig):
@@ -305,9 +316,12 @@ class PictureSensorConfig(RenderedConfig):
         return {}
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet, which keeps it and passes the header on.
+        """Return a picture as a packet.
 
-        The picture is the output of the renderer on the host, shape [H, W] or [H, W, C].
+        Args:
+            picture: The output of the renderer, or what `make_process` makes of it, on the host, shape [H, W]
+                or [H, W, C]; the packet keeps it.
+            header: `stamp_ns`, `sequence` and `sensor`, which the packet passes on.
         """
         raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
 
@@ -333,7 +347,7 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         return self.shutter if self.shutter.window_ns else None
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet, whose class has `data` and `encoding`."""
+        """Return a picture as a packet, whose class has `data` and `encoding`; see `PictureSensorConfig`."""
         packet: Packet = self.packet_type(data=picture, encoding=self.encoding, **header)  # type: ignore[call-arg]
         return packet
 
@@ -346,16 +360,26 @@ class FrameSensor(Protocol):
     """It has a reference, and saw every instant that was rendered since."""
 
     def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
-        """Launch what it makes of the frames of a batch, device array, shape [>= K, H, W]."""
+        """Launch what it makes of the frames of a batch.
+
+        Args:
+            frames: Log radiance, device array of float32, shape [>= K, H, W]; stays as it is until the batch
+                has been read.
+            stamps_ns: Times of the first K frames [ns], increasing.
+        """
 
     def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
-        """Wait for the oldest batch; return what gives the packets that end in it, at most at a stamp.
+        """Wait for the oldest batch; return the function that returns the packets that end in it.
 
-        It is called next, or after the `see` of one more batch.
+        That function is called next, or after the `see` of one more batch.
+
+        Args:
+            stamps_ns: Times of the frames of the batch [ns].
+            until_ns: Packets that end later are not returned [ns].
         """
 
     def flush(self, *, until_ns: int) -> list[Packet]:
-        """Return the packet that has begun and not ended."""
+        """Return the packet that has begun and not ended, cut at a stamp [ns]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -407,12 +431,19 @@ class WorldFrameSensor(Protocol):
     def find(self, clock_ns: Any, offsets_ns: tuple[int, ...], parity: int) -> None:
         """Look at the frames of a step; launches only, on CUDA.
 
-        `clock_ns` is the time of each world at the begin of the step [ns], int64, shape [N]; `offsets_ns`
-        lead from there to the last frame seen before (<= 0), and to each frame [ns].
+        Args:
+            clock_ns: Time of each world at the beginning of the step [ns], int64, shape [N].
+            offsets_ns: From there to the last frame seen before (<= 0), and to each frame [ns].
+            parity: Which of the two states is the present one, 0 or 1.
         """
 
     def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
-        """Draw what stays in the pixels of some worlds (None: of all) anew; waits for the device."""
+        """Draw what stays in the pixels of some worlds anew; waits for the device.
+
+        Args:
+            seeds: Seed of each world, of all N.
+            worlds: Indices of the worlds whose pixels are drawn; None: all.
+        """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -440,7 +471,11 @@ class FrameSensorConfig(CameraConfig):
         raise NotImplementedError(f"{type(self).__name__} must say how it is made")
 
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
-        """Return for how many results of each world there is room in a step, as asked or as the sensor likes.
+        """Return for how many results of each world there is room in a step.
+
+        Args:
+            world_count: Number of worlds N.
+            event_capacity: What the user asks for; None: as the sensor likes.
 
         Raises:
             ValueError: They are more than can be counted.

@@ -102,8 +102,14 @@ class DisplacementRule:
     ) -> None:
         """Allocate the buffers.
 
-        `rate` is the clock whose ticks are chosen from; `motions` of the bodies are a device array of
-        `scene.bodies.Motion`, by default as the scene has them.
+        Args:
+            arrays: The scene on a device.
+            lens: Lens of the camera.
+            max_displacement_px: How far a point may move between two renders [px].
+            rate: The clock whose ticks are chosen from.
+            p_BC: Position of the camera on the body [m].
+            q_BC: Orientation of the camera's optical frame against the body, xyzw.
+            motions: Of the bodies, device array of `scene.bodies.Motion`; None: as the scene has them.
         """
         self.coarse_count = 0
         self._limit_px = max_displacement_px
@@ -168,16 +174,15 @@ class DisplacementRule:
         self._started = False
 
     def choose(
-        self,
-        states: Any,
-        slots: Sequence[int],
-        stamps_ns: Sequence[int],
-        forced: Sequence[bool],
+        self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int], forced: Sequence[bool]
     ) -> list[int]:
         """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
 
-        Slots are of `states` (`Trace.states`) and of consecutive ticks of the clock, later than those of the
-        call before. Ticks that are `forced` are rendered in any case; the very first always is.
+        Args:
+            states: Where the flight is (`Trace.states`), float64, shape [slot, vehicle, >= 13].
+            slots: Slots of consecutive ticks of the clock.
+            stamps_ns: Their stamps [ns], later than those of the call before.
+            forced: Whether a tick is rendered in any case; the very first always is.
         """
         self.coarse_count = 0
         chosen: list[int] = []

@@ -63,7 +63,16 @@ class Labeller(Protocol):
     """Is told of events while their columns are on the device."""
 
     def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
-        """Launch what is done with them: their times, and columns and rows from a place on in an array."""
+        """Launch what is done with them.
+
+        Args:
+            count: How many events there are.
+            t: Their times [us], int64, shape [>= count].
+            x: Their columns [px], uint16, from `first_x` on.
+            y: Their rows [px], uint16, from `first_y` on.
+            first_x: Where the columns begin in `x`.
+            first_y: Where the rows begin in `y`.
+        """
 
 
 class EventKeys:

@@ -76,11 +76,7 @@ def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction:
 
 @wp.func
 def reach_down(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
+    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.float32:
     """Return the largest sample that reaches the level below."""
     level = level_at(base, up, down + 1, threshold_on, threshold_off)
@@ -89,11 +85,7 @@ def reach_down(
 
 @wp.func
 def reach_up(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
+    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.float32:
     """Return the least sample that reaches the level above."""
     level = level_at(base, up + 1, down, threshold_on, threshold_off)
@@ -102,11 +94,7 @@ def reach_up(
 
 @wp.func
 def quiet_range(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
+    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.vec2:
     """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
     return wp.vec2(
@@ -117,11 +105,7 @@ def quiet_range(
 
 @wp.func
 def key_after(
-    elapsed_ns: wp.float64,
-    start_ns: wp.int64,
-    place: wp.int64,
-    time_shift: wp.int32,
-    polarity: wp.int32,
+    elapsed_ns: wp.float64, start_ns: wp.int64, place: wp.int64, time_shift: wp.int32, polarity: wp.int32
 ) -> wp.int64:
     """Return the key of an event some time, rounded to 2^-10 ns, after a stamp."""
     ticks = wp.int64(wp.rint(elapsed_ns * _TICKS_PER_NS))
@@ -220,10 +204,6 @@ def key_of_level(
     """Return the key of one of the events between two samples, from `up` and `down` at the first of them."""
     polarity = wp.where(sample > last, 1, 0)
     level = level_at(
-        base,
-        up + (event + 1) * polarity,
-        down + (event + 1) * (1 - polarity),
-        threshold_on,
-        threshold_off,
+        base, up + (event + 1) * polarity, down + (event + 1) * (1 - polarity), threshold_on, threshold_off
     )
     return _key(level, wp.float64(last), wp.float64(sample), start_ns, end_ns, place, time_shift, polarity)

@@ -279,9 +279,20 @@ def _read_rows(
 
 
 class Readout:
-    """The arbiter of one event camera and the events that wait for it, `waiting_count` now.
+    """The arbiter of one event camera and the events that wait for it.
 
-    `pixel_shift`: bits of a key below its column, without what is not of the place of the pixel.
+    Args:
+        config: Its parameters.
+        height: Rows of the sensor [px].
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        pixel_shift: Bits of a key below its column, without what is not of the place of the pixel.
+        device: Where the keys are.
+        seed: Seed of the run, for late stamps.
+        sensor: Name of the camera, likewise.
+
+    Attributes:
+        waiting_count: Events that wait now.
     """
 
     def __init__(
@@ -356,9 +367,14 @@ class Readout:
     ) -> int:
         """Replace the keys of events that have happened by those of events that are read; return how many.
 
-        All events until `now_ns` have happened: `count` keys from `first` on, in any order; room for
-        `waiting_count` more is needed there. `spare` and, on CUDA, `order` are overwritten; they have room
-        for `count` keys, on CUDA for twice as many.
+        Args:
+            keys: Overwritten from `first` on; there has to be room for `count` + `waiting_count` keys.
+            first: Where the keys begin of events that have happened since the last call, in any order.
+            count: How many there are.
+            spare: Overwritten; has room for `count` keys, on CUDA for twice as many.
+            order: On CUDA overwritten, with room for twice `count`.
+            origin_us: Origin of the time of keys [us].
+            now_ns: All events until then have happened [ns].
         """
         wp.launch(
             _by_nanosecond,

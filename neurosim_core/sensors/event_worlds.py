@@ -73,8 +73,16 @@ class WorldEventCamera:
     with more than `capacity` events each of its K renders keeps `capacity / K` at most, the rows from the top
     that fit, and the others are counted in `dropped`.
 
-    Frames are log radiance of all worlds, float32, shape [world, K, pixel], read at each scan. Without
-    `takes_apart` there is no room for `results`: somebody else reads the keys.
+    Args:
+        configs: The pixels of each world.
+        width: Width of the sensor [px].
+        height: Height of the sensor [px].
+        frames: Log radiance of all worlds, float32, shape [world, K, pixel]; read at each scan.
+        capacity: Room for events of one world in one step.
+        sensor: Name of the sensor: noise depends on it.
+        seeds: Seed of each world.
+        ordered: Sort the events of each world.
+        takes_apart: Have room for `results`; False: somebody else reads the keys.
     """
 
     def __init__(

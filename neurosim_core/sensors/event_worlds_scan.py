@@ -220,8 +220,7 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
     scan_noisy = make_pixel_scan(terms)
 
     @wp.kernel(
-        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"),
-        enable_backward=False,
+        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"), enable_backward=False
     )
     def scan(
         # Model:

@@ -78,7 +78,13 @@ class Errors:
 
 
 def make_errors(config: ErrorConfig, *, rate_hz: float, name: str) -> Errors:
-    """Return errors as kernels read them; `name` is that of the sensor and of what is measured."""
+    """Return errors as kernels read them.
+
+    Args:
+        config: The errors, in the unit of what is measured.
+        rate_hz: Samples a second [Hz].
+        name: Names the random numbers, such as "SENSOR/velocity": two with one name have the same.
+    """
     errors = Errors()
     errors.white = wp.vec3d(*axes(config.white))
     errors.walk = wp.vec3d(*(value / math.sqrt(rate_hz) for value in axes(config.walk)))
@@ -270,10 +276,18 @@ class StateSampler(Sampler):
     ) -> None:
         """Allocate what it needs.
 
-        `packet` makes a packet of header and rows: its class, if its fields are named as the `outputs`, an
-        array of shape [slot, world] each, or of more axes, (type, length, ...); if they `are_stacked`, the
-        kernel writes one array [output, slot, world]. `group_count`: groups of errors of three axes. `late`:
-        before the first sample the state was that of it.
+        Args:
+            context: What it is made for.
+            kernel: See above.
+            inputs: First parameters of the kernel.
+            packet: Returns the packet of a sample, from its rows by name and the header; the class of the
+                packet, if its fields are named as the `outputs`.
+            outputs: Warp types of what it measures, by name: an array of shape [slot, world] each; (type, n,
+                ...) is one of shape [slot, world, n, ...].
+            are_stacked: The kernel writes one array, shape [output, slot, world], in place of one for each.
+            terms: Names of what is computed; with any there is a memory for errors.
+            group_count: How many groups of errors there are, of three axes each.
+            late: Delay and dropouts; before the first sample the state was that of it.
         """
         vehicle = context.vehicle
         self.terms, self._packet = terms, packet
@@ -355,9 +369,16 @@ def make_reader(
 ) -> StateSampler:
     """Return a sensor at work that reads something of each vehicle, to which errors are added.
 
-    `read` is a Warp function of the model, `Motion`, the world and the number of an output, that returns a
-    vec3d, of which only the first number counts if it `is_scalar` (float64). `errors` names its outputs. The
-    others are those of `StateSampler`.
+    Args:
+        context: What it is made for.
+        read: A Warp function of the model, `Motion`, the world and the number of an output; it returns a
+            vec3d.
+        model: What it reads besides, of the Warp type of its first parameter.
+        errors: Names of its outputs, in the order of their numbers, and the errors of each.
+        packet: Returns the packet of a sample; see `StateSampler`.
+        rate_hz: Samples a second [Hz].
+        is_scalar: An output is only the first number of what is read, float64, in place of vec3d.
+        late: Delay and dropouts; see `StateSampler`.
     """
     made = [
         make_errors(each, rate_hz=rate_hz, name=f"{context.name}/{name}") for name, each in errors.items()

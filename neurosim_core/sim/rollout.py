@@ -108,9 +108,19 @@ def begin_step(
 ) -> PendingStep:
     """Begin a control period like `step`, without waiting for a CUDA device.
 
+    Args:
+        model: What does not change.
+        state: Has to go to `end_step` before anything else is done to it.
+        command: As of `step`.
+        mode: As of `step`.
+
     Returns:
-        What `end_step` needs, which has to come before anything else is done to the state. Arguments and
-        errors are those of `step`.
+        What `end_step` needs.
+
+    Raises:
+        RuntimeError: A period is pending, or `run_model` was broken off.
+        ValueError: The command is of a wrong shape or not finite.
+        DynamicsError: The integration has failed before.
     """
     if state.failure is not None:
         raise state.failure
@@ -144,7 +154,13 @@ def settle(state: State) -> None:
 
 
 def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
-    """Wait for a control period that was pending, and return what `step` returns."""
+    """Wait for a control period that is pending, and return what `step` returns.
+
+    Args:
+        model: What does not change.
+        state: Moved on by the period.
+        pending: What `begin_step` returned.
+    """
     packets = pending.packets + read(model, state, last=state.launched_ns >= pending.end_ns)
     while state.launched_ns < pending.end_ns and not (state.ended or state.failure is not None):
         part_ns = batch_end_ns(model.schedule, state.launched_ns, pending.end_ns)
@@ -215,9 +231,12 @@ def render_backlog_left(state: State) -> int:
 
 
 def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
-    """Render the oldest batch that was flown and not looked at; return its packets in the order of time.
+    """Render a batch of `integrate_period`; return the packets of its cameras in the order of time.
 
-    Only what belongs to the cameras changes in the state, so that another thread may fly on.
+    Args:
+        model: What does not change.
+        state: Only what belongs to the cameras changes, so that another thread may fly on.
+        batch: The oldest that neither `render_batch` nor `skip_batch` has had.
     """
     launch_cameras(model, state, batch)
     packets = read_cameras(state, batch, borrow=state.borrow_pictures)
@@ -226,13 +245,13 @@ def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
 
 
 def skip_batch(model: Model, state: State, batch: Batch) -> int:
-    """Render nothing of a batch, in place of `render_batch`.
+    """Render nothing of a batch, in place of `render_batch`; arguments are the same.
 
     The sequence of each image camera shows the gap; for an event camera log radiance is linear in time over
     the gap, and a window of events that should have ended there is as much longer.
 
     Returns:
-        How many instants of casts were left out.
+        How many instants were not rendered.
     """
     count = 0
     for index, group in enumerate(state.groups):
@@ -301,13 +320,20 @@ def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
 
 
 def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> None:
-    """Launch one batch, as `advance` flies it, without waiting for a CUDA device."""
+    """Launch one batch, as `advance` flies it, without waiting for a CUDA device.
+
+    Args:
+        model: What does not change.
+        state: Has room for one more batch in flight.
+        end_ns: End of the batch [ns], after what was launched before.
+        closed_loop: The path controller commands; otherwise the last command is held.
+    """
     stretch = boundaries(model.schedule, state.launched_ns, end_ns)
     launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
 
 
 def finish(state: State) -> list[Packet]:
-    """Return the packets whose windows have pending and not ended; for the end of a run."""
+    """Return the packets whose windows have begun and not ended; for the end of a run."""
     return [packet for group in state.groups for packet in flush_frames(group, until_ns=state.stamp_ns)]
 
 

@@ -6,20 +6,17 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from live_rig import IMU, LiveRig, make_config
 from processes import SOON_S, wait_for
 from recording_backend import RecordingBackend
 from runtime_directory import own_directory
-from scipy.spatial.transform import Rotation
 
 from cortex import Node
 from cortex import messages as msg
 from cortex_ros2_bridge.bridge import Bridge
 from cortex_ros2_bridge.config import load
-from cortex_ros2_bridge.frames import quaternion_of, roll_pitch_yaw
 from cortex_ros2_bridge.msgs import message_class
 
 UNSUPPORTED, OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
@@ -219,10 +216,3 @@ def test_parameters_of_the_simulator_are_set(world: Any) -> None:
     assert "is neither a bool" in results[2].reason
     assert world.rig.simulator.config.live.real_time_factor == 0.5
     world.call("set_parameters", parameters=[make(name=factor.name, value=value(type=3, double_value=1.0))])
-
-
-@pytest.mark.parametrize("angles", [(0.3, -0.7, 2.5), (-2.0, 1.2, -0.4), (0.0, 0.0, 3.0)])
-def test_angles_and_quaternions_are_those_of_scipy(angles: tuple[float, float, float]) -> None:
-    q = quaternion_of(*angles)
-    assert np.allclose(q, Rotation.from_euler("xyz", angles).as_quat(canonical=False), atol=1e-15)
-    assert roll_pitch_yaw(q) == pytest.approx(angles)

@@ -1,4 +1,4 @@
-"""Shards of WebDataset and data sets of tonic: the same windows as those of the recording."""
+"""Shards of WebDataset: the same windows as those of the recording; and tonic, which takes windows."""
 
 from __future__ import annotations
 
@@ -105,33 +105,15 @@ def test_what_is_wrong_with_shards(flights, tmp_path):
         damaged[3]
 
 
-def test_a_data_set_as_tonic_has_it(flights):
-    windows = data.Dataset(flights)
-    pairs = data.TonicDataset(flights, target=("depth", "pose"))
-    assert pairs.sensor_size == (WIDTH, HEIGHT, 2)
-    assert len(pairs) == len(windows)
-    for sample, (events, (depth, pose)) in zip(windows, pairs, strict=True):
-        assert events.dtype.names == pairs.ordering == ("x", "y", "t", "p")
-        assert np.array_equal(events["t"], sample.events.t)
-        assert np.array_equal(events["x"], sample.events.x)
-        assert np.array_equal(events["y"], sample.events.y)
-        assert np.array_equal(events["p"], sample.events.polarity)
-        assert np.array_equal(depth, sample.depth)
-        assert np.array_equal(pose, sample.pose)
-    counted = data.TonicDataset(flights, transform=len, target_transform=np.min)
-    assert counted[3] == (len(windows[3].events.t), windows[3].depth.min())
-    swapped = data.TonicDataset(flights, transforms=lambda events, target: (target, events))
-    assert swapped[0][0].shape == (HEIGHT, WIDTH)
-    with pytest.raises(ValueError, match="instead of transform"):
-        data.TonicDataset(flights, transform=len, transforms=lambda events, target: (events, target))
-
-
 FRAME_OF_TONIC = """
 import json, sys
+import numpy as np
 from tonic import transforms
 from neurosim_core import data
-pairs = data.TonicDataset(sys.argv[1])
-print(json.dumps(transforms.ToImage(pairs.sensor_size)(pairs[0][0]).tolist()))
+sample = data.Dataset(sys.argv[1])[0]
+t, x, y, polarity = sample.events
+events = np.rec.fromarrays([x, y, t, polarity], names="x,y,t,p")
+print(json.dumps(transforms.ToImage((sample.width, sample.height, 2))(events).tolist()))
 """
 
 
