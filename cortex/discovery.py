@@ -98,10 +98,10 @@ class Directory:
         self._quiet_ns = 0
         """Until when an `Alive` is no reason for a further `Hello`."""
         self._epoch = self._version = 0
-        self._missing: dict[int, int] = {}
-        """Revisions that `Welcome` named and that have not arrived yet, by node."""
-        self._doubted: dict[int, int] = {}
-        """When to drop a node that the registry did not name in its last `Welcome` [ns]."""
+        self._named: dict[int, int] = {}
+        """Revisions of the other nodes that the registry has told of."""
+        self._doubt_until_ns = 0
+        """When to drop the nodes that it has not told of."""
         self._address = f"ipc://{runtime_dir(domain) / REGISTRY_SOCKET}" if registry == "auto" else registry
         if registry != "off":
             self._connect(self._address)
@@ -130,7 +130,13 @@ class Directory:
     @property
     def connected(self) -> bool:
         """Whether the registry has told of all nodes; without one there is nothing to wait for."""
-        return self.socket is None or (self._welcomed and not self._missing)
+        return self.socket is None or (self._welcomed and self._is_complete())
+
+    def _is_complete(self) -> bool:
+        known = self.nodes
+        return all(
+            node in known and known[node].revision == named for node, named in list(self._named.items())
+        )
 
     def announce(self) -> None:
         """Say that this node's record has changed; the next `tick` sends it. Any thread may call this."""
@@ -261,8 +267,7 @@ class Directory:
             self._on_alive(message, now_ns)
         elif isinstance(message, records.Gone):
             self._count(message.version)
-            self._missing.pop(message.node, None)
-            self._doubted.pop(message.node, None)
+            self._named.pop(message.node, None)
             self._drop(message.node)
         else:
             self._on_changed(message)
@@ -290,23 +295,15 @@ class Directory:
         self._epoch, self._version = welcome.epoch, welcome.version
         named = dict(zip(welcome.nodes, welcome.revisions, strict=True))
         named.pop(self._own.node, None)
-        self._missing = {
-            node: revision
-            for node, revision in named.items()
-            if node not in self.nodes or self.nodes[node].revision != revision
-        }
-        # A registry that was just started does not know everybody yet: one lease of grace.
-        since = {
-            node: self._doubted.get(node, now_ns + control.LEASE_NS)
-            for node in self.nodes
-            if node not in named
-        }
-        self._doubted = since
+        self._named = named
+        self._doubt_until_ns = (
+            now_ns + control.LEASE_NS
+        )  # one that was just started does not know everybody yet
 
     def _on_alive(self, alive: records.Alive, now_ns: int) -> None:
         if not self._welcomed or now_ns < self._quiet_ns:
             return  # the answer to our last `Hello` is on its way and says more
-        if alive.epoch != self._epoch or alive.version != self._version or self._missing:
+        if alive.epoch != self._epoch or alive.version != self._version or not self._is_complete():
             self._say_hello(now_ns, snapshot=True)
         elif alive.held != self._own.revision:
             self._say_hello(now_ns, snapshot=False)
@@ -315,10 +312,11 @@ class Directory:
         record = changed.record
         records.check_record(record)
         self._count(changed.version)
-        self._missing.pop(record.node, None)
-        self._doubted.pop(record.node, None)
+        if record.node == self._own.node:
+            return
+        self._named[record.node] = record.revision
         known = self.nodes.get(record.node)
-        if record.node != self._own.node and (known is None or known.revision != record.revision):
+        if known is None or known.revision != record.revision:
             self.nodes = {**self.nodes, record.node: record}
             self._changed.add(record.node)
 
@@ -328,12 +326,11 @@ class Directory:
         """If this process was stopped, the others' silence is ours: their leases start where they stood."""
         if stall_ns > control.STALL_NS:
             self._heard_ns += stall_ns
-            self._doubted = {node: at_ns + stall_ns for node, at_ns in self._doubted.items()}
+            self._doubt_until_ns += stall_ns
 
     def _expire(self, now_ns: int) -> None:
-        if self._welcomed:  # without a registry nobody is removed
-            for node in [node for node, at_ns in self._doubted.items() if now_ns > at_ns]:
-                self._doubted.pop(node)
+        if self._welcomed and now_ns > self._doubt_until_ns:  # without a registry nobody is removed
+            for node in self.nodes.keys() - self._named.keys():
                 self._drop(node)
 
     def _drop(self, node: int) -> None:

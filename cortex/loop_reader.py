@@ -31,32 +31,20 @@ class LoopReader:
         self._subscriber = subscriber
         self._is_watching = False
         self._waiters: set[asyncio.Future[None]] = set()
-        self._timer: asyncio.TimerHandle | None = None
 
     async def wait(self, timeout_s: float) -> None:
         """Return when something may have come, at the latest after the time."""
         if not self._is_watching:
             self.loop.add_reader(self._subscriber.fd, self._wake)
             self._is_watching = True
-        self._set_timer(self.loop.time() + timeout_s)
         waiter: asyncio.Future[None] = self.loop.create_future()
         self._waiters.add(waiter)
+        timer = self.loop.call_later(timeout_s, self._wake_all)
         try:
             await waiter
         finally:
+            timer.cancel()
             self._waiters.discard(waiter)
-
-    def _set_timer(self, when_s: float) -> None:
-        """Wake all at that time or earlier: one timer serves a stream that waits thousands of times."""
-        if self._timer is not None:
-            if self._timer.when() <= when_s:
-                return
-            self._timer.cancel()
-        self._timer = self.loop.call_at(when_s, self._on_time)
-
-    def _on_time(self) -> None:
-        self._timer = None
-        self._wake_all()
 
     def _wake(self) -> None:
         self._subscriber.wakeup.clear()
@@ -80,9 +68,6 @@ class LoopReader:
 
         def leave() -> None:
             self._forget()
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None  # a task that goes on to wait needs another
             self._wake_all()
 
         if not self.loop.is_closed():
@@ -110,12 +95,8 @@ class AsyncReceiver(AsyncIterator[T]):
 
     async def receive(self, timeout_s: float | None) -> T:
         """Take the next message, or raise TimeoutError."""
-        self._fast_receive.left -= 1
-        if self._fast_receive.left >= 0 and monotonic_ns() < self._fast_receive.until_ns:
-            message: T = self._take()
-            if message is not NOTHING:
-                return message
-        return await self._wait(timeout_s, look=True)
+        message: T = self._fast_receive.soon()
+        return message if message is not NOTHING else await self._wait(timeout_s, look=True)
 
     async def _wait(self, timeout_s: float | None, *, look: bool) -> T:
         """Take the next message as soon as it is there; without a `look` now if there was one in vain."""

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 from cortex.callbacks import CallbackThread, check_callable
 from cortex.clock import Clock, wall_offset_ns
-from cortex.codec import RawCodec, RawMessage, codec_of
+from cortex.codec import Codec, RawCodec, RawMessage, codec_of
 from cortex.context import LINGER_MS, Closed, Closing, context
 from cortex.control_thread import ControlThread, ask_stats
 from cortex.discovery import Directory
@@ -154,30 +154,18 @@ class Node(Closing):
         if not 0.0 <= max_wait_s <= 86_400.0:
             raise ValueError(f"max_wait_s must be 0 to 86400, got {max_wait_s}")
         return self._add_publisher(
-            Publisher(
-                check_topic(topic),
-                codec_of(message_type),
-                self._pub_sockets,
-                latch=latch,
-                inline_max=inline_max,
-                expected_bytes=expected_bytes,
-                max_wait_s=max_wait_s,
-                on_close=self._drop_publisher,
-            )
+            topic,
+            codec_of(message_type),
+            latch=latch,
+            inline_max=inline_max,
+            expected_bytes=expected_bytes,
+            max_wait_s=max_wait_s,
         )
 
     def raw_publisher(self, topic: str, schema: Schema, *, latch: bool = False) -> Publisher[RawMessage]:
         """Publish bodies that are encoded already; their type is known by its schema only."""
         self._check_open()
-        return self._add_publisher(
-            Publisher(
-                check_topic(topic),
-                cast(Any, RawCodec(schema)),
-                self._pub_sockets,
-                latch=latch,
-                on_close=self._drop_publisher,
-            )
-        )
+        return self._add_publisher(topic, cast(Any, RawCodec(schema)), latch=latch)
 
     def subscriber(
         self,
@@ -366,7 +354,11 @@ class Node(Closing):
         if self._closed:
             raise Closed(f"node {self.name!r} is closed")
 
-    def _add_publisher(self, publisher: Publisher[T]) -> Publisher[T]:
+    def _add_publisher(self, topic: str, codec: Codec, **options: Any) -> Publisher[Any]:
+        check_topic(topic)
+        publisher: Publisher[Any] = Publisher(
+            topic, codec, self._pub_sockets, on_close=self._drop_publisher, **options
+        )
         with self._lock:
             self._publishers.append(publisher)
             self._match_all(publisher.topic)
@@ -456,7 +448,7 @@ class Node(Closing):
             self.id,
             [publisher.stats() for publisher in publishers],
             [subscriber.stats() for subscriber in subscribers],
-            self.rejected + self._directory.rejected + self._server.rejected,
+            self.rejected + self._directory.rejected,
         )
 
 

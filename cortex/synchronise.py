@@ -32,12 +32,16 @@ class _Follower:
         self.subscriber = node.subscriber(topic, type_, policy=reliable(_DEPTH))
         self._period_ns = NS_PER_S / Fraction(str(rate_hz))
         self._waiting: deque[Any] = deque()
-        self._newest_ns = 0
+        self._begin_ns = self._newest_ns = 0
+
+    def begin(self, stamp_ns: int) -> None:
+        """Neither wait for messages up to a stamp nor return them: they may have come before this reader."""
+        self._begin_ns = self._newest_ns = stamp_ns
 
     def forget(self) -> None:
         """Drop what has come: time has begun again."""
         self._waiting.clear()
-        self._newest_ns = 0
+        self.begin(0)
         try:
             while True:
                 self.subscriber.recv(0.0)
@@ -52,7 +56,7 @@ class _Follower:
         found = []
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             found.append(self._waiting.popleft())
-        return [message for message in found if message.stamp_ns > 0]
+        return [message for message in found if message.stamp_ns > self._begin_ns]
 
     def _take(self, stamp_ns: int, due_ns: int, timeout_s: float) -> None:
         try:
@@ -89,8 +93,9 @@ def synchronised(
 
     These are all messages after the stamp before and up to this one. One that is due by then and has not come
     is waited for, so the result does not depend on who was faster: a controller in lockstep that acts on what
-    it is given here flies the same flight to the last bit. Messages of stamp 0 are left out, as some sensors
-    have none. A leader that is sent again, as to a controller that has just come, is yielded again
+    it is given here flies the same flight to the last bit. The first leader comes
+    with nothing: what belongs to it may have been sent before this node came, and some sensors have no
+    message of stamp 0. A leader that is sent again, as to a controller that has just come, is yielded again
     with nothing new. Where time begins again, so do all topics.
 
     Args:
@@ -123,6 +128,8 @@ def _messages(
     subscriber: Any, message: Any, others: dict[str, _Follower], timeout_s: float
 ) -> Iterator[tuple[Any, dict[str, list[Any]]]]:
     last_ns = -1
+    for other in others.values():
+        other.begin(message.stamp_ns)
     while True:
         if message.stamp_ns < last_ns:
             for other in others.values():

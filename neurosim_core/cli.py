@@ -23,6 +23,7 @@ from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
 from neurosim_core.fit import command as fit
+from neurosim_core.garbage import no_collection
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once, raise_at_signals
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_command(argv: Sequence[str] | None) -> int:
-    gc.set_threshold(100_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
+    gc.set_threshold(200_000, 10, 10)  # what imports make stays: to look after every 700 objects takes 0.4 s
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     if not faulthandler.is_enabled():
         with contextlib.suppress(ValueError, OSError, RuntimeError):  # standard error may be no file
@@ -304,6 +305,7 @@ def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[Simul
         from rich.console import Console
 
         with (
+            no_collection(),
             Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
             ThreadPoolExecutor(max_workers=1) as aside,
         ):

@@ -21,8 +21,6 @@ from cortex.bench.processes import Child
 from cortex.bench.report import print_case, print_header, write_csv
 from cortex.places import NETWORK_VARIABLES
 
-_QUICK_SECONDS = 0.05
-_QUICK_REPEATS = 2
 _REGISTRY_START_S = 10.0
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
@@ -38,7 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
     against = "measure Cortex of this checkout (built) beside ours"
     add("--against", type=Path, metavar="CHECKOUT", help=against)
-    add("--quick", action="store_true", help="tiny runs: shows that it works, measures nothing")
     add("--csv", type=Path, metavar="FILE", help="write every figure there, too")
     options = parser.parse_args(arguments)
     try:
@@ -59,8 +56,6 @@ def _run(options: argparse.Namespace) -> dict[str, Results]:
     if repeats < 1 or not 0.0 < seconds <= 600.0:  # also refuses nan
         raise ValueError(f"wants repeats >= 1 and 0 < seconds <= 600, got {repeats}, {seconds}")
     settings = Settings(repeats, seconds)
-    if options.quick:
-        settings = Settings(min(repeats, _QUICK_REPEATS), min(seconds, _QUICK_SECONDS))
     results: dict[str, Results] = {}
     with ExitStack() as stack:
         _make_place(stack, options.against)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import sys
 import threading
@@ -19,6 +18,7 @@ from rich.table import Table
 from cortex import Node
 from cortex.messages import SimulatorStatus
 from neurosim_core.config import SimulationConfig
+from neurosim_core.garbage import no_collection
 from neurosim_core.live.call import describe_status
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import SIMULATION, command_topic
@@ -61,7 +61,7 @@ def serve(
     stop = threading.Event()
     with Node("simulator") as node:
         require_single_instance(node)
-        with console.status("preparing") as preparing:
+        with no_collection(), console.status("preparing") as preparing:
 
             def show(phase: str) -> None:
                 preparing.update(f"preparing: {phase}")
@@ -76,8 +76,6 @@ def serve(
                 on_phase=show,
                 reader=reader,
             )
-        gc.collect()
-        gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second
         sys.setswitchinterval(_SWITCH_S)
         with stop_at_signals(stop, on_stop=node.stop_waiting), simulator:
             print_plan(console, simulator.vehicles, config)

@@ -320,6 +320,14 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     Raises:
         ValueError: The seed of the configuration is not in free space, or the scene has none.
     """
+    return choose_seed(map_distances(scene, config, device), scene, config)
+
+
+def map_distances(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") -> FreeSpace:
+    """Map the distances to a scene, the first half of `make_free_space`; `choose_seed` is the other one.
+
+    Nearly all of it is outside Python's interpreter lock, and SciPy is not imported.
+    """
     bounds = scene.bounds_m
     notes: list[str] = []
     voxel = config.voxel_m
@@ -343,24 +351,28 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     arrays.distance = distance
     arrays.origin = wp.vec3(*origin.tolist())
     arrays.voxel = wp.float32(voxel)
-    known = _Seed(np.array(config.seed_m), "seed_m of the configuration") if config.seed_m else None
-    if known is None and scene.inside_m is not None:
-        known = _Seed(np.array(scene.inside_m), "the point that the scene names as inside")
-    host = distance.numpy()
-    unseeded = FreeSpace(
-        distance=host,
+    return FreeSpace(
+        distance=distance.numpy(),
         origin_m=origin,
         voxel_m=voxel,
         bounds_m=bounds,
         seed_m=bounds.mean(axis=0),
         closed=scene.closed and config.seed_m is None,
-        notes=(),
+        notes=tuple(notes),
         arrays=arrays,
         mesh=mesh,
         device=device,
     )
+
+
+def choose_seed(unseeded: FreeSpace, scene: Scene, config: FreeSpaceConfig) -> FreeSpace:
+    """Return what `map_distances` has mapped with the seed of its free space; see `make_free_space`."""
+    bounds, notes = unseeded.bounds_m, list(unseeded.notes)
+    known = _Seed(np.array(config.seed_m), "seed_m of the configuration") if config.seed_m else None
+    if known is None and scene.inside_m is not None:
+        known = _Seed(np.array(scene.inside_m), "the point that the scene names as inside")
     seed = _find_seed(unseeded) if known is None else known
-    if known is not None and (room := float(unseeded.clearance(known.point)[0])) <= voxel:
+    if known is not None and (room := float(unseeded.clearance(known.point)[0])) <= unseeded.voxel_m:
         if config.seed_m is not None:
             raise ValueError(
                 f"seed_m must be in free space, got {config.seed_m}, where the nearest surface or bound "

@@ -18,6 +18,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
 _ALIGNMENT = 64
 
 
+class NotReadError(Exception):
+    """The process has not read the scene that is asked for; who loads it here is told what is wrong."""
+
+
 class SceneReader:
     """A process that reads a scene. A context manager, which ends it."""
 
@@ -43,8 +48,9 @@ class SceneReader:
                 working directory.
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
-        self._answers: list[list[tuple[int, int]]] = []
-        """Where the parts of each answer are in the file, and how long they are."""
+        self._answers: list[list[tuple[int, int]] | None] = []
+        """Where the parts of each answer are in the file, and how long they are; None: it gives no more."""
+        self._turn = threading.Lock()
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
         with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
             # more than arguments may hold; nothing stays in a buffer
@@ -59,37 +65,34 @@ class SceneReader:
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
-    def geometry(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
+    def geometry(self, config: SceneConfig) -> Scene:
         """Wait for the triangles; return the scene without materials, some time before `scene` has all of it.
 
-        Arguments and errors are those of `scene`.
-        """
-        return self._answer(0, config) or config.load(pictures=pictures)
-
-    def scene(self, config: SceneConfig, *, pictures: bool = True) -> Scene:
-        """Wait for the scene and return it; what the process could not read is read here.
-
-        Args:
-            config: The settings, checked.
-            pictures: See `SceneConfig.load`; they are decoded if the process could.
+        `config` has the settings, checked.
 
         Raises:
-            SceneError: A file cannot be used.
+            NotReadError: The process could not read it, or read other settings.
         """
-        return self._answer(1, config) or config.load(pictures=pictures)
+        return self._answer(0, config)
 
-    def _answer(self, number: int, config: SceneConfig) -> Scene | None:
-        """Wait for an answer of the process; None if it gives none, or read something else."""
+    def scene(self, config: SceneConfig) -> Scene:
+        """Wait for the scene and return it, with its pictures decoded; argument and errors as above."""
+        return self._answer(1, config)
+
+    def _answer(self, number: int, config: SceneConfig) -> Scene:
         assert self._process.stdout is not None
-        while len(self._answers) <= number:
-            line = self._process.stdout.readline()
-            if not line:
-                return None
-            self._answers.append(json.loads(line))
+        with self._turn:
+            while len(self._answers) <= number:
+                self._answers.append(json.loads(self._process.stdout.readline() or "null"))
+        places = self._answers[number]
+        if places is None:
+            raise NotReadError
         data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
-        body, *buffers = (data[at : at + size] for at, size in self._answers[number])
+        body, *buffers = (data[at : at + size] for at, size in places)
         read, scene = pickle.loads(body, buffers=buffers)
-        return scene if read == config else None
+        if read != config:
+            raise NotReadError
+        return scene
 
     def __enter__(self) -> SceneReader:
         return self

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections import defaultdict
@@ -19,8 +20,8 @@ from neurosim_core.config import SimulationConfig
 from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
 from neurosim_core.scene.bodies import Body, make_bodies
-from neurosim_core.scene.freespace import FreeSpace, make_free_space
-from neurosim_core.scene.reader import SceneReader
+from neurosim_core.scene.freespace import FreeSpace, choose_seed, make_free_space, map_distances
+from neurosim_core.scene.reader import NotReadError, SceneReader
 from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
@@ -121,6 +122,19 @@ def make_fleet(
 
     Arguments and errors as for `make_model`.
     """
+    if reader is not None:
+        with contextlib.suppress(NotReadError):
+            return _make_fleet(config, reader, on_phase, meanwhile)
+    return _make_fleet(config, None, on_phase, meanwhile)
+
+
+def _make_fleet(
+    config: SimulationConfig,
+    reader: SceneReader | None,
+    on_phase: Callable[[str], None] | None,
+    meanwhile: Callable[[Model, Callable[[], bool]], None] | None,
+) -> dict[str, Model]:
+    """Do what `make_fleet` does, if the reader could read the scene."""
     setup_s: dict[str, float] = defaultdict(float)
 
     def phase(name: str) -> AbstractContextManager[None]:
@@ -129,31 +143,37 @@ def make_fleet(
         return timed(setup_s, name)
 
     device = find_device(config.device)
-    with ThreadPoolExecutor(max_workers=1) as aside:
+    members = {name: config.of(name) for name in config.vehicles}
+    seeing = any(plan_render_groups(member.sensors) for member in members.values())
+    bodies = make_bodies(config.bodies) if seeing else ()
+    with ThreadPoolExecutor(max_workers=4) as aside:
         beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
-        with phase("scene"):
-            members = {name: config.of(name) for name in config.vehicles}
-            seeing = any(plan_render_groups(member.sensors) for member in members.values())
-            if reader is None:
-                scene = config.scene.load(pictures=seeing)
-            else:
-                load_scipy()  # while the other process reads
-                scene = reader.geometry(config.scene, pictures=seeing)
-            bodies = make_bodies(config.bodies) if seeing else ()
-        beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
+        if reader is None:
+            reading = aside.submit(config.scene.load, pictures=seeing)
+        else:
+            reading = aside.submit(reader.geometry, config.scene)
 
-        def light() -> tuple[Scene, Any]:
-            """Return the scene with all that is seen, here and on the device; needs no path: both at once."""
-            whole = scene if reader is None else reader.scene(config.scene, pictures=seeing)
+        def map_scene() -> FreeSpace:
+            geometry = reading.result()
+            beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
+            return map_distances(geometry, config.free_space, device)
+
+        def light_scene() -> tuple[Scene, Any]:
+            whole = reading.result() if reader is None else reader.scene(config.scene)
             if not seeing:
                 return whole, None
+            beginning.result()
             return whole, upload_scene(
                 whole, config.render, device=device, renderer=config.renderer, bodies=bodies
             )
 
-        lit = aside.submit(light)
+        with phase("scene"):
+            mapping, lighting = aside.submit(map_scene), aside.submit(light_scene)
+            if reader is not None:
+                load_scipy()  # while the other process reads, and distances are mapped
+            scene = reading.result()
         with phase("free space"):
-            free_space = make_free_space(scene, config.free_space, device=device)
+            free_space = choose_seed(mapping.result(), scene, config.free_space)
         with phase("path"):
             paths = {name: plan_path(member, free_space) for name, member in members.items()}
 
@@ -166,8 +186,8 @@ def make_fleet(
             if meanwhile is not None and seeing:
                 name, first = next(iter(members.items()))
                 blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
-                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None), lit.done)
-            scene, scene_on_device = lit.result()
+                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None), lighting.done)
+            scene, scene_on_device = lighting.result()
     return {name: model_of(name, config, scene_on_device) for name, config in members.items()}
 
 

@@ -95,7 +95,7 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 def load_scipy() -> None:
     """Import what free space, paths and light take from SciPy, so that it is there when they need it."""
-    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.sparse.csgraph, scipy.spatial
+    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:

@@ -103,6 +103,12 @@ def test_time_that_begins_again_begins_again_for_all(make_node):
     assert rows == [(0, []), (10 * MS, [10 * MS]), (0, []), (5 * MS, []), (10 * MS, [10 * MS])]
 
 
+def test_a_reader_that_comes_late_waits_for_nothing_of_before(make_node):
+    """As a controller that is started again in lockstep: the reading of its first tick is not sent twice."""
+    publish(make_node("publisher"), [("tick", 20 * MS)])
+    assert collect(make_node("reader"), 1, 100.0, timeout_s=2.0) == [(20 * MS, [])]
+
+
 def test_a_leader_of_another_type_is_a_mismatch(make_node):
     publisher = make_node("publisher").publisher("/ticks", Reading, latch=True)
     publisher.publish(Reading(stamp_ns=0, value=0.0))

@@ -19,16 +19,25 @@ from small_room import room_scene
 
 import neurosim_core as ns
 from neurosim_core.render.refine import refine
+from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.hall import HallConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
-from neurosim_core.scene.reader import SceneReader
+from neurosim_core.scene.reader import NotReadError, SceneReader
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.source import SceneError
+from neurosim_core.sim import make_model
 
 
 def arrays_of(scene: Scene) -> dict[str, Any]:
     found = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
     return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+
+def settings_in(config: SceneConfig, **sensors: Any) -> ns.SimulationConfig:
+    """Hover in a scene."""
+    scene = config.model_dump(mode="json")
+    sensors["imu"] = {"kind": "imu"}
+    return ns.load_config({"scene": scene, "path": {"kind": "hover"}, "sensors": sensors, "device": "cpu"})
 
 
 def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
@@ -74,8 +83,10 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
 def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
     with SceneReader({"scene": settings}) as reader:
-        assert reader.geometry(config).name == "room"
-        assert reader.scene(config).name == "room"
+        for read in (reader.geometry, reader.scene):
+            with pytest.raises(NotReadError):
+                read(config)
+        assert make_model(settings_in(config), reader=reader).scene.name == "room"
 
 
 def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
@@ -83,7 +94,7 @@ def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
         SceneReader({"scene": {"file": "no.glb"}}) as reader,
         pytest.raises(SceneError, match=r"no\.glb: no such file"),
     ):
-        reader.scene(MeshSceneConfig(file=Path("no.glb")))
+        make_model(settings_in(MeshSceneConfig(file=Path("no.glb"))), reader=reader)
 
 
 def test_modules_of_the_working_directory_are_left_alone(tmp_path, monkeypatch):
@@ -133,9 +144,10 @@ def test_a_picture_that_cannot_be_decoded_counts_where_somebody_looks(tmp_path):
     (tmp_path / "box.glb").write_bytes(box.export(file_type="glb").replace(b"\x89PNG", b"none"))
     config = MeshSceneConfig(file=tmp_path / "box.glb")
     with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
-        assert len(reader.scene(config, pictures=False).faces) == 12
+        assert len(make_model(settings_in(config), reader=reader).scene.faces) == 12
+        camera = {"kind": "rgb", "lens": {"width": 8, "height": 8, "horizontal_fov_rad": 1.0}}
         with pytest.raises(SceneError, match="cannot be decoded"):
-            reader.scene(config)
+            make_model(settings_in(config, camera=camera), reader=reader)
 
 
 def test_settings_of_a_scene_may_be_long(monkeypatch):
@@ -154,7 +166,15 @@ def test_a_disk_without_room_is_done_without(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "pwrite", fail)
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
     with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
-        assert reader.scene(config).name == "room"
+        assert make_model(settings_in(config), reader=reader).scene.name == "room"
+
+
+def test_a_process_that_ends_too_early_is_done_without(tmp_path):
+    config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        reader.geometry(config)
+        reader._process.kill()
+        assert make_model(settings_in(config), reader=reader).scene.name == "room"
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
