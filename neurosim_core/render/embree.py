@@ -157,7 +157,6 @@ def packet_caster(width: int, *, origins: bool = False) -> Any:
 
     The last bits of a hit may depend on the other rays of its packet.
     """
-
     origin_type: Any = wp.array[wp.vec3] if origins else wp.vec3
     code = read_native(__file__, "cast_rays" if origins else "cast_packet", WIDTH=width)
 
