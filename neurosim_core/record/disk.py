@@ -64,7 +64,9 @@ class Disk:
 
     def readinto(self, buffer: memoryview) -> int:
         """Read what was written last, held back or not."""
-        found = os.preadv(self._file.fileno(), [buffer], self._offset)  # forked processes share the position
+        data = os.pread(self._file.fileno(), len(buffer), self._offset)  # forked processes share the position
+        found = len(data)
+        buffer[:found] = data
         for (offset, size), data in self._held.items():
             low, high = max(offset, self._offset), min(offset + size, self._offset + len(buffer))
             if low < high:

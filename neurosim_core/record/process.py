@@ -35,6 +35,8 @@ _QUEUE_BYTES = 32_000_000
 """What may wait to be sent [bytes]."""
 _COPIED_BYTES = 4096
 """Smaller arrays are copied at once."""
+_RECEIVED_MAX = 64
+"""Packets that a thread of the process that writes receives ahead."""
 _SIZES = struct.Struct("<QQ")
 """Sizes of what is pickled, and of the arrays behind it [bytes]."""
 _SCALARS = (int, float, bool, str)
@@ -65,6 +67,8 @@ class _Process:
     def disown(self) -> None:
         """Let it see the end of the stream when the process ends that this one was forked from."""
         self.socket.close()
+        if self in _spare:
+            _spare.remove(self)
 
 
 _spare: list[_Process] = []
@@ -144,7 +148,7 @@ class RecordingProcess:
         if self._put_bytes - self._sent_bytes > _QUEUE_BYTES:
             self._wait()
         if not self._is_sending:
-            self._end()
+            self._end(early=True)
 
     def close(self, *, complete: bool = True) -> None:
         """Wait until all is written, and mark the file as complete unless it is not. Again: does nothing.
@@ -193,17 +197,17 @@ class RecordingProcess:
                 return
             self._progress.wait()
 
-    def _end(self) -> None:
-        """Wait for the end of the process, and raise what went wrong."""
+    def _end(self, *, early: bool = False) -> None:
+        """Wait for the end of the process, and raise what went wrong; always if that is `early`."""
         self._closed = True
         self._process.socket.close()
         report = self._process.popen.communicate()[0]
         status = self._process.popen.returncode
-        if status:
+        if not status:
+            self._failure, self.kept_ns = pickle.loads(report)
+        if status or (early and self._failure is None):
             how = f"by signal {-status}" if status < 0 else f"with exit status {status}"
             self._failure = OSError(f"cannot write {self._path}: the process that writes it ended {how}")
-        else:
-            self._failure, self.kept_ns = pickle.loads(report)
         if self._failure is not None:
             raise self._failure
 
@@ -234,9 +238,21 @@ def _write(writer: RecordingWriter, source: socket.socket) -> None:
     """Write what comes until the stream ends; what is cut off is dropped."""
     classes: dict[int, tuple[Any, Sequence[str]]] = {}
     complete = False
+    messages: queue.Queue[tuple[Any, NDArray[np.uint8]] | None] = queue.Queue(_RECEIVED_MAX)
+
+    def receive() -> None:
+        try:
+            while True:
+                messages.put(_receive(source))
+        except EOFError:
+            pass
+        finally:
+            messages.put(None)
+
+    threading.Thread(target=receive, name="receive", daemon=True).start()
     try:
-        while True:
-            content, arrays = _receive(source)
+        while (message := messages.get()) is not None:
+            content, arrays = message
             if isinstance(content, bool):
                 complete = content
                 return
@@ -251,8 +267,6 @@ def _write(writer: RecordingWriter, source: socket.socket) -> None:
                     values[index] = np.ndarray(shape, dtype, *at)
             kind, names = classes[number]
             writer.write(kind(**dict(zip(names, values, strict=True))))
-    except EOFError:
-        pass
     finally:
         writer.close(complete=complete)
 

@@ -17,7 +17,7 @@ from processes import SOON_S, Beside, shared_mappings, wait_for
 
 import cortex.back_pressure
 import cortex.broadcast
-import cortex.large
+import cortex.fanout
 import cortex.link
 from cortex import Closed, keep_last, latest, reliable
 from cortex.pub_socket import Backoff
@@ -368,7 +368,7 @@ def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkey
         assert readers[-1].wait_for_publisher(SOON_S)
         monkeypatch.setattr(readers[-1], "top_up", lambda now_ns: None)
     fill_slots(publisher)
-    monkeypatch.setattr(cortex.large, "STRICT_BYTES", 0)
+    monkeypatch.setattr(cortex.fanout, "STRICT_BYTES", 0)
     waits_s = recorded_waits_s(monkeypatch)
     assert not publisher.publish(scan(1, 25_000))
     assert len(waits_s) > 1

@@ -50,16 +50,11 @@ class Link {
         complaints_(std::move(complaints)),
         socket_(net::make_socket(context, zmq::socket_type::sub, net::is_tcp(address_),
                                  policy.is_reliable ? static_cast<int>(policy.depth) : net::queue_max, 0)) {
-#if defined(__linux__)
-    const bool shared_memory = local;
-#else
-    const bool shared_memory = false && local;
-#endif
     fd_ = socket_.get(zmq::sockopt::fd);
     secure(socket_);
     socket_.connect(address_);
     for (const char kind : {'M', 'N', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
-    attach(shared_memory);
+    attach(local);
   }
 
   Link(const Link&) = delete;
@@ -152,12 +147,12 @@ class Link {
   void attach(bool shared_memory) {
     using wire::Key;
     const auto quota = std::min<std::uint64_t>(policy_.depth + 2, 255), timeout_ms = static_cast<std::uint64_t>(policy_.timeout.count());
-    const std::uint64_t options = (shared_memory ? Key::shared_memory : 0) | (policy_.is_reliable ? Key::strict : 0);
     reader_ = random_number();
-    key_ = Key('A', flags(), source_, reader_, options | quota << 8 | timeout_ms << 32).bytes();
     if (shared_memory && net::is_ipc(address_)) {
       end_ = RingReader::open(address_.substr(6, address_.rfind('.') - 6) + ".ring", source_, reader_);
     }
+    const std::uint64_t options = (end_ != nullptr ? Key::shared_memory : 0) | (policy_.is_reliable ? Key::strict : 0);
+    key_ = Key('A', flags(), source_, reader_, options | quota << 8 | timeout_ms << 32).bytes();
     socket_.set(zmq::sockopt::subscribe, key_);
   }
 
@@ -305,14 +300,6 @@ class Link {
     if (is_new && !answer.latched.empty()) latched(answer.latched, queue);
   }
 
-  void subscribe(char kind, bool wanted) {
-    if (wanted) {
-      socket_.set(zmq::sockopt::subscribe, prefix(kind));
-    } else {
-      socket_.set(zmq::sockopt::unsubscribe, prefix(kind));
-    }
-  }
-
   // If the publisher has taken us in, it sends all that follows through its ring; false if we cannot read it.
   bool use_ring() {
     const int welcomed = end_ == nullptr ? 0 : end_->welcomed();
@@ -324,7 +311,7 @@ class Link {
   void enter_ring() {
     in_ring_ = attached_ = true;
     if (!std::exchange(known_, true)) expected_ = end_->first();  // what is lost counts from there on
-    for (const char kind : {'M', 'N', 'L'}) subscribe(kind, false);
+    for (const char kind : {'M', 'N', 'L'}) socket_.set(zmq::sockopt::unsubscribe, prefix(kind));
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
@@ -342,7 +329,7 @@ class Link {
   void go_without_memory(const std::string& why) {
     complaints_->once("memory " + address_, "cannot share memory with " + address_ + ": " + why);
     if (in_ring_) {
-      for (const char kind : {'M', 'N', 'L'}) subscribe(kind, true);
+      for (const char kind : {'M', 'N', 'L'}) socket_.set(zmq::sockopt::subscribe, prefix(kind));
     }
     in_ring_ = false;
     end_.reset();

@@ -20,7 +20,6 @@
 #include "cortex/readers.hpp"
 #include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
-#include "cortex/slot.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
 

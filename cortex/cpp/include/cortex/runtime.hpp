@@ -5,10 +5,11 @@
 #include <array>
 #include <cerrno>
 #include <chrono>
-#include <climits>
 #include <cstdint>
+#include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <filesystem>
 #include <fstream>
 #include <random>
 #include <stdexcept>
@@ -97,9 +98,8 @@ inline std::array<std::uint8_t, 8> blake2b_8(const std::string& data) {
 namespace runtime {
 
 inline std::string hexadecimal(std::uint64_t number) {
-  static constexpr char digits[] = "0123456789abcdef";
-  std::string text;
-  for (int shift = 60; shift >= 0; shift -= 4) text += digits[number >> shift & 15];
+  char text[17];
+  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(number));
   return text;
 }
 
@@ -126,12 +126,7 @@ inline int domain_id(int domain) {
 
 inline std::string base_directory() {
   const std::string chosen = environment("CORTEX_RUNTIME_DIR");
-  if (!chosen.empty()) {
-    if (chosen.front() == '/') return chosen;
-    char here[PATH_MAX];
-    if (::getcwd(here, sizeof here) == nullptr) throw std::system_error(errno, std::generic_category(), "getcwd");
-    return std::string(here) + "/" + chosen;
-  }
+  if (!chosen.empty()) return std::filesystem::absolute(chosen).string();
   const std::string session = environment("XDG_RUNTIME_DIR");
   struct stat status {};
   if (!session.empty() && ::stat(session.c_str(), &status) == 0 && status.st_uid == ::getuid()) {
