@@ -191,7 +191,7 @@ def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
         # Out:
         memory_out: wp.array[Memory],
     ):
-        """Let the memory of pixels begin anew in some worlds, at what they see; threads are [world, pixel]."""
+        """Let the memory of pixels begin anew in some worlds with what they see; threads: [world, pixel]."""
         world, pixel = wp.tid()
         if mask[world] == 0:
             return
