@@ -66,6 +66,7 @@ QUESTIONS: Sequence[Question] = (
     Question("throughput", "whole steps a second, and what their parts take", ("scene", "device", "samples")),
     Question("worlds", "renders a second of many worlds stepped together", (*_VIEW, "worlds", "seconds")),
     Question("data", "windows a second from a recording, for learning"),
+    Question("leave-out", "what a scene does not need is not computed: kernels, memory, libraries, time"),
     Question("step", "whole steps a second with one event camera", (*_VIEW, *_STEPS), False),
     Question("closed-loop", "from command to image between processes", (*_VIEW, *_LOOP), False),
 )
