@@ -396,7 +396,7 @@ def test_a_signal_ends_fly_though_what_it_interrupts_swallows_exceptions(shared_
                 simulator.say("ended")
 
         monkeypatch.setattr(Status, "update", update)
-        assert fly(None, vehicle=None, mode="position") == 130
+        assert fly(None, vehicle=None, mode="position", delay_s=0.0) == 130
     assert "interrupted" in capsys.readouterr().err
 
 
