@@ -157,10 +157,13 @@ def plan_tour(space: FreeSpace, config: TourConfig, *, duration_s: float) -> Pat
 def plan_waypoints(space: FreeSpace, config: WaypointsConfig) -> Path:
     """Plan a flight through given places, from rest to rest.
 
+    Args:
+        space: Where the vehicle can fly.
+        config: The places and the limits of the flight.
+
     Raises:
         PlanningError: A place is not in free space or cannot be reached at this clearance; the message says
-        which
-            one, and where the nearest place is that can.
+            which one, and where the nearest place is that can.
     """
     terrain = _terrain(space, config)
     points = np.array(config.points_m, dtype=np.float64)

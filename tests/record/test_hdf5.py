@@ -392,7 +392,7 @@ def test_killed_run_leaves_a_readable_file(tmp_path, then, caplog):
 
 def run_child(path: Path, then: str, *, first: str = "") -> tuple[int, str, str]:
     command = [sys.executable, "-c", first + CHILD.format(then=then), str(path), str(Path(__file__).parent)]
-    done = subprocess.run(command, timeout=60, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, timeout=300, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout.removeprefix("ready\n"), done.stderr
 
 
