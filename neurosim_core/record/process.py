@@ -67,6 +67,8 @@ class _Process:
     def disown(self) -> None:
         """Let it see the end of the stream when the process ends that this one was forked from."""
         self.socket.close()
+        if self in _spare:
+            _spare.remove(self)
 
 
 _spare: list[_Process] = []

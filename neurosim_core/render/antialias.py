@@ -47,7 +47,8 @@ from neurosim_core.render.coverage import (
 )
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import RADIANCE, RenderOutputs, allocated_radiance_writer
+from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer
+from neurosim_core.render.packet_shading import PACKET_TERMS
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
@@ -91,7 +92,7 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
     radiance_of = pixel_shader(terms)
     shade = surface_shader(terms, beyond=True)
     locate_tile = tile_locator(terms, images=True, instants=True)
-    write_radiance = allocated_radiance_writer()
+    write_radiance = radiance_writer(RADIANCE, supersampled=False, allocated=True)
     cast_packet = packet_caster(terms.embree) if terms.embree else None
     find_pose = pose_finder(terms)
 
@@ -201,18 +202,21 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
                 total += radiance_of(
                     scene, bodies, pose, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
-        write_radiance(scene, total / whole, instant, place.slot, row, col, out)
+        write_radiance(scene, total / whole, 1, instant, place.slot, row, col, out)
 
     return average_pixels
 
 
 @cache
-def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
+def _block_shader(*, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
 
     Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
     """
+    points = {"SAMPLES": SAMPLE_COUNT, "MOST": FACE_COUNT_MAX, "SHARPNESS": round(100 * SHARPNESS)}
+    lookup = {**PACKET_TERMS, "LIGHT_WITHIN": True, "APART": round(100 * APART)}
 
+    @wp.func_native(read_native(__file__, "shade_block", TIMED=timed, UNIT=True, **points, **lookup))
     def shade_block(
         scene: SceneData,
         view: ViewData,
@@ -228,28 +232,15 @@ def _block_shader(*, textured: bool, emissive: bool, timed: bool) -> Any:
         unresolved_out: wp.array[int],
     ): ...
 
-    if textured:
-        shade_block.__name__ = shade_block.__qualname__ = "shade_textured_block"
-    code = read_native(
-        __file__,
-        "shade_block",
-        SAMPLES=SAMPLE_COUNT,
-        MOST=FACE_COUNT_MAX,
-        TEXTURED=textured,
-        EMISSIVE=emissive,
-        TIMED=timed,
-        UNIT=True,
-        LIGHT_WITHIN=True,
-        SHARPNESS=round(100 * SHARPNESS),
-        APART=round(100 * APART),
-    )
-    return wp.func_native(code)(shade_block)
+    return shade_block
 
 
 @cache
-def _pixel_caster(terms: RenderTerms) -> Any:
+def _pixel_caster(width: int, *, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders those of 4 x 4 pixels that have a bit."""
+    packet = {"SAMPLES": RAY_COUNT, "N": _LANES, "SIDE": _SIDE, "WIDTH": width}
 
+    @wp.func_native(read_native(__file__, "cast_pixels", TIMED=timed, UNIT=False, **packet, **PACKET_TERMS))
     def cast_pixels(
         scene: SceneData,
         view: ViewData,
@@ -265,23 +256,7 @@ def _pixel_caster(terms: RenderTerms) -> Any:
         radiance_out: wp.array[wp.vec3],
     ): ...
 
-    if terms.textured:
-        cast_pixels.__name__ = cast_pixels.__qualname__ = "cast_textured_pixels"
-    code = read_native(
-        __file__,
-        "cast_pixels",
-        SAMPLES=RAY_COUNT,
-        WIDTH=terms.embree,
-        N=_LANES,
-        SIDE=_SIDE,
-        TEXTURED=terms.textured,
-        EMISSIVE=terms.emissive,
-        TIMED=terms.timed,
-        UNIT=False,
-        LIGHT_WITHIN=False,
-        APART=0,
-    )
-    return wp.func_native(code)(cast_pixels)
+    return cast_pixels
 
 
 @wp.func_native(read_native(__file__, "write_log"))
@@ -302,9 +277,9 @@ def _write_log(
 def _block_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
-    write_images = allocated_radiance_writer(tuple(name for name in RADIANCE if name != "log_radiance"))
-    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive, timed=terms.timed)
-    cast_pixels = _pixel_caster(terms)
+    write_images = radiance_writer(RADIANCE[1:], supersampled=False, allocated=True)
+    shade_block = _block_shader(timed=terms.timed)
+    cast_pixels = _pixel_caster(terms.embree, timed=terms.timed)
 
     @wp.kernel(module="unique", enable_backward=False)
     def average_blocks(
@@ -358,7 +333,9 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         if place.slot >= 0 and (out.rgb.shape[0] > 0 or out.radiance.shape[0] > 0):
             for y in range(rows):
                 for x in range(columns):
-                    write_images(scene, radiance[_SIDE * y + x], instant, place.slot, top + y, left + x, out)
+                    write_images(
+                        scene, radiance[_SIDE * y + x], 1, instant, place.slot, top + y, left + x, out
+                    )
 
     return average_blocks
 

@@ -13,7 +13,7 @@
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import warp as wp
 
@@ -45,14 +45,6 @@ _FAST = {"fast_math": True}
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
-
-
-class GroupKernels(NamedTuple):
-    """The three kernels; their parameters are those of `antialias.antialiasing_kernel` and `BlockLists`."""
-
-    even: wp.Kernel
-    uneven: wp.Kernel
-    unresolved: wp.Kernel
 
 
 @wp.func_native(read_native(__file__, "classify_block"))
@@ -221,8 +213,8 @@ def _part_shader(terms: RenderTerms) -> wp.Function:
     return shade_met
 
 
-def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
-    """Return the kernels; see `antialias.antialiasing_kernel`."""
+def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
+    """Return the three kernels; parameters: those of `antialias.antialiasing_kernels`, then `BlockLists`."""
     requested = requested_outputs(outputs)
     locate_pixel = _pixel_locator(terms, images=requested.images, instants=requested.log)
     find_pose = pose_finder(terms)
@@ -437,4 +429,4 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
             if wanted != 0 and index % RAY_COUNT == 0:
                 write_radiance(scene, light / float(RAY_COUNT), 1, at.instant, at.slot, at.row, at.col, out)
 
-    return GroupKernels(shade_even_blocks, cover_uneven_blocks, cast_unresolved_pixels)
+    return shade_even_blocks, cover_uneven_blocks, cast_unresolved_pixels

@@ -5,11 +5,9 @@ The rays of 8 x 8 pixels in M consecutive instants lie in a narrow frustum: that
 motion of the camera. One search lists the triangles in it, and each ray is intersected with the list alone.
 
 1. A few probe rays are traced. The furthest hit, and a little more, is the reach of the list: triangles
-   behind
-   the walls of a room are not listed.
+   behind the walls of a room are not listed.
 2. The tree is traversed with the swept frustum, cut off at the reach. On CUDA the threads of a block take
-   nodes
-   from one stack. The list holds every triangle that one of the rays can hit within the reach.
+   nodes from one stack. The list holds every triangle that one of the rays can hit within the reach.
 3. Each ray is intersected with the list. Where one triangle is first by more than rounding, the tree's own
    intersection computes the point. Other rays are unresolved and traverse the tree, as do all rays of a tile
    whose list is too long.

@@ -6,7 +6,7 @@
 
 from collections.abc import Collection
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
@@ -82,14 +82,6 @@ class RenderOutputs:
     [M, H, W]."""
 
 
-def make_render_outputs(**outputs: Any) -> RenderOutputs:
-    """Return the structure of outputs given by name; None: not requested."""
-    out = RenderOutputs()
-    for name, array in outputs.items():
-        setattr(out, name, array)
-    return out
-
-
 @wp.func
 def _to_srgb(linear: float) -> wp.uint8:
     # IEC 61966-2-1
@@ -99,8 +91,11 @@ def _to_srgb(linear: float) -> wp.uint8:
 
 
 @cache
-def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
-    """Return the function that writes the geometry of a pixel, that of it which is in `outputs`."""
+def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms, *, allocated: bool = False) -> wp.Function:
+    """Return the function that writes those of a pixel's `outputs` that are geometry.
+
+    Of `widened_outputs` it writes, if `allocated`, those whose arrays are.
+    """
     surface_albedo = albedo_reader(terms)
 
     @wp.func
@@ -116,19 +111,23 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
         out: RenderOutputs,
     ) -> None:
         if wp.static("depth" in outputs):
-            out.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+            if wp.static(not allocated) or out.depth.shape[0] > 0:
+                out.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
         if wp.static("range" in outputs):
-            out.range[slot, row, col] = wp.where(hit.face >= 0, hit.t, wp.inf)
+            if wp.static(not allocated) or out.range.shape[0] > 0:
+                out.range[slot, row, col] = wp.where(hit.face >= 0, hit.t, wp.inf)
         if wp.static("normal" in outputs):
-            normal = wp.vec3(0.0)
-            if hit.face >= 0:
-                normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
-            out.normal[slot, row, col] = normal
+            if wp.static(not allocated) or out.normal.shape[0] > 0:
+                normal = wp.vec3(0.0)
+                if hit.face >= 0:
+                    normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
+                out.normal[slot, row, col] = normal
         if wp.static("instance" in outputs):
-            name = int(-1)
-            if hit.face >= 0:
-                name = scene.face_instance[hit.face]
-            out.instance[slot, row, col] = name
+            if wp.static(not allocated) or out.instance.shape[0] > 0:
+                name = int(-1)
+                if hit.face >= 0:
+                    name = scene.face_instance[hit.face]
+                out.instance[slot, row, col] = name
         if wp.static("returns" in outputs):
             found = wp.vec3(wp.inf, 0.0, 0.0)
             if hit.face >= 0:
@@ -146,10 +145,11 @@ def _natural_log(x: float) -> float: ...
 
 
 @cache
-def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Function:
-    """Return the function that writes the light of a pixel, that of it which is in `outputs`.
+def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool, allocated: bool = False) -> wp.Function:
+    """Return the function that writes those of a pixel's `outputs` that are light.
 
-    It takes the radiance of all samples of the pixel together, if it is `supersampled`.
+    It takes the radiance of all samples of the pixel together, if it is `supersampled`; if `allocated`, it
+    writes the outputs whose arrays are.
     """
 
     @wp.func
@@ -167,70 +167,16 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
         if wp.static(supersampled):
             radiance = (1.0 / float(layer_count - 1)) * radiance
         if wp.static("log_radiance" in outputs):
-            luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
-            out.log_radiance[instant, row, col] = _natural_log(luma + scene.dark_floor)
+            if wp.static(not allocated) or out.log_radiance.shape[0] > 0:
+                luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
+                out.log_radiance[instant, row, col] = _natural_log(luma + scene.dark_floor)
         if wp.static("radiance" in outputs):
-            if slot >= 0:
+            if slot >= 0 and (wp.static(not allocated) or out.radiance.shape[0] > 0):
                 out.radiance[slot, row, col] = scene.exposure * radiance
         if wp.static("rgb" in outputs):
-            if slot >= 0:
+            if slot >= 0 and (wp.static(not allocated) or out.rgb.shape[0] > 0):
                 out.rgb[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
                 out.rgb[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
                 out.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
     return write_radiance
-
-
-@cache
-def allocated_radiance_writer(outputs: tuple[str, ...] = RADIANCE) -> wp.Function:
-    """Return the function that writes the light of a pixel to those of its outputs that are allocated."""
-    write_log, write_rgb, write_linear = (radiance_writer((name,), supersampled=False) for name in RADIANCE)
-
-    @wp.func
-    def write_allocated_radiance(
-        scene: SceneData, radiance: wp.vec3, instant: int, slot: int, row: int, col: int, out: RenderOutputs
-    ) -> None:
-        if wp.static("log_radiance" in outputs):
-            if out.log_radiance.shape[0] > 0:
-                write_log(scene, radiance, 1, instant, slot, row, col, out)
-        if wp.static("rgb" in outputs):
-            if out.rgb.shape[0] > 0:
-                write_rgb(scene, radiance, 1, instant, slot, row, col, out)
-        if wp.static("radiance" in outputs):
-            if out.radiance.shape[0] > 0:
-                write_linear(scene, radiance, 1, instant, slot, row, col, out)
-
-    return write_allocated_radiance
-
-
-@cache
-def allocated_geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
-    """Return the function that writes the geometry of a pixel: of `widened_outputs`, what is allocated."""
-    write_depth, write_range, write_normal, write_instance, write_returns = (
-        geometry_writer((name,), terms) for name in _GEOMETRY
-    )
-
-    @wp.func
-    def write_allocated_geometry(
-        scene: SceneData,
-        ray: wp.vec3,
-        cosine: float,
-        spread_rad: float,
-        hit: Hit,
-        slot: int,
-        row: int,
-        col: int,
-        out: RenderOutputs,
-    ) -> None:
-        if out.depth.shape[0] > 0:
-            write_depth(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
-        if out.range.shape[0] > 0:
-            write_range(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
-        if out.normal.shape[0] > 0:
-            write_normal(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
-        if out.instance.shape[0] > 0:
-            write_instance(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
-        if wp.static("returns" in outputs):
-            write_returns(scene, ray, cosine, spread_rad, hit, slot, row, col, out)
-
-    return write_allocated_geometry

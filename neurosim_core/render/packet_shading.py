@@ -18,16 +18,21 @@ from neurosim_core.native_code import read_native
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.view_data import ViewData
 
+PACKET_TERMS = {"TEXTURED": True, "EMISSIVE": True, "LIGHT_WITHIN": False, "APART": 0}
+"""Constants of `shade_lanes.cuh`: on a CPU to look for textures takes less than to compile both kernels."""
+
 
 @cache
-def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: bool) -> Any:
+def packet_shader(lanes: int, *, unit_normals: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that adds the radiance of a packet's hits to a total.
 
     Its parameters are the scene; then of each lane: ray, of unit length; spread [rad]; face, -1: nothing was
     hit; distance [m]; u and v, the weights of the first and the second corner; the normal of the front, of
     unit length if so said. The last is the radiance of each lane so far, to add to.
     """
+    code = read_native(__file__, "shade_packet", N=lanes, UNIT=unit_normals, **PACKET_TERMS)
 
+    @wp.func_native(code)
     def shade_packet(
         scene: SceneData,
         rays: wp.array[wp.vec3],
@@ -40,23 +45,11 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
         total: wp.array[wp.vec3],
     ): ...
 
-    if textured:  # by its name the code of a kernel tells whether it samples textures
-        shade_packet.__name__ = shade_packet.__qualname__ = "shade_textured_packet"
-    code = read_native(
-        __file__,
-        "shade_packet",
-        N=lanes,
-        TEXTURED=textured,
-        EMISSIVE=emissive,
-        UNIT=unit_normals,
-        LIGHT_WITHIN=False,
-        APART=0,
-    )
-    return wp.func_native(code)(shade_packet)
+    return shade_packet
 
 
 @cache
-def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
+def packet_program(width: int) -> Any:
     """Return the Warp function, for CPU kernels only, that casts and shades 4 x 4 pixels, and takes the log.
 
     The bits are those of `packet_caster`, `packet_shader` and the writer of each pixel; the hits are passed
@@ -69,7 +62,9 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
     not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4. The last
     is the log radiance, of which these pixels are written.
     """
+    code = read_native(__file__, "render_packet", N=16, SIDE=4, WIDTH=width, UNIT=False, **PACKET_TERMS)
 
+    @wp.func_native(code)
     def render_packet(
         scene: SceneData,
         rays: wp.array2d[wp.vec4],
@@ -86,21 +81,7 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
         log_radiance_out: wp.array3d[float],
     ): ...
 
-    if textured:
-        render_packet.__name__ = render_packet.__qualname__ = "render_textured_packet"
-    code = read_native(
-        __file__,
-        "render_packet",
-        N=16,
-        SIDE=4,
-        WIDTH=width,
-        TEXTURED=textured,
-        EMISSIVE=emissive,
-        UNIT=False,
-        LIGHT_WITHIN=False,
-        APART=0,
-    )
-    return wp.func_native(code)(render_packet)
+    return render_packet
 
 
 @cache

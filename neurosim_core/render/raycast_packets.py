@@ -14,9 +14,10 @@ from neurosim_core.render.candidate_data import TILE, UNRESOLVED, CandidateListD
 from neurosim_core.render.candidate_intersection import intersect_tile
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.outputs import (
+    RADIANCE,
     RenderOutputs,
-    allocated_geometry_writer,
-    allocated_radiance_writer,
+    geometry_writer,
+    radiance_writer,
     requested_outputs,
 )
 from neurosim_core.render.packet_shading import face_caster, packet_program, packet_shader
@@ -41,8 +42,8 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     every_instant = requested.log or requested.faces
     locate_tile = tile_locator(terms, images=requested.images, instants=every_instant)
     radiance_of = pixel_shader(terms)
-    write_geometry = allocated_geometry_writer(outputs, terms)
-    write_radiance = allocated_radiance_writer()
+    write_geometry = geometry_writer(outputs, terms, allocated=True)
+    write_radiance = radiance_writer(RADIANCE, supersampled=False, allocated=True)
     side = TILE if terms.by_tile else 4
     lanes = side * side
     packets = (TILE // side) ** 2  # of a tile
@@ -51,12 +52,9 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     packed = requested.radiance and terms.baked and not terms.bodies and not terms.finest_level
     origin_count = lanes if terms.timed else 1
     each_lane = requested.geometry or listed or not packed
-    shade_packet = packet_shader(lanes, textured=terms.textured, emissive=terms.emissive, unit_normals=listed)
+    shade_packet = packet_shader(lanes, unit_normals=listed)
     fused = requested.log and packed and not listed and not terms.timed  # for instants without an image slot
-    render_packet = (
-        packet_program(terms.embree, textured=terms.textured, emissive=terms.emissive) if fused else None
-    )
-
+    render_packet = packet_program(terms.embree) if fused else None
     plain = requested.faces and not (requested.radiance or terms.bodies or listed)
     cast_faces = face_caster(terms.embree, timed=terms.timed) if plain else None
 
@@ -230,7 +228,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             for y in range(rows):
                 for x in range(columns):
                     write_radiance(
-                        scene, share * radiance[side * y + x], instant, slot, top + y, left + x, out
+                        scene, share * radiance[side * y + x], 1, instant, slot, top + y, left + x, out
                     )
 
     return raycast_packets

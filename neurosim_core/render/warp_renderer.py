@@ -20,7 +20,7 @@ from neurosim_core.render.candidate_lists import CandidateLists, choose_candidat
 from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, make_render_outputs, requested_outputs
+from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, RenderOutputs, requested_outputs
 from neurosim_core.render.ray_layers import first_rays, pixel_rays, ray_layers
 from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
@@ -164,8 +164,10 @@ class WarpRenderer:
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
         self.returns = allocate("returns", images, wp.vec3)
-        arrays_of = {name: getattr(self, name) for name in OUTPUTS}
-        self._render_outputs = make_render_outputs(**arrays_of, face=allocate(FACE, instants, int))
+        self._render_outputs = RenderOutputs()
+        self._render_outputs.face = allocate(FACE, instants, int)
+        for name in OUTPUTS:
+            setattr(self._render_outputs, name, getattr(self, name))
         self._blind = BlindPixels(
             lenses,
             worlds.lens_of_world if worlds.lenses else wp.zeros(worlds.count, dtype=int, device=device),

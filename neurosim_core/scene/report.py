@@ -16,6 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
+from trimesh.intersections import slice_faces_plane
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
@@ -170,40 +171,27 @@ def cut_open(scene: Scene, height_m: float) -> Scene:
     Raises:
         ValueError: If nothing is below the height.
     """
-    over = scene.vertices[scene.faces][:, :, 2] > height_m
-    count = over.sum(axis=1)
-    if (count == 3).all():
+    corner, face = scene.faces.ravel(), np.arange(len(scene.faces))
+    more = np.column_stack([scene.normals[corner], scene.uv[corner], face.repeat(3)])  # of corners
+    vertices, faces, more = slice_faces_plane(
+        scene.vertices[corner].astype(np.float64),
+        np.arange(len(corner)).reshape(-1, 3),
+        plane_normal=[0.0, 0.0, -1.0],
+        plane_origin=[0.0, 0.0, height_m],
+        uv=more,
+    )
+    if not len(faces):
         raise ValueError(f"nothing of scene {scene.name!r} is below {height_m} m")
-    values = np.concatenate([scene.vertices, scene.normals, scene.uv], axis=1).astype(np.float64)
-    pieces, origin = [values[scene.faces[count == 0]]], [np.flatnonzero(count == 0)]
-    for above in (1, 2):
-        faces = np.flatnonzero(count == above)
-        odd = np.argmax(over[faces] == (above == 1), axis=1)  # the corner that is alone on its side
-        turned = (odd[:, None] + np.arange(3)) % 3
-        lone, right, left = np.moveaxis(values[np.take_along_axis(scene.faces[faces], turned, axis=1)], 1, 0)
-        on_right, on_left = (
-            lone + ((height_m - lone[:, 2]) / (other[:, 2] - lone[:, 2]))[:, None] * (other - lone)
-            for other in (right, left)
-        )
-        if above == 2:
-            pieces.append(np.stack([lone, on_right, on_left], axis=1))
-            origin.append(faces)
-        else:
-            pieces += [np.stack([on_right, right, left], axis=1), np.stack([on_right, left, on_left], axis=1)]
-            origin += [faces, faces]
-    corner, face = np.concatenate(pieces), np.concatenate(origin)
-    edge = np.roll(corner[:, :, :3], -1, axis=1) - corner[:, :, :3]
-    kept = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > 1e-9  # cuts through corners leave lines
-    flat = corner[kept].reshape(-1, 8)
-    length = np.linalg.norm(flat[:, 3:6], axis=1, keepdims=True)
+    length = np.linalg.norm(more[:, :3], axis=1, keepdims=True)
+    face = np.rint(more[faces[:, 0], 5]).astype(np.int64)
     return dataclasses.replace(
         scene,
-        vertices=flat[:, :3].astype(np.float32),
-        normals=(flat[:, 3:6] / np.where(length > 0.0, length, 1.0)).astype(np.float32),
-        uv=flat[:, 6:].astype(np.float32),
-        faces=np.arange(len(flat), dtype=np.int32).reshape(-1, 3),
-        face_material=scene.face_material[face[kept]],
-        face_instance=scene.face_instance[face[kept]],
+        vertices=vertices.astype(np.float32),
+        normals=(more[:, :3] / np.where(length > 0.0, length, 1.0)).astype(np.float32),
+        uv=more[:, 3:5].astype(np.float32),
+        faces=faces.astype(np.int32),
+        face_material=scene.face_material[face],
+        face_instance=scene.face_instance[face],
     )
 
 

@@ -161,8 +161,8 @@ class PixelNoise:
 
     Attributes:
         terms: The terms that are compiled in.
-        thresholds: Thresholds upwards and downwards, device array of vec2d, shape [pixel]; empty without
-            mismatch.
+        model: What the scan reads of pixels that stays, a `PixelModel`.
+        memories: What pixels remember, a `Memory` for each state of the ring.
     """
 
     def __init__(
@@ -182,20 +182,14 @@ class PixelNoise:
         self._sensor = sensor
         self._device = wp.get_device(device)
         self._pixel_count = pixel_count
-        self._ring = [self._make_memory() for _ in range(ring_size)]
-        self._model = self._make_model()
-        self.thresholds = self._model.thresholds
+        self.memories = [self._make_memory() for _ in range(ring_size)]
+        self.model = self._make_model()
         self._reset_ns = 0
 
     def set_reset(self, stamp_ns: int) -> None:
         """Let the noise that follows be that after a reset at a stamp."""
         self._reset_ns = stamp_ns
-        self._model.seed = mix_seed(self._seed, stamp_ns)
-
-    @property
-    def model(self) -> Any:
-        """Return what the scan reads of pixels that stays, a `PixelModel`."""
-        return self._model
+        self.model.seed = mix_seed(self._seed, stamp_ns)
 
     def phase(self) -> tuple[int, bool]:
         """Return the stream of random phases, and whether voltages begin at one."""
@@ -205,10 +199,6 @@ class PixelNoise:
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset an origin of time lies [ns]."""
         return origin_ns - self._reset_ns
-
-    def memory(self, slot: int) -> Any:
-        """Return the state in a slot of the ring."""
-        return self._ring[slot]
 
     def _stream(self, use: str) -> int:
         return stream_id(f"{self._sensor}/events/{use}")

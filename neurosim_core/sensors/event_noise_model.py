@@ -66,7 +66,7 @@ class PixelModel:
     jitter: wp.vec2d  # standard deviations ON, OFF
     jitter_least: wp.float64
     refractory_ns: wp.float64
-    signals: wp.array[SignalTerm]  # what changes what pixels see, in the order of `signals_of`
+    signals: wp.array[SignalTerm]  # what changes what pixels see, in the order of `signal_terms`
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64
     bright_factor: wp.float64

@@ -202,7 +202,7 @@ class Pixels:
             self._key_room = 1 << (2 * counts[0] - 1).bit_length()
 
     def launch_key(self, scan: Scan) -> Hashable:
-        """Return the key of the launches of a scan: same key, same launches (`streams.GraphCache`)."""
+        """Return the key of the launches of a scan: same key, same launches (`GraphCache`)."""
         keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
         frames = scan.frames.ptr, len(scan.stamps_ns)
         return scan.number, scan.state, *frames, keys

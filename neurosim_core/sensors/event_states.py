@@ -98,7 +98,7 @@ class PixelStates:
             for world in range(len(self._configs))
         ]
         memories: list[Any] = [
-            wp.array([each.memory(slot) for each in self.noise], dtype=Memory, device=self._device)
+            wp.array([each.memories[slot] for each in self.noise], dtype=Memory, device=self._device)
             for slot in range(len(self.last))
         ]
         if self._models is None:

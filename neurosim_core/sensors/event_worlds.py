@@ -31,7 +31,7 @@ class WorldEvents:
     """The events of a step in all worlds, on the device, valid until the next step or reset.
 
     Those of world i are [offsets[i], offsets[i + 1]); beyond the end of the last the arrays have no meaning.
-    They are sorted by (t, y, x, polarity) within each world, unless `make_worlds(sorted=False)`.
+    They are sorted by (t, y, x, polarity) within each world, unless `Simulation(sorted=False)`.
     """
 
     t: wp.array[wp.int64]

@@ -392,7 +392,7 @@ def test_killed_run_leaves_a_readable_file(tmp_path, then, caplog):
 
 def run_child(path: Path, then: str, *, first: str = "") -> tuple[int, str, str]:
     command = [sys.executable, "-c", first + CHILD.format(then=then), str(path), str(Path(__file__).parent)]
-    done = subprocess.run(command, timeout=60, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, timeout=300, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout.removeprefix("ready\n"), done.stderr
 
 
@@ -634,6 +634,15 @@ def test_files_that_are_not_ours_are_refused(tmp_path):
             file.attrs["format_version"] = version
         with pytest.raises(ValueError, match=rf"written by {age} version .*format version {version}\)"):
             Recording(tmp_path / "later.h5")
+
+
+@pytest.mark.parametrize("lost", ["path/stamp_ns", "sensors/imu/sequence"])
+def test_what_is_missing_in_a_recording_is_damage(tmp_path, lost):
+    write(tmp_path / "f.h5", make_flight(0, [1]))
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        del file[lost]
+    with pytest.raises(ValueError, match=r"f.h5 is damaged: "), Recording(tmp_path / "f.h5") as flight:
+        list(flight.packets())
 
 
 def test_unknown_names_list_the_known_ones(tmp_path):

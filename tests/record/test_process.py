@@ -26,12 +26,12 @@ from neurosim_core.record.process import RecordingProcess, start_process
 
 PACKETS = make_flight(5, [700, 0, 20_000, 30, 1, 500] * 4)[:-1]
 BEGIN = """
-import os, signal, sys, time
+import contextlib, os, signal, sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_hdf5 import HEADER, image
 from test_process import PACKETS
-from neurosim_core.record.process import RecordingProcess
+from neurosim_core.record.process import RecordingProcess, start_process
 writer = RecordingProcess(Path(sys.argv[1]), HEADER)
 """
 
@@ -227,7 +227,7 @@ for k, packet in enumerate(PACKETS):
 writer.close()
 print(stopped)
 """
-    assert run(code, tmp_path / "f.h5").communicate(timeout=60.0) == ("[1]\n", "")
+    assert run(code, tmp_path / "f.h5").communicate(timeout=300.0) == ("[1]\n", "")
     with Recording(tmp_path / "f.h5") as flight:
         assert flight.clean
         assert_same(list(flight.packets()), PACKETS)
@@ -237,6 +237,7 @@ def test_a_forked_process_leaves_the_recording_to_its_parent(tmp_path):
     code = """
 for packet in PACKETS[:50]:
     writer.write(packet)
+start_process()
 child = os.fork()
 if child == 0:
     try:
@@ -244,15 +245,19 @@ if child == 0:
     except RuntimeError as error:
         print(error, flush=True)
     writer.close()
+    with contextlib.closing(RecordingProcess(Path(sys.argv[1] + "2"), HEADER)) as own:
+        own.write(PACKETS[0])
     sys.exit()
 os.waitpid(child, 0)
 for packet in PACKETS[50:]:
     writer.write(packet)
 writer.close()
 """
-    found, errors = run(code, tmp_path / "f.h5").communicate(timeout=60.0)
+    found, errors = run(code, tmp_path / "f.h5").communicate(timeout=300.0)
     assert errors == ""
     assert "only its parent can write" in found
+    with Recording(tmp_path / "f.h52") as flight:
+        assert_same(list(flight.packets()), PACKETS[:1])
     with Recording(tmp_path / "f.h5") as flight:
         assert flight.clean
         assert_same(list(flight.packets()), PACKETS)

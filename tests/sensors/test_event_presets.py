@@ -104,7 +104,7 @@ def test_shot_noise_of_v2e_goes_with_the_threshold(device):
     camera.reset(np.zeros((64, 64), np.float32))
     events = camera.feed(np.zeros((1, 64, 64), np.float32), [20_000_000_000]).numpy()
     pixel = events.y.astype(int) * 64 + events.x
-    threshold = camera._pixels.noise.thresholds.numpy()
+    threshold = camera._pixels.noise.model.thresholds.numpy()
     for column, polarity in ((0, 1), (1, 0)):
         count = np.bincount(pixel[events.polarity == polarity], minlength=64 * 64)
         expected = 20.0 * 20.0 * 0.2 / threshold[:, column]
