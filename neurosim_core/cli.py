@@ -162,6 +162,9 @@ def _add_fly(commands: _Commands) -> None:
         help="what to command (default: motor_speeds)",
     )
     fly.add_argument(
+        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
+    )
+    fly.add_argument(
         "--policy",
         metavar="NAME",
         help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
@@ -347,7 +350,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     from neurosim_core.live.controller import fly
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
-    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
+    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
 def _up(arguments: argparse.Namespace) -> int:
