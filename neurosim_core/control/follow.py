@@ -129,7 +129,12 @@ class PathFollower:
         return command
 
     def error_m(self, stamp_ns: int, position: ArrayLike) -> float:
-        """Return how far a position is from where the path is at a stamp [m]."""
+        """Return how far a position is from where the path is at a stamp [m].
+
+        Args:
+            stamp_ns: Time since the start of the path [ns].
+            position: p_WB [m], shape [3].
+        """
         return math.dist(self._cursor.at(stamp_ns)["position"], np.asarray(position))
 
     def _position(self, point: np.void) -> NDArray[np.float64]:

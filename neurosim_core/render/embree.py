@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-def,empty-body"
+# mypy: disable-error-code="no-untyped-def,empty-body,valid-type"
 """Rays on the CPU by Embree, which casts packets of rays ten times faster than Warp casts single ones.
 
 Kernels call the shared library that the package `embreex` carries through the address of its function: no
@@ -6,7 +6,7 @@ Python per ray, no copies. Embree's robust mode: no ray slips through an edge th
 rays of antialiasing do without it: of a first ray any face nearby will do, and the others are one of many.
 """
 
-from __future__ import annotations
+# No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 
 import ctypes
 import importlib.metadata
@@ -157,12 +157,14 @@ def packet_caster(width: int, *, origins: bool = False) -> Any:
 
     The last bits of a hit may depend on the other rays of its packet.
     """
+    origin_type: Any = wp.array[wp.vec3] if origins else wp.vec3
+    code = read_native(__file__, "cast_rays" if origins else "cast_packet", WIDTH=width)
 
-    @wp.func_native(read_native(__file__, "cast_packet", WIDTH=width))
+    @wp.func_native(code)
     def cast_packet(
         intersect: wp.uint64,
         scene: wp.uint64,
-        origin: wp.vec3,
+        origin: origin_type,
         rays: wp.array[wp.vec3],
         far_m: float,
         face_out: wp.array[int],
@@ -172,18 +174,4 @@ def packet_caster(width: int, *, origins: bool = False) -> Any:
         normal_out: wp.array[wp.vec3],
     ): ...
 
-    @wp.func_native(read_native(__file__, "cast_rays", WIDTH=width))
-    def cast_rays(
-        intersect: wp.uint64,
-        scene: wp.uint64,
-        origins: wp.array[wp.vec3],
-        rays: wp.array[wp.vec3],
-        far_m: float,
-        face_out: wp.array[int],
-        t_out: wp.array[float],
-        u_out: wp.array[float],
-        v_out: wp.array[float],
-        normal_out: wp.array[wp.vec3],
-    ): ...
-
-    return cast_rays if origins else cast_packet
+    return cast_packet

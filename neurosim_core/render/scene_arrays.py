@@ -88,7 +88,7 @@ def upload_scene(
         )
 
         def cover() -> tuple[PackedTextures, RenderTerms, NDArray[np.float64]]:
-            packed, area_m2 = packing.result(), areas_m2(mesh)
+            area_m2, packed = areas_m2(mesh), packing.result()
             terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
             _upload_surfaces(data, scene, mesh, area_m2, joined, packed, terms, device)
             if connecting is not None:

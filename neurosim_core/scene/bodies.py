@@ -271,7 +271,6 @@ def _pose_bodies(
     motions: wp.array[Motion],
     # In:
     stamps_ns: wp.array2d[wp.int64],
-    vehicle: int,
     slots: wp.array[int],
     instants_per_world: int,
     # Out:
@@ -279,7 +278,7 @@ def _pose_bodies(
     q_WO_out: wp.array2d[wp.quatd],
 ) -> None:
     instant, body = wp.tid()
-    stamp_ns = stamps_ns[slots[instant], vehicle]
+    stamp_ns = stamps_ns[slots[instant], 0]
     motion = motions[instant / instants_per_world * p_WO_out.shape[1] + body]
     p_WO_out[instant, body] = body_position(motion, stamp_ns)
     q_WO_out[instant, body] = body_orientation(motion, stamp_ns)
@@ -292,19 +291,24 @@ def pose_bodies(
     *,
     count: int,
     poses: BodyPoses,
-    vehicle: int = 0,
 ) -> None:
     """Write where bodies are at the first `count` of the given slots; launches one kernel.
 
-    Motions of several worlds (`upload_motions`) share the instants out in their order. Stamps [ns] have shape
-    [slot, vehicle] (`Trace.stamps`).
+    Motions of several worlds (`upload_motions`) share the instants out in their order.
+
+    Args:
+        motions: Of the bodies of each world, one world after the other.
+        stamps_ns: Times [ns], shape [slot, >= 1], of which the first column counts (`Trace.stamps`).
+        slots: Rows of `stamps_ns`, shape [>= count].
+        count: Number of instants, of all worlds together.
+        poses: Overwritten; its first `count` rows.
     """
     body_count = poses.p_WO.shape[1]
     worlds = motions.shape[0] // max(body_count, 1)
     wp.launch(
         _pose_bodies,
         dim=(count, body_count),
-        inputs=[motions, stamps_ns, vehicle, slots, max(count // max(worlds, 1), 1)],
+        inputs=[motions, stamps_ns, slots, max(count // max(worlds, 1), 1)],
         outputs=[poses.p_WO, poses.q_WO],
         device=motions.device,
     )

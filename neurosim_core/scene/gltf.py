@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,9 +40,8 @@ _LABELS = ("semantic", "class", "category", "label")
 def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> Source:
     """Read the default scene of a glTF file, .gltf or .glb.
 
-    A texture file that is not there is an error if `textures_required`, else noted and left out. With
-    `pictures` textures are decoded from now on in threads: the first look at one waits for it, and raises
-    what is wrong with it. Else they are decoded at that first look, if ever.
+    A texture file that is not there is an error if `textures_required`, else noted and left out. Textures are
+    decoded at the first look at them, which raises what is wrong; with `pictures` emissive ones are here.
 
     Raises:
         SceneError: If the file is truncated, malformed, or needs an extension that is not read.
@@ -100,17 +98,14 @@ class _Reader:
         """Return the textures of pictures, one for pictures of the same bytes; see `read_gltf`."""
         found: dict[bytes, Texture] = {}
         textures: dict[int, Texture] = {}
-        threads = ThreadPoolExecutor()  # Pillow releases the interpreter lock
         for index in sorted(wanted):
             name, data = self._image(index)
             if data is None:
                 continue
             if data not in found:
                 decode = partial(decode_picture, data, file=str(self.path), name=name)
-                texels = threads.submit(decode).result if self.pictures else decode
-                found[data] = Texture(name=name, srgb=texels)
+                found[data] = Texture(name=name, srgb=decode)
             textures[index] = found[data]
-        threads.shutdown(wait=False)
         if len(textures) < len(wanted):
             self.source.notes.append(
                 f"{len(wanted) - len(textures)} texture files are missing; base colours are used alone."

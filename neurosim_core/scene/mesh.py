@@ -152,9 +152,10 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),
         **arrays,
     )
-    for texture in (material.texture for material in scene.materials if pictures):
-        if texture is not None:
-            texture.decode()
+    if pictures:  # at the end: what threads do of it in Python would hold up the rest
+        textures = dict.fromkeys(m.texture for m in scene.materials if m.texture is not None)
+        with ThreadPoolExecutor() as threads:  # Pillow releases the interpreter lock
+            list(threads.map(Texture.decode, textures))
     return scene
 
 

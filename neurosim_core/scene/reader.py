@@ -127,18 +127,18 @@ def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
     kind = scene_kind(given)
     config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
     scene = config.load()
-    with ThreadPoolExecutor() as aside:
-        for texture in {id(m.texture): m.texture for m in scene.materials if m.texture is not None}.values():
-            aside.submit(texture.__getstate__)
-        write((config, dataclasses.replace(scene, materials=())))
-        from neurosim_core.render.config import RenderConfig
-        from neurosim_core.render.refine import refine_within
+    write((config, dataclasses.replace(scene, materials=())))
+    from neurosim_core.render.config import RenderConfig
+    from neurosim_core.render.refine import refine_within
 
-        render = RenderConfig.model_validate(settings["render"])
-        edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
-        if (mesh := refine_within(scene, edge_m)) is not None:
-            scene.refined[edge_m] = mesh
-            _ = mesh.corner_groups, mesh.corner_normals
+    render = RenderConfig.model_validate(settings["render"])
+    edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
+    if (mesh := refine_within(scene, edge_m)) is not None:
+        scene.refined[edge_m] = mesh
+        _ = mesh.corner_groups, mesh.corner_normals
+    with ThreadPoolExecutor() as aside:  # now: threads that take much memory hold each other up
+        for texture in dict.fromkeys(m.texture for m in scene.materials if m.texture is not None):
+            aside.submit(texture.__getstate__)
         if render.samples_per_pixel == "adaptive":
             _ = scene.connections
     write((config, scene))

@@ -57,7 +57,6 @@ def load_poses(
     q_BC: wp.quatd,
     # In:
     states: wp.array3d[wp.float64],
-    vehicle: int,
     slots: wp.array[int],
     step_s: wp.array[wp.float64],
     # Out:
@@ -66,12 +65,10 @@ def load_poses(
     """Write the poses of the camera at the ticks of a block and one tick later; threads are the ticks."""
     tick = wp.tid()
     slot = slots[tick]
-    p_WB = wp.vec3d(states[slot, vehicle, 0], states[slot, vehicle, 1], states[slot, vehicle, 2])
-    q_WB = wp.quatd(
-        states[slot, vehicle, 3], states[slot, vehicle, 4], states[slot, vehicle, 5], states[slot, vehicle, 6]
-    )
-    v_W = wp.vec3d(states[slot, vehicle, 7], states[slot, vehicle, 8], states[slot, vehicle, 9])
-    w_B = wp.vec3d(states[slot, vehicle, 10], states[slot, vehicle, 11], states[slot, vehicle, 12])
+    p_WB = wp.vec3d(states[slot, 0, 0], states[slot, 0, 1], states[slot, 0, 2])
+    q_WB = wp.quatd(states[slot, 0, 3], states[slot, 0, 4], states[slot, 0, 5], states[slot, 0, 6])
+    v_W = wp.vec3d(states[slot, 0, 7], states[slot, 0, 8], states[slot, 0, 9])
+    w_B = wp.vec3d(states[slot, 0, 10], states[slot, 0, 11], states[slot, 0, 12])
     poses_out.p_WC[tick + 1] = p_WB + wp.quat_rotate(q_WB, p_BC)
     poses_out.q_WC[tick + 1] = q_WB * q_BC
     q_next_WB = q_WB * quaternion_exp(step_s[tick] * w_B)

@@ -20,6 +20,7 @@ from neurosim_core.packets import EventArrays
 from neurosim_core.runtime.cuda import HostInput, RecordedLaunch
 from neurosim_core.sensors import event_worlds_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_cut import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_input import as_frames, invalid_message
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.warp_start import start_warp
@@ -27,9 +28,6 @@ from neurosim_core.warp_start import start_warp
 _ROOM_MIN = 1024
 _PIXELS_PER_EVENT = 2
 """Pixels for each event for which there is room in a call before any have come."""
-_COLUMNS = ((wp.int64, 0), (wp.uint16, 8), (wp.uint16, 10), (wp.uint8, 12))
-"""Types of time, column, row and polarity, and where they begin in a block with room for one event."""
-_EVENT_BYTES = 13
 _LANES = 1 << 16
 """Threads that take the events of all cameras apart, on CUDA."""
 
@@ -229,9 +227,9 @@ class EventCameraBatch:
         """Return time, column, row and polarity of the events of the last frame, in arrays of their own."""
         room = len(events)
         spaced = room + room % 2  # columns in a block begin where they may
-        block: Any = wp.empty(_EVENT_BYTES * max(spaced, 2), dtype=wp.uint8, device=self.device)
+        block: Any = wp.empty(EVENT_BYTES * max(spaced, 2), dtype=wp.uint8, device=self.device)
         columns: list[Any] = []
-        for dtype, offset in _COLUMNS:
+        for dtype, offset in zip(COLUMN_TYPES, COLUMN_OFFSETS, strict=True):
             column: Any = wp.array(
                 ptr=block.ptr + offset * spaced, dtype=dtype, shape=(room,), device=self.device
             )

@@ -7,7 +7,13 @@ from neurosim_core.sensors.event_levels import COLUMN_SHIFT
 
 wp.set_module_options({"enable_backward": False})
 
-# what `decode_windows` is told
+COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
+"""Types of the times, columns, rows and polarities of events."""
+COLUMN_OFFSETS = (0, 8, 10, 12)
+"""Where each of them begins in a block of memory with room for one event."""
+EVENT_BYTES = 13
+
+# places in the header of a cut
 COUNT = wp.constant(0)
 ROOM = wp.constant(1)
 ORIGIN_US = wp.constant(2)
@@ -40,7 +46,7 @@ def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_
 @wp.kernel
 def prepare(
     # In:
-    told: wp.array[wp.int64],
+    header: wp.array[wp.int64],
     bounds: wp.array[wp.int64],
     window_count: wp.int32,
     time_shift: wp.int32,
@@ -50,10 +56,10 @@ def prepare(
     """Set `late` on keys that come after the end of a window within its microsecond; threads are the room.
 
     Keys beyond the count get to sort behind all others. `bounds` are the ends of windows from the keys' time
-    origin [ns], at least 1 us apart; what else is `told` is for `decode_windows`.
+    origin [ns], at least 1 us apart; the rest of `header` is for `decode_windows`.
     """
     event = wp.tid()
-    if wp.int64(event) < told[COUNT]:
+    if wp.int64(event) < header[COUNT]:
         keys[event] = mark(keys[event], bounds, window_count, time_shift)
     else:
         keys[event] = _NOTHING
@@ -170,7 +176,7 @@ def decode(
 @wp.kernel
 def decode_windows(
     # In:
-    told: wp.array[wp.int64],
+    header: wp.array[wp.int64],
     bounds: wp.array[wp.int64],
     window_count: wp.int32,
     keys: wp.array[wp.int64],
@@ -184,15 +190,15 @@ def decode_windows(
 ) -> None:
     """Do what `find_ends` and `decode` do, for at least one key; threads are the room.
 
-    `told` are: how many keys there are; for how many the columns have room, an even number; the origin of
+    `header` holds how many keys there are; for how many the columns have room, an even number; the origin of
     their time [us]. The columns are one block of memory, given as three types, one after the other in it.
     """
     event = wp.tid()
-    count = wp.int32(told[COUNT])
+    count = wp.int32(header[COUNT])
     if event < count:
-        room = wp.int32(told[ROOM])
+        room = wp.int32(header[ROOM])
         found = take_apart(keys[event], row_shift, time_shift)
-        columns_8[event] = told[ORIGIN_US] + found.time_us
+        columns_8[event] = header[ORIGIN_US] + found.time_us
         columns_2[4 * room + event] = found.x
         columns_2[5 * room + event] = found.y
         columns_1[12 * room + event] = found.polarity

@@ -21,6 +21,7 @@ from neurosim_core.runtime.cuda import (
     size_class,
 )
 from neurosim_core.sensors import event_cut
+from neurosim_core.sensors.event_cut import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_readout import Readout
 
@@ -29,11 +30,6 @@ ROOM_PER_PIXEL = 16
 and memory follows the events, in place of doubling in the middle of a run."""
 TOUCHED_COUNT_MAX = 1 << 18
 """Keys of that room that are written to at once: the first busy moment of a run needs no new pages."""
-_COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
-"""Types of the times, columns, rows and polarities that are handed out."""
-_OFFSETS = (0, 8, 10, 12)
-"""Where each of them begins in a block with room for one event."""
-_EVENT_BYTES = 13
 _EVENTS_PER_SAMPLE = 1 / 8
 """Events of a pixel in a frame for which memory of the host is pinned from the start: four times as many as a
 tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stands still."""
@@ -42,8 +38,8 @@ _PINNED_BLOCKS = 3
 _ROOM_MIN = 1024
 _BLOCK_COUNT_MAX = 1 << 26
 """Most events in one block of memory: Warp counts its bytes in 31 bits."""
-_TOLD = 3
-"""Numbers that a cut is told besides the ends of its windows."""
+_HEADER_LENGTH = 3
+"""Numbers in the header of a cut, before the ends of its windows."""
 _PINNED_BYTES_MAX = 144 << 20
 """Most memory that is pinned for events that have not come."""
 
@@ -127,7 +123,7 @@ class EventKeys:
             return
         self._frame_count = size_class(frame_count)
         events = int(_EVENTS_PER_SAMPLE * self._frame_count * self._pixel_count)
-        self._blocks.reserve(min(_EVENT_BYTES * events, _PINNED_BYTES_MAX // _PINNED_BLOCKS), _PINNED_BLOCKS)
+        self._blocks.reserve(min(EVENT_BYTES * events, _PINNED_BYTES_MAX // _PINNED_BLOCKS), _PINNED_BLOCKS)
 
     def append(self, keys: wp.array[wp.int64], first: int, count: int, origin_us: int) -> None:
         """Add `count` keys from `first` on, whose time has its own origin [us]."""
@@ -169,7 +165,7 @@ class EventKeys:
         if self._device.is_cuda:
             self._order = self._empty(2 * room, wp.int32)
             if self._on_host:
-                block = self._empty(_EVENT_BYTES * min(room, _BLOCK_COUNT_MAX), wp.uint8)
+                block = self._empty(EVENT_BYTES * min(room, _BLOCK_COUNT_MAX), wp.uint8)
                 self._columns = [
                     wp.array(ptr=block.ptr, dtype=dtype, shape=block.shape[0] // size, device=self._device)
                     for dtype, size in ((wp.int64, 8), (wp.uint16, 2))
@@ -204,13 +200,15 @@ class EventKeys:
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
         copied = count + count % 2  # columns in a block begin where they may
-        told = self._told.rows
-        told[:_TOLD] = count, copied, self.origin_us
-        told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
+        header = self._header.rows
+        header[:_HEADER_LENGTH] = count, copied, self.origin_us
+        header[_HEADER_LENGTH : _HEADER_LENGTH + len(ends_ns)] = (
+            np.array(ends_ns) - self.origin_us * NS_PER_US
+        )
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
             return self._begin_cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
-        self._told.upload()
-        prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
+        self._header.upload()
+        prepared = [self._header.array, self._bounds, len(ends_ns), self._time_shift]
         self._launch(event_cut.prepare, count, prepared, [self.keys])
         self._sort(count, end_bit)
         self._launch(
@@ -220,7 +218,7 @@ class EventKeys:
             [self._found],
         )
         self._found_on_host.fetch(0, len(ends_ns))
-        columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
+        columns = [self._empty(count, dtype) for dtype in COLUMN_TYPES]
         decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
         self._launch(event_cut.decode, count, decoded, columns)
         if self._labels is not None:
@@ -241,27 +239,27 @@ class EventKeys:
         shifts = [self._row_shift, self._time_shift]
 
         def launch() -> None:
-            self._told.upload()
-            told = [self._told.array, self._bounds, window_count]
-            self._launch(event_cut.prepare, room, [*told, self._time_shift], [self.keys])
+            self._header.upload()
+            header = [self._header.array, self._bounds, window_count]
+            self._launch(event_cut.prepare, room, [*header, self._time_shift], [self.keys])
             self._sort(room, end_bit)
             outputs = [*self._columns, self._found]
-            self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
+            self._launch(event_cut.decode_windows, room, [*header, self.keys, *shifts], outputs)
             self._found_on_host.fetch(0, window_count)
 
         self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         if self._labels is not None:
             t, both = self._columns[:2]
             self._labels.launch(self.count, t, both, both, first_x=4 * copied, first_y=5 * copied)
-        block = blocks.acquire(_EVENT_BYTES * copied)
-        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
+        block = blocks.acquire(EVENT_BYTES * copied)
+        wp.copy(block.array, self._columns[-1], count=EVENT_BYTES * copied)
         self._read.set()
 
         def end_cut() -> tuple[list[Any], list[int]]:
             self._read.wait()
-            rows = blocks.hand_out(block, _EVENT_BYTES * copied)
+            rows = blocks.hand_out(block, EVENT_BYTES * copied)
             columns = []
-            for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
+            for offset, dtype in zip(COLUMN_OFFSETS, map(wp.dtype_to_numpy, COLUMN_TYPES), strict=True):
                 size = np.dtype(dtype).itemsize
                 columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
             return columns, self._found_on_host.rows(0, window_count).tolist()
@@ -271,8 +269,8 @@ class EventKeys:
     def no_events(self) -> list[Any]:
         """Return columns without an event."""
         if self._on_host:
-            return [np.zeros(0, wp.dtype_to_numpy(dtype)) for dtype in _COLUMN_TYPES]
-        return [self._empty(0, dtype) for dtype in _COLUMN_TYPES]  # Warp refuses an empty slice
+            return [np.zeros(0, wp.dtype_to_numpy(dtype)) for dtype in COLUMN_TYPES]
+        return [self._empty(0, dtype) for dtype in COLUMN_TYPES]  # Warp refuses an empty slice
 
     def carry_over(self, first: int, origin_us: int) -> None:
         """Keep the keys from `first` on for later windows, with their time from an origin [us]."""
@@ -303,8 +301,8 @@ class EventKeys:
 
     def _make_window_buffers(self, window_count: int) -> None:
         self._graphs = GraphCache(self._device)  # they name the buffers
-        self._told = HostInput(wp.zeros(_TOLD + window_count, dtype=wp.int64, device=self._device))
-        self._bounds = self._told.array[_TOLD:]
+        self._header = HostInput(wp.zeros(_HEADER_LENGTH + window_count, dtype=wp.int64, device=self._device))
+        self._bounds = self._header.array[_HEADER_LENGTH:]
         self._found = wp.zeros(window_count, dtype=wp.int32, device=self._device)
         self._found_on_host = HostCopy(self._found)
 

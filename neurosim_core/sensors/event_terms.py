@@ -45,7 +45,11 @@ class NoiseTermConfig(Settings):
     with every frame, `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
 
     def numbers(self, white_radiance: float) -> tuple[float, ...]:
-        """Return what `SignalTerm.numbers` holds, at most four."""
+        """Return what `SignalTerm.numbers` holds, at most four.
+
+        Args:
+            white_radiance: Radiance that counts as white (`EventCameraConfig.white_radiance`).
+        """
         return ()
 
     def terms(self) -> tuple[str, ...]:

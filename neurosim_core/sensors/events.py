@@ -347,9 +347,10 @@ class EventCamera:
     def begin_windows(
         self, ends_ns: Sequence[int], *, scan_count: int | None = None
     ) -> Callable[[], list[Events]]:
-        """Do what `collect_windows` does, but for the wait for events that are sorted: what is returned does.
+        """Launch what `collect_windows` does; arguments and errors are the same.
 
-        With a `scan_count_max` above 1, `feed_device` may come before that is called, and nothing else.
+        The function that is returned waits for the sorted events and returns the packets. With a
+        `scan_count_max` above 1, `feed_device` may be called before it, and nothing else.
         """
         ends = [int(end) for end in ends_ns]
         under_way = len(self._under_way)

@@ -395,7 +395,12 @@ def _picture_count(group: RenderGroup, images: Mapping[str, ImageChannel], capac
 
 
 def move_bodies(groups: Iterable[RenderGroupState], bodies: Mapping[str, BodyConfig]) -> None:
-    """Let the same bodies move otherwise from now on; nothing may be being rendered."""
+    """Let the same bodies move otherwise from now on; waits for the device.
+
+    Args:
+        groups: All render groups of a state; nothing may be being rendered.
+        bodies: Settings of all bodies, by name, in the order of the model; only `motion` may differ.
+    """
     for group in groups:
         if group.motions is not None:
             wp.copy(group.motions, upload_motions(bodies, group.device))

@@ -135,7 +135,12 @@ def begin_step(
 
 
 def prepare_step(model: Model, state: State) -> None:
-    """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work."""
+    """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work.
+
+    Args:
+        model: What does not change.
+        state: Keeps the plan, which the next `begin_step` uses unless other cameras have been selected.
+    """
     state.planned = _plan_period(model, state)
     plan_ahead(model, state, state.planned.batch)
 
@@ -270,6 +275,11 @@ def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
     An event camera that comes back takes the first instant that it sees as its reference, and its packets
     count on.
 
+    Args:
+        model: What does not change.
+        state: The cameras that look are part of it.
+        names: Names of the cameras that look, in the settings.
+
     Raises:
         ValueError: There is no such camera.
     """
@@ -295,7 +305,12 @@ def observe(state: State) -> Odometry:
 
 
 def start(model: Model, state: State) -> list[Packet]:
-    """Sample every sensor at stamp 0; event cameras take it as their reference."""
+    """Sample every sensor at stamp 0, and return the packets; event cameras take it as their reference.
+
+    Args:
+        model: What does not change.
+        state: As `make_state` returns it: nothing has been launched.
+    """
     launch(model, state, plan_batch(state, [everything(model.schedule)], closed_loop=True))
     return read(model, state)
 

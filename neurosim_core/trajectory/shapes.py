@@ -138,19 +138,24 @@ def line(config: LineConfig) -> Path:
 
 
 def circle(config: CircleConfig, *, center: Array) -> Path:
-    """Return a circle."""
+    """Return a circle, parallel to the ground.
+
+    Args:
+        config: Radius, speed and heading.
+        center: Its centre in W [m], shape [3], unless `config` gives one.
+    """
     radius = config.radius_m
     return _periodic(config, center, (radius, radius, 0.0), (1, 1, 1), (0.5 * math.pi, 0.0, 0.0))
 
 
 def figure_eight(config: FigureEightConfig, *, center: Array) -> Path:
-    """Return a figure eight."""
+    """Return a figure eight, parallel to the ground; arguments as of `circle`."""
     amplitude = (0.5 * config.length_m, 0.5 * config.width_m, 0.0)
     return _periodic(config, center, amplitude, (1, 2, 1), (0.0, 0.0, 0.0))
 
 
 def lissajous(config: LissajousConfig, *, center: Array) -> Path:
-    """Return a Lissajous curve."""
+    """Return a Lissajous curve; arguments as of `circle`."""
     return _periodic(config, center, config.amplitude_m, config.cycles, config.phase_rad)
 
 

@@ -92,7 +92,12 @@ class HostVehicle:
         raise NotImplementedError
 
     def acceleration(self, state: MultirotorState, command: NDArray[np.float64]) -> Acceleration:
-        """Return dv/dt in W [m/s^2] and dw/dt in B [rad/s^2] of one world, each of shape [3]."""
+        """Return dv/dt in W [m/s^2] and dw/dt in B [rad/s^2] of one world, each of shape [3].
+
+        Args:
+            state: Of the vehicle, without the leading axis.
+            command: Rotor speeds that are commanded [rad/s], shape [R].
+        """
         raise NotImplementedError
 
     def advance(self, duration_ns: int) -> None:

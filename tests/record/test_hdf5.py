@@ -635,6 +635,15 @@ def test_files_that_are_not_ours_are_refused(tmp_path):
             Recording(tmp_path / "later.h5")
 
 
+@pytest.mark.parametrize("lost", ["path/stamp_ns", "sensors/imu/sequence"])
+def test_what_is_missing_in_a_recording_is_damage(tmp_path, lost):
+    write(tmp_path / "f.h5", make_flight(0, [1]))
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        del file[lost]
+    with pytest.raises(ValueError, match=r"f.h5 is damaged: "), Recording(tmp_path / "f.h5") as flight:
+        list(flight.packets())
+
+
 def test_unknown_names_list_the_known_ones(tmp_path):
     write(tmp_path / "f.h5", make_flight(0, [1]))
     with Recording(tmp_path / "f.h5") as flight:

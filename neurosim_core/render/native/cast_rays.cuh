@@ -1,2 +1,2 @@
-auto origin_of = [&](int axis, int lane) { return origins.data[lane][axis]; };
+auto origin_of = [&](int axis, int lane) { return origin.data[lane][axis]; };
 #include "cast_lanes.cuh"
