@@ -15,6 +15,7 @@ import numpy as np
 import scipy  # which imports its parts when they are used
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
+from pydantic import model_validator
 
 from neurosim_core.settings import Settings
 
@@ -29,6 +30,10 @@ UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion that is given as a rotation may be from 1."""
 
 
+_MOUNT_MAX_M = 20.0
+"""What is mounted further from the body was meant in millimetres [m]."""
+
+
 class Mount(Settings):
     """Where a sensor sits on the body: exactly T_BS, no hidden lift or lever arm."""
 
@@ -37,6 +42,20 @@ class Mount(Settings):
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll). A camera
     with zeros looks forward; positive pitch looks down."""
+
+    @model_validator(mode="after")
+    def _units_are_right(self) -> Mount:
+        if max(map(abs, self.rpy_rad)) > 2.0 * math.pi:
+            radians = [round(math.radians(value), 6) for value in self.rpy_rad]
+            raise ValueError(
+                f"rpy_rad must be within +-2 pi, got {[*self.rpy_rad]}; if these are degrees, write {radians}"
+            )
+        if max(map(abs, self.position_m)) > _MOUNT_MAX_M:
+            raise ValueError(
+                f"position_m must be within +-{_MOUNT_MAX_M:g} m of the body, got {[*self.position_m]}; if "
+                f"these are millimetres, write {[1e-3 * value for value in self.position_m]}"
+            )
+        return self
 
     def rotation(self) -> scipy.spatial.transform.Rotation:
         """Return R_BS for a sensor with axes forward, left, up."""

@@ -261,6 +261,21 @@ def test_an_interrupted_run_is_kept_whole(tmp_path):
         assert flight.packet_count("imu") > 10
 
 
+def test_an_interrupted_conversion_leaves_nothing(tmp_path):
+    count, draft = 5_000_000, tmp_path / ".out.csv.part"
+    zeros = np.zeros(count, np.uint8)
+    np.savez(tmp_path / "in.npz", t=np.arange(count), x=zeros, y=zeros, p=zeros)
+    command = [sys.executable, "-m", "neurosim_core", "convert", "in.npz", "out.csv", "--size", "4x4"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as conversion:
+        while not draft.exists():
+            assert conversion.poll() is None
+            time.sleep(0.01)
+        conversion.send_signal(signal.SIGINT)
+        assert conversion.communicate(timeout=60.0)[1] == "neurosim: interrupted\n"
+    assert conversion.returncode == 130
+    assert [file.name for file in tmp_path.iterdir()] == ["in.npz"]
+
+
 def test_folders_are_numbered_when_none_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for expected in ("flight", "flight-2", "flight-3"):
@@ -307,7 +322,7 @@ def test_serve_has_its_scene_read_by_another_process(monkeypatch):
         (["run", "--duration", "-1"], "--duration: Input should be greater than 0, got -1.0"),
         (["serve", "--factor", "-1"], "--factor: Input should be greater than or equal to 0, got -1.0"),
         (["serve", "--set", "live.mode=fast"], "--set live.mode: Input should be 'lockstep' or 'streaming'"),
-        (["bench", "closed-loop", "--device", "gpu", "--rates", "5"], "--device: must be auto, cpu"),
+        (["bench", "streaming", "--device", "gpu", "--sampling-rate", "5"], "--device: must be auto, cpu"),
         (["run", "--set", "scene={kind: mesh, file: nothing.glb}"], "nothing.glb"),
         (["scene", "nothing.glb"], "nothing.glb"),
         (["view", "nowhere"], "no flight at"),

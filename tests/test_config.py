@@ -52,7 +52,32 @@ def test_every_key_is_documented():
     assert not missing
 
 
+UNLIT = {"mode": "unshadowed", "edge_max_m": 0.1}
+VOLTMETER = {"preset": "voltmeter_dvs346", "threshold_on": 0.3}
+WITHOUT_EFFECT = [
+    ({"render": {"lighting": UNLIT}}, ["render.lighting", "edge_max_m", "unshadowed"]),
+    (
+        {"sensors": {"e": {"kind": "event_camera", "pixel": VOLTMETER}}},
+        ["e.pixel: threshold_on does nothing"],
+    ),
+    ({"sensors": {"e": {"kind": "event_camera", "classes": {"a": ["*"]}}}}, ["e: classes", "label semantic"]),
+    ({"sensors": {"c": {"kind": "rgb", "shutter": {"direction": "up"}}}}, ["direction", "readout_s is 0"]),
+    ({"sensors": {"c": {"kind": "rgb", "shutter": {"exposure_samples": 4}}}}, ["exposure_s is 0, got 4"]),
+    ({"path": {"height_min_m": 2.0}}, ["path: height_min_m must be below height_max_m = 1.7, got 2"]),
+]
+UNITS = [
+    ({"sensors": {"c": {"kind": "rgb", "mount": {"rpy_rad": [0, 90, 0]}}}}, ["write [0.0, 1.570796, 0.0]"]),
+    ({"sensors": {"c": {"kind": "imu", "mount": {"position_m": [100, 0, 30]}}}}, ["write [0.1, 0.0, 0.03]"]),
+    ({"sensors": {"c": {"kind": "rgb", "shutter": {"readout_s": 0.1}}}}, ["1 / rate_hz = 0.05, got 0.1"]),
+    ({"sensors": {"a": {"kind": "gps", "delay_s": 1e9}}}, ["sensors.a.delay_s", "60"]),
+    ({"vehicle": {"parameters": {"wind_m_s": [3000, 0, 0]}}}, ["wind_m_s.0", "200, got 3000"]),
+    ({"vehicle": {"max_step_s": 1e-12}}, ["vehicle.max_step_s", "1e-12"]),
+    ({"path": {"limits": {"speed_max_m_s": 1e9}}}, ["path.limits.speed_max_m_s", "200"]),
+    ({"free_space": {"voxel_m": 1e-9}}, ["free_space.voxel_m", "1e-09"]),
+]
 WRONG = [
+    *WITHOUT_EFFECT,
+    *UNITS,
     ({"duration_s": -1.0}, ["duration_s", "greater than 0", "-1.0"]),
     ({"duration_ms": 4000}, ["duration_ms", "unknown key", "duration_s"]),
     ({"duration_s": "4 s"}, ["duration_s", "valid number", "'4 s'"]),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.settings_file import nested
+from neurosim_core.signals import raise_at_signals
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -119,8 +120,13 @@ def _transfer(arguments: argparse.Namespace) -> int:
     check_new(out, overwrite=arguments.overwrite)
     console = Console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with raise_at_signals() as raise_again, Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("converting", total=None)
+
+        def on_block(count: int) -> None:
+            raise_again()
+            progress.update(task, description=f"{count:,} events")
+
         done = transfer(
             arguments.source,
             out,
@@ -130,7 +136,7 @@ def _transfer(arguments: argparse.Namespace) -> int:
             sensor=arguments.sensor,
             from_zero=arguments.from_zero,
             time_unit=arguments.time_unit,
-            on_block=lambda count: progress.update(task, description=f"{count:,} events"),
+            on_block=on_block,
         )
     span_s = (done.end_us - done.begin_us) * 1e-6
     more = f", {done.packet_count:,} other packets" if done.packet_count else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import logging
 from collections.abc import Iterator
@@ -37,7 +38,7 @@ class Recording:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file is not a recording, or of another format version.
+            ValueError: The file is not a recording, is damaged, or of another format version.
             ImportError: h5py is not installed.
         """
         h5py = import_h5py()
@@ -49,16 +50,17 @@ class Recording:
         except OSError as error:
             raise ValueError(f"{self._path} is not a readable HDF5 file: {error}") from error
         try:
-            self.header = _read_header(self._file, self._path)
+            with _damage_of(self._path):
+                self.header = _read_header(self._file, self._path)
+                self.clean = bool(self._file.attrs["clean"])
+                self._streams = {
+                    name: _Stream(name, group)
+                    for name, group in self._file["sensors"].items()
+                    if "packet_count" in group
+                }
         except Exception:
             self._file.close()
             raise
-        self.clean = bool(self._file.attrs["clean"])
-        self._streams = {
-            name: _Stream(name, group)
-            for name, group in self._file["sensors"].items()
-            if "packet_count" in group
-        }
         notes = [stream.note for stream in self._streams.values() if stream.note]
         if not self.clean:
             notes.append(f"{self._path} was not closed properly: packets at its end are missing")
@@ -122,7 +124,12 @@ class Recording:
             ValueError: No such sensor.
         """
         streams = [self._stream(name).packets(start_s, end_s) for name in (sensors or self.sensors)]
-        for _, _, packet in heapq.merge(*streams, key=lambda item: item[:2]):
+        merged = heapq.merge(*streams, key=lambda item: item[:2])
+        while True:
+            with _damage_of(self._path):
+                _, _, packet = next(merged, (None, None, None))
+            if packet is None:
+                return
             yield packet
 
     def events(self, sensor: str, start_s: float, end_s: float) -> EventArrays:
@@ -233,6 +240,15 @@ class _Stream:
             stamp_ns, sequence, order = (int(header[name][row]) for name in HEADER_COLUMNS)
             packet = self.packet_class(stamp_ns=stamp_ns, sequence=sequence, sensor=self.name, **values)
             yield stamp_ns, order, packet
+
+
+@contextlib.contextmanager
+def _damage_of(path: Path) -> Iterator[None]:
+    """Say of the errors of HDF5 that they are damage of a file."""
+    try:
+        yield
+    except (KeyError, OSError, RuntimeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def _read_header(file: Any, path: Path) -> RecordingHeader:

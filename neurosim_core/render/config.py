@@ -32,6 +32,18 @@ class LightingConfig(Settings):
     light_radius_m: float = Field(default=0.1, gt=0.0)
     """Radius of the lights [m]: softens shadows, and distances are taken as at least this."""
 
+    @model_validator(mode="after")
+    def _only_baked_light_has_shadows(self) -> LightingConfig:
+        both = ("mode", "light_radius_m")
+        changed = [
+            name
+            for name, field in type(self).model_fields.items()
+            if name not in both and getattr(self, name) != field.default
+        ]
+        if self.mode == "unshadowed" and changed:
+            raise ValueError(f"{', '.join(changed)}: for mode baked, and does nothing with unshadowed")
+        return self
+
 
 class CandidateListConfig(Settings):
     """Candidate lists of tiles of 8 x 8 pixels; they change speed, not results."""

@@ -14,7 +14,7 @@ from typing import Annotated, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.render.camera import Lens
@@ -80,6 +80,14 @@ class ShutterConfig(Settings):
     exposure_samples: Annotated[int, Field(ge=1, le=256)] = 16
     """Instants of an exposure, each with a ray per pixel; at least `render.samples_per_pixel`, 16 if it is
     adaptive and there are several."""
+
+    @model_validator(mode="after")
+    def _keys_have_effect(self) -> ShutterConfig:
+        for name, time in (("direction", "readout_s"), ("exposure_samples", "exposure_s")):
+            value, default = getattr(self, name), type(self).model_fields[name].default
+            if value != default and getattr(self, time) == 0.0:
+                raise ValueError(f"{name} does nothing where {time} is 0, got {value!r}")
+        return self
 
     @property
     def window_ns(self) -> int:

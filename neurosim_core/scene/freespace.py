@@ -45,7 +45,7 @@ _CPU_CHUNKS = 8
 class FreeSpaceConfig(Settings):
     """How finely the room in a scene is mapped."""
 
-    voxel_m: float = Field(default=0.1, gt=0.0)
+    voxel_m: float = Field(default=0.1, ge=1e-6)
     """Spacing of the distance grid [m]."""
     voxel_count_max: int = Field(default=8_000_000, ge=1_000)
     """Most voxels (4 bytes each); a larger scene gets coarser ones, and a note says so."""
@@ -331,8 +331,8 @@ def map_distances(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") ->
     bounds = scene.bounds_m
     notes: list[str] = []
     voxel = config.voxel_m
-    while (counts := _counts(bounds, voxel)).prod() > config.voxel_count_max:
-        voxel *= max(1.01, (int(counts.prod()) / config.voxel_count_max) ** (1.0 / 3.0))
+    while (counts := _counts(bounds, voxel)).prod(dtype=float) > config.voxel_count_max:
+        voxel *= max(1.01, (counts.prod(dtype=float) / config.voxel_count_max) ** (1.0 / 3.0))
     if voxel != config.voxel_m:
         notes.append(
             f"Free space is mapped in voxels of {voxel:.3g} m instead of {config.voxel_m:g} m: "

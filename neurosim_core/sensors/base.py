@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
@@ -340,6 +340,15 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
     packet_type: ClassVar[type[Packet]] = Image
     encoding: ClassVar[ImageEncoding]
     """What a pixel of its pictures is."""
+
+    @model_validator(mode="after")
+    def _pictures_do_not_overlap(self) -> ImageSensorConfig:
+        for name in ("readout_s", "exposure_s"):
+            if (time_s := getattr(self.shutter, name)) * self.rate_hz > 1.0 + 1e-6:
+                raise ValueError(
+                    f"shutter.{name} must be at most 1 / rate_hz = {1.0 / self.rate_hz:g}, got {time_s:g}"
+                )
+        return self
 
     @property
     def timing(self) -> RayTiming | None:

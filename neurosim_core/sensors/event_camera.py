@@ -57,6 +57,12 @@ class EventSensorConfig(FrameSensorConfig):
 
     packet_type = Events
 
+    @model_validator(mode="after")
+    def _classes_are_labels(self) -> EventSensorConfig:
+        if self.classes is not None and "semantic" not in self.labels:
+            raise ValueError(f"classes are for the label semantic, got labels {list(self.labels)}")
+        return self
+
     @property
     def look_back_ns(self) -> int:
         """Over the events of a packet, and of the batch that it ends in."""

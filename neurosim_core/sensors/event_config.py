@@ -338,6 +338,9 @@ class EventCameraConfig(Settings):
             for name in ("threshold_jitter", "lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} must be null where stochastic is given, which has its own")
+            for name in ("threshold_on", "threshold_off"):
+                if (value := getattr(self, name)) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name} does nothing where stochastic is given, got {value:g}: use k1")
         kinds = [term for each in self.noise for term in each.terms()]
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"noise must have each kind once, got {', '.join(kinds)}")

@@ -107,7 +107,7 @@ class LateConfig(StateSensorConfig):
 
     rate_hz: RateHz = 100.0
     """Samples a second [Hz]."""
-    delay_s: NonNegative = 0.0
+    delay_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
     """Age of a sample when it comes, at the stamp [s]; a multiple of 1 / rate_hz."""
     dropout_probability: Probability = 0.0
     """Share of samples that do not come."""

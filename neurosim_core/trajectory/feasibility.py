@@ -29,7 +29,7 @@ _PARTS = 16
 class FlightLimits(Settings):
     """What a path may ask of the vehicle; holds everywhere on the path."""
 
-    speed_max_m_s: float = Field(default=3.0, gt=0.0)
+    speed_max_m_s: float = Field(default=3.0, gt=0.0, le=200.0)
     """Largest speed [m/s]."""
     thrust_to_weight_max: float = Field(default=1.6, gt=1.0)
     """Largest thrust as a multiple of the weight."""

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 import scipy  # which imports its parts when they are used
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Vector3
@@ -79,6 +79,14 @@ class TourConfig(CollisionFreeConfig):
     """Least height of goals above what is below them [m]."""
     height_max_m: float = Field(default=1.7, gt=0.0)
     """Largest height of goals above what is below them [m]."""
+
+    @model_validator(mode="after")
+    def _heights_are_a_range(self) -> TourConfig:
+        if not self.height_min_m < self.height_max_m:
+            raise ValueError(
+                f"height_min_m must be below height_max_m = {self.height_max_m:g}, got {self.height_min_m:g}"
+            )
+        return self
 
 
 class WaypointsConfig(CollisionFreeConfig):

@@ -24,7 +24,7 @@ from neurosim_core.vehicle.aerodynamics import (
 )
 from neurosim_core.vehicle.command_ranges import CommandRangesConfig
 from neurosim_core.vehicle.ground import GroundConfig
-from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig
+from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig, WindVector
 
 TERMS = (
     "motor_lag",
@@ -79,7 +79,7 @@ class MultirotorConfig(Settings):
     """Fastest speed of a rotor [rad/s]; commands above saturate there."""
     gravity_m_s2: NonNegative = 9.81
     """Gravity along world -z [m/s^2]."""
-    wind_m_s: Vector3 = (0.0, 0.0, 0.0)
+    wind_m_s: WindVector = (0.0, 0.0, 0.0)
     """Velocity of the air in W [m/s]."""
     gusts: tuple[GustConfig, ...] = ()
     """Discrete gusts, which add up."""

@@ -36,7 +36,7 @@ class VehicleConfig(Settings):
 
     kind: str
     """Under which name the class is registered."""
-    max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
+    max_step_s: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.001
     """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
     collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
     """Radius of the sphere around the vehicle that must not touch the scene [m]. Where `parameters.ground`

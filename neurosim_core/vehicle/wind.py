@@ -48,10 +48,15 @@ _SERIES_TERM_COUNT = wp.constant(wp.int32(12))
 _vec5d = wp.types.vector(length=5, dtype=wp.float64)
 
 
+_Wind = Annotated[float, Field(ge=-200.0, le=200.0)]
+WindVector = tuple[_Wind, _Wind, _Wind]
+"""Velocity of the air [m/s], up to twice a hurricane's: what is faster passes walls between two checks."""
+
+
 class GustConfig(Settings):
     """A discrete gust that rises and falls as 1 - cos, the same everywhere."""
 
-    velocity_m_s: Vector3
+    velocity_m_s: WindVector
     """Velocity of the air at full strength, added to the wind, in W [m/s]: amplitude and direction."""
     start_s: Annotated[float, Field(ge=0.0, le=1e6)]
     """When it begins [s]."""
