@@ -83,7 +83,8 @@ class SceneReader:
         assert self._process.stdout is not None
         with self._turn:
             while len(self._answers) <= number:
-                self._answers.append(json.loads(self._process.stdout.readline() or "null"))
+                line = self._process.stdout.readline()
+                self._answers.append(json.loads(line) if line.endswith(b"\n") else None)
         places = self._answers[number]
         if places is None:
             raise NotReadError
