@@ -237,7 +237,7 @@ def test_there_is_room_beside_a_flat_scene(axis):
     beside[axis] = 1.5
     assert space.clearance(beside[None])[0] == pytest.approx(1.5, abs=0.1)
     assert any("flat" in note for note in space.notes)
-    with pytest.raises(ValueError, match="no free space at 0.1 m resolution"):
+    with pytest.raises(ValueError, match="the scene has no free space"):
         make_free_space(as_scene(box((0.0, 0.0, 0.0), (0.15, 0.15, 0.15))), FreeSpaceConfig())
 
 
