@@ -31,20 +31,32 @@ class LoopReader:
         self._subscriber = subscriber
         self._is_watching = False
         self._waiters: set[asyncio.Future[None]] = set()
+        self._timer: asyncio.TimerHandle | None = None
 
     async def wait(self, timeout_s: float) -> None:
         """Return when something may have come, at the latest after the time."""
         if not self._is_watching:
             self.loop.add_reader(self._subscriber.fd, self._wake)
             self._is_watching = True
+        self._set_timer(self.loop.time() + timeout_s)
         waiter: asyncio.Future[None] = self.loop.create_future()
         self._waiters.add(waiter)
-        timer = self.loop.call_later(timeout_s, self._wake_all)
         try:
             await waiter
         finally:
-            timer.cancel()
             self._waiters.discard(waiter)
+
+    def _set_timer(self, when_s: float) -> None:
+        """Wake all at that time or earlier: one timer serves a stream that waits thousands of times."""
+        if self._timer is not None:
+            if self._timer.when() <= when_s:
+                return
+            self._timer.cancel()
+        self._timer = self.loop.call_at(when_s, self._on_time)
+
+    def _on_time(self) -> None:
+        self._timer = None
+        self._wake_all()
 
     def _wake(self) -> None:
         self._subscriber.wakeup.clear()
@@ -68,6 +80,9 @@ class LoopReader:
 
         def leave() -> None:
             self._forget()
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None  # a task that goes on to wait needs another
             self._wake_all()
 
         if not self.loop.is_closed():

@@ -322,7 +322,7 @@ def test_serve_has_its_scene_read_by_another_process(monkeypatch):
         (["run", "--duration", "-1"], "--duration: Input should be greater than 0, got -1.0"),
         (["serve", "--factor", "-1"], "--factor: Input should be greater than or equal to 0, got -1.0"),
         (["serve", "--set", "live.mode=fast"], "--set live.mode: Input should be 'lockstep' or 'streaming'"),
-        (["bench", "closed-loop", "--device", "gpu", "--rates", "5"], "--device: must be auto, cpu"),
+        (["bench", "streaming", "--device", "gpu", "--sampling-rate", "5"], "--device: must be auto, cpu"),
         (["run", "--set", "scene={kind: mesh, file: nothing.glb}"], "nothing.glb"),
         (["scene", "nothing.glb"], "nothing.glb"),
         (["view", "nowhere"], "no flight at"),

@@ -62,6 +62,16 @@ class Options:
         "synthetic",
         choices=["synthetic", "warp"],
     )
+    sampling_rate: float | None = _option(
+        "renders of the event camera a second (default: 25, on a GPU 500)", type=float, metavar="HZ"
+    )
+    delays: tuple[float, ...] | None = _option(
+        "what the controller sleeps before commands", type=_numbers(float), metavar="S,..."
+    )
+    tours: int | None = _option("how many paths to fly", type=int, metavar="N")
+    mode: str = _option(
+        "what is commanded (default: velocity)", "velocity", choices=["motor_speeds", "velocity", "position"]
+    )
     logs: tuple[Path, ...] | None = _option(
         "logs of flights: time [s], accelerometer [g], gyroscope [deg/s], commands of four motors [PWM]",
         type=_paths,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block, take_all
-from processes import ROOT, SOON_S, Beside, Lines, wait_for
+from processes import ROOT, SOON_S, Beside, Lines
 from test_end_of_stream import expected, leavers
 from wire_vectors import message_to_plain
 
@@ -175,14 +175,16 @@ def test_reliable_from_rust(start, make_node):
     assert subscriber.counters.rejected == subscriber.counters.cut_off == 0
 
 
-def test_a_reader_that_rust_does_not_wait_for(start, make_node):
-    """It counts what it has lost, learns of the last loss, and gets messages again."""
+@pytest.mark.parametrize("pause_s", [0.0, 0.5], ids=["at once", "after it was told first"])
+def test_a_reader_that_rust_does_not_wait_for(start, make_node, pause_s):
+    """It counts what it has lost, learns of the last loss whenever it reads, and gets messages again."""
     publishing = Publishing(start("pub", "/blocks"), Block)
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
     publishing.await_subscribers(1)
     count = 2_000  # of a kilobyte: more than lies between the two
     for number in range(count):
         publishing.publish(make_block(number, 1_000))
+    time.sleep(pause_s)
     numbers: list[int] = []
     while len(numbers) + subscriber.counters.lost < count:
         blocks = take_all(subscriber)
@@ -199,22 +201,6 @@ def test_a_reader_that_rust_does_not_wait_for(start, make_node):
     first = next(index for index, number in enumerate([*numbers, count]) if index != number)
     assert lost <= counted["timeouts"] < count + 20 - first
     assert (subscriber.counters.lost, subscriber.counters.rejected) == (lost, 0)
-
-
-def test_a_reader_that_rust_passed_over_learns_of_it_whenever_it_reads(start, make_node):
-    """It is told again and again how many messages there were."""
-    publishing = Publishing(start("pub", "/blocks"), Block)
-    subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, timeout_s=0.0))
-    publishing.await_subscribers(1)
-    count = 2_000
-    for number in range(count):
-        publishing.publish(make_block(number, 1_000))
-    time.sleep(0.5)  # several times the silence after which it is told first
-    received: list[Block] = []
-    wait_for(
-        lambda: received.extend(take_all(subscriber)) or len(received) + subscriber.counters.lost == count
-    )
-    assert subscriber.counters.lost > 0
 
 
 def test_several_subscribers_of_rust(start, make_node):
