@@ -22,6 +22,7 @@ from test_hdf5 import HEADER, MS, assert_same, image, make_events, make_flight, 
 
 from neurosim_core.packets import Events, FieldSpec, Packet
 from neurosim_core.record import Recording
+from neurosim_core.record.hdf5 import deflate_count
 from neurosim_core.record.process import RecordingProcess, start_process
 
 PACKETS = make_flight(5, [700, 0, 20_000, 30, 1, 500] * 4)[:-1]
@@ -168,6 +169,24 @@ def test_a_writer_that_is_killed_is_noticed(tmp_path):
         all(writer.write(packet) is None for packet in itertools.repeat(PACKETS[0]))
     assert writer.kept_ns is None
     writer.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="which processes there are, only Linux says in files")
+def test_a_compressor_that_is_killed_is_noticed(tmp_path):
+    writer = RecordingProcess(tmp_path / "f.h5", HEADER)
+    writer.write(PACKETS[0])
+    pid = writer._process.popen.pid
+    children: list[str] = []
+    while len(children) < deflate_count():
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    for child in children:
+        os.kill(int(child), signal.SIGKILL)
+    for packet in PACKETS[1:]:
+        writer.write(packet)
+    with pytest.raises(OSError, match="a process that compresses has ended"):
+        writer.close()
+    with Recording(tmp_path / "f.h5") as flight:
+        assert not flight.clean
 
 
 def test_writing_waits_for_a_process_that_stands_still(tmp_path):
