@@ -375,7 +375,6 @@ class Antialiasing:
         outputs: Collection[str],
         terms: RenderTerms,
         device: str,
-        thread_count: int | None,
         pixel_count: int,
     ) -> None:
         """Choose the kernels and allocate what they share, for launches of at most `pixel_count` pixels.
@@ -383,7 +382,7 @@ class Antialiasing:
         Rays are `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4]; terms are those of
         the first pass.
         """
-        self._device, self._thread_count = device, thread_count
+        self._device = device
         is_cuda = wp.get_device(device).is_cuda
         self._kernels = antialiasing_kernels(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
         self._lists = make_lists(pixel_count // _LANES, device) if is_cuda else None
@@ -409,7 +408,6 @@ class Antialiasing:
                 inputs=inputs,
                 outputs=[out],
                 device=self._device,
-                thread_count=self._thread_count,
             )
             return
         self._lists.count.zero_()
