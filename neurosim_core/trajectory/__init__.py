@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Annotated
 
-import numpy as np
 import scipy  # which imports its parts when they are used
 from pydantic import Field
 
@@ -96,22 +94,8 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def load_scipy() -> None:
-    """Import what free space and paths take from SciPy, so that it is there when they need it; for a command.
-
-    Half of the time of an import goes into notes that SciPy adds to docstrings of its functions, which it
-    parses, and into modules of NumPy that it looks at and does not use: it finds neither.
-    """
-    getdoc, found = inspect.getdoc, vars(np)
-    hidden = {"f2py", "testing"} - found.keys()  # NumPy imports them when it is asked for them
-    inspect.getdoc = lambda _: ""  # type: ignore[assignment]
-    found.update(dict.fromkeys(hidden))
-    try:
-        _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
-    finally:
-        inspect.getdoc = getdoc
-        for name in hidden:
-            if found[name] is None:
-                del found[name]
+    """Import what free space, paths and light take from SciPy, so that it is there when they need it."""
+    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
