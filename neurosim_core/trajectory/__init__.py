@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Annotated
 
 import scipy  # which imports its parts when they are used
@@ -95,16 +94,8 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def load_scipy() -> None:
-    """Import what free space and paths take from SciPy, so that it is there when they need it; for a command.
-
-    SciPy parses docstrings of many functions to add notes, a third of the time of its import: it finds none.
-    """
-    getdoc = inspect.getdoc
-    inspect.getdoc = lambda _: ""  # type: ignore[assignment]
-    try:
-        _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
-    finally:
-        inspect.getdoc = getdoc
+    """Import what free space, paths and light take from SciPy, so that it is there when they need it."""
+    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
