@@ -101,7 +101,6 @@ class CandidateLists:
         config: CandidateListConfig,
         instant_count: int,
         has_fallback: bool,
-        thread_count: int | None = None,
     ) -> None:
         """Allocate the lists, for at most `instant_count` instants per launch.
 
@@ -117,7 +116,6 @@ class CandidateLists:
         bounds = tile_bounds(rays, width, height)
         self._tree, self._width, self._height, self._extent_m = tree, width, height, extent_m
         self._device = str(tree.nodes.device)
-        self._thread_count = thread_count
         self._lanes = 1 if tree.nodes.device.is_cpu else BLOCK
         self.data = CandidateListData()
         self.data.instants = config.instants
@@ -150,5 +148,4 @@ class CandidateLists:
             inputs=[self._tree, rays, self._width, self._height, self._extent_m, instant_count, p_WC, q_WC],
             outputs=[self.data],
             device=self._device,
-            thread_count=self._thread_count,
         )

@@ -147,10 +147,6 @@ class Pixels:
         self.states.set_reset(stamp_ns)
         self.states.begin_noise(self._overflow, 0)
 
-    def since_reset_ns(self, origin_ns: int) -> int:
-        """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
-        return 0 if self.noise is None else self.noise.since_reset_ns(origin_ns)
-
     def next_state(self, state: int) -> int:
         """Return where in the ring the state after another is."""
         return (state + 1) % len(self.states.last)
