@@ -41,7 +41,7 @@ def receive_frame(link: socket.socket) -> tuple[list[Any], NDArray[np.uint8]]:
     sizes = bytearray(_SIZES.size)
     _receive_into(link, [memoryview(sizes)])
     bodies, arrays = (np.empty(size, np.uint8) for size in _SIZES.unpack(sizes))
-    _receive_into(link, [memoryview(bodies), memoryview(arrays)])
+    _receive_into(link, [bodies.data, arrays.data])
     stream, contents = io.BytesIO(bodies.tobytes()), []
     while stream.tell() < bodies.size:
         contents.append(pickle.load(stream))
