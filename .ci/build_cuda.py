@@ -28,9 +28,9 @@ from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement_kernels import rule_kernels
+from neurosim_core.sensors.event_kernels import make_noisy_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
-from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.sim.trace import note_state

@@ -19,12 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from neurosim_core import __version__
-from neurosim_core.bench import commands as bench
-from neurosim_core.convert import command as convert
-from neurosim_core.data import command as dataset
-from neurosim_core.fit import command as fit
 from neurosim_core.garbage import no_collection
-from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_settings, load_settings, settings_of
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once, raise_at_signals
 
@@ -54,8 +49,11 @@ def _run_command(argv: Sequence[str] | None) -> int:
         os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")  # it would look through all that is installed
     began_s = time.perf_counter()
-    arguments = _parser().parse_args(argv)
-    if arguments.command.__module__ != learn.__name__:  # whose PyTorch may multiply with OpenBLAS
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser(argv).parse_args(argv)
+    if (
+        arguments.command.__module__ != "neurosim_core.learn.command"
+    ):  # whose PyTorch may multiply with OpenBLAS
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
     arguments.began_s = began_s
     if arguments.computes:
@@ -105,7 +103,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message.rstrip('; ')}; `{self.prog} --help` lists what there is\n")
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return a parser of all commands; if `argv` begins with one of this module, of those alone."""
     parser: argparse.ArgumentParser = _Parser(
         prog="neurosim",
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
@@ -114,17 +113,22 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
-    others = (
-        convert.add_parser,
-        dataset.add_parser,
-        dataset.add_compare_parser,
-        fit.add_parser,
-        bench.add_parser,
-        learn.add_parsers,
-    )
-    for add in (*parsers, *others):
+    for add in (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view):
         add(commands)
+    if argv and argv[0] in commands.choices:
+        return parser
+    from neurosim_core.bench import commands as bench  # with the others 0.03 s
+    from neurosim_core.convert import command as convert
+    from neurosim_core.data import command as dataset
+    from neurosim_core.fit import command as fit
+    from neurosim_core.learn import command as learn
+
+    convert.add_parser(commands)
+    dataset.add_parser(commands)
+    dataset.add_compare_parser(commands)
+    fit.add_parser(commands)
+    bench.add_parser(commands)
+    learn.add_parsers(commands)
     return parser
 
 
@@ -156,6 +160,9 @@ def _add_fly(commands: _Commands) -> None:
         default="motor_speeds",
         choices=["motor_speeds", "velocity", "position"],
         help="what to command (default: motor_speeds)",
+    )
+    fly.add_argument(
+        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
     )
     fly.add_argument(
         "--policy",
@@ -335,13 +342,15 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 def _fly(arguments: argparse.Namespace) -> int:
     if arguments.policy is not None:
-        return learn.fly_policy(arguments, settings_of(arguments))
+        from neurosim_core.learn.command import fly_policy
+
+        return fly_policy(arguments, settings_of(arguments))
     if arguments.save is not None:
         raise ValueError("--save goes with --policy; `neurosim serve --record DIR` records other flights")
     from neurosim_core.live.controller import fly
 
     config = load_settings(arguments) if arguments.config is not None or settings_of(arguments) else None
-    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode)
+    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
 def _up(arguments: argparse.Namespace) -> int:
@@ -374,6 +383,9 @@ def _scene(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    kinds = (".rrd",) if arguments.flight is None else (".rrd", ".webp", ".gif")
+    if arguments.save is not None and arguments.save.suffix not in kinds:
+        raise ValueError(f"--save writes {' or '.join(kinds)} here, got {arguments.save}")
     if arguments.flight is None:
         from neurosim_core.live.viewer import view
 
@@ -387,9 +399,10 @@ def _view(arguments: argparse.Namespace) -> int:
             open_browser=not arguments.no_browser,
         )
     from neurosim_core.flight import rerun_file
-    from neurosim_core.view.film import SUFFIXES, save_film
 
-    if arguments.save is not None and arguments.save.suffix in SUFFIXES:
+    if arguments.save is not None and arguments.save.suffix != ".rrd":
+        from neurosim_core.view.film import save_film
+
         flight = arguments.flight
         save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
         print(f"wrote {arguments.save}")

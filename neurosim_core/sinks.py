@@ -254,7 +254,9 @@ class EventFileSinkConfig(SinkConfig):
         cameras = {key: each.lens for key, each in sensors.items() if isinstance(each, EventSensorConfig)}
         camera = self.sensor or next(iter(cameras), "")
         if camera not in cameras:
-            known = ", ".join(cameras) or "there is none"
+            if not cameras:
+                raise ValueError(f"sinks.{name}: needs an event camera, and there is none")
+            known = ", ".join(cameras)
             raise ValueError(f"sinks.{name}: no event camera {camera!r}, known: {known}")
         return camera, create_events(file, width=cameras[camera].width, height=cameras[camera].height)
 

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import trimesh
 import yaml
 
 from neurosim_core import cli, load_config
@@ -114,15 +115,20 @@ def test_settings_of_the_documentation(name):
     assert config != load_config({"duration_s": config.duration_s})
 
 
-def test_the_other_commands(house, tmp_path, monkeypatch, capsys):
-    """The list under "What else there is", shortened where a flight would take long; all in this process."""
+def test_the_other_commands(tmp_path, monkeypatch, capsys):
+    """The list under "What else there is", shortened where a flight would take long; all in this process.
+
+    An empty room stands for house.glb.
+    """
     listed = commands("alone")
     assert len(listed) == 8
     small = (
         " --duration 0.05 --set render.lighting.mode=unshadowed --set sensors.events.kind=event_camera"
         " --set 'sensors.events.lens={width: 32, height: 24, horizontal_fov_rad: 1.5}'"
     )
-    (tmp_path / "house.glb").symlink_to(house)
+    room = trimesh.creation.box(extents=(6.0, 5.0, 2.7))
+    room.invert()
+    room.export(tmp_path / "house.glb")
     monkeypatch.chdir(tmp_path)
 
     def run(command: str) -> str:

@@ -56,6 +56,8 @@ class Question:
 _VIEW = ("scene", "device", "width", "height")
 _STEPS = ("instants", "steps", "max_displacement", "samples")
 _LOOP = ("rates", "renderer", "seconds", "settings")
+_STREAM = ("sampling_rate", "seconds", "settings")
+_DELAY = ("delays", "tours", "mode", "seconds", "settings")
 
 QUESTIONS: Sequence[Question] = (
     Question("dynamics", "error against run time of the flight dynamics, and stiff and extreme flights"),
@@ -66,8 +68,11 @@ QUESTIONS: Sequence[Question] = (
     Question("throughput", "whole steps a second, and what their parts take", ("scene", "device", "samples")),
     Question("worlds", "renders a second of many worlds stepped together", (*_VIEW, "worlds", "seconds")),
     Question("data", "windows a second from a recording, for learning"),
+    Question("leave-out", "what a scene does not need is not computed: kernels, memory, libraries, time"),
     Question("step", "whole steps a second with one event camera", (*_VIEW, *_STEPS), False),
     Question("closed-loop", "from command to image between processes", (*_VIEW, *_LOOP), False),
+    Question("streaming", "an IMU beside an event camera in real time", (*_VIEW, *_STREAM), False),
+    Question("delay", "a slow controller against the same delay in lockstep", _DELAY, False),
 )
 """All questions; `bench all` asks in this order."""
 

@@ -17,7 +17,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.control import PathFollower
 from neurosim_core.frames import Mount
-from neurosim_core.live.probe import ProbeError, answer_images
+from neurosim_core.live.probe import ProbeError, StreamProbe, answer_images
 from neurosim_core.overrides import set_options
 from neurosim_core.packets import EventArrays, Events, Odometry
 from neurosim_core.record import Recording

@@ -77,6 +77,24 @@ class NeurosimProcess:
         lines = self._log.read_text(errors="replace").strip().splitlines()[-5:]
         return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it ends by itself; raise `ProcessEnded` where its status is not 0, or `TimeoutError`."""
+        try:
+            status = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            late = f"`neurosim {self._command}` did not end within {timeout_s:g} s"
+            raise TimeoutError(f"{late}; {self.last_words()}") from None
+        if status != 0:
+            self.check()
+
+    def resident_bytes(self) -> int:
+        """Return the memory that it holds, shared pages included; -1 where the system does not say."""
+        try:
+            pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1])
+        except (OSError, IndexError):
+            return -1
+        return pages * os.sysconf("SC_PAGE_SIZE")
+
     def __enter__(self) -> NeurosimProcess:
         return self
 

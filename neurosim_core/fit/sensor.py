@@ -267,6 +267,8 @@ def _square_wave(stimulus: Stimulus, rise_count: int, period_s: float) -> tuple[
     starts, falls = find_steps(stimulus.steps)
     bright_s = 1e-6 * float(np.median(falls - starts))
     rise_s = max(stimulus.rise_s, 1e-6)
+    if rise_s >= (level_s := min(bright_s, period_s - bright_s)):
+        raise ValueError(f"--rise must be shorter than a level of the steps, {level_s:.3g} s, got {rise_s:g}")
     top = math.log(stimulus.contrast)
     log, time_s = [0.0], [0.0]
     for number in range(rise_count + 1):

@@ -63,16 +63,19 @@ class PathController:
         *,
         lockstep: bool,
         rotor_speed: NDArray[np.float64],
+        delay_s: float = 0.0,
     ) -> None:
         """Connect.
 
         `follower`: makes the commands; for this controller only. `lockstep`: whether the simulator waits for
-        each command. `rotor_speed`: rotor speeds before any have arrived [rad/s], shape [R].
+        each command. `rotor_speed`: rotor speeds before any have arrived [rad/s], shape [R]. `delay_s`: how
+        long to sleep before each command [s].
         """
         self.vehicle = vehicle
         self.command_count = self.lost_count = self.missing_count = 0
         self.error_square_sum_m2 = 0.0
         self._follower = follower
+        self._delay_s = delay_s
         self._wait_s = _ROTORS_S["lockstep" if lockstep else "streaming"]
         self._newest = rotor_speed
         self._speeds: dict[int, NDArray[np.float64]] = {}
@@ -104,6 +107,8 @@ class PathController:
         except TimeoutError:
             return False
         rotor_speed = self._rotor_speed_of(odometry)
+        if self._delay_s > 0.0:
+            self._closed.wait(self._delay_s)
         command = self._follower.command(
             stamp_ns=odometry.stamp_ns,
             position=odometry.position,
@@ -192,10 +197,11 @@ class PathController:
 class _Fleet:
     """The controllers of all vehicles, a thread for each. A context manager."""
 
-    def __init__(self, node: Node, *, only: str | None, mode: FollowMode) -> None:
+    def __init__(self, node: Node, *, only: str | None, mode: FollowMode, delay_s: float) -> None:
         self.mode = mode
         self._node = node
         self._only = only
+        self._delay_s = delay_s
         self._planned: SimulationConfig | None = None
         self._paths: dict[str, Path] = {}
         self._controllers: list[PathController] = []
@@ -229,6 +235,7 @@ class _Fleet:
                 ),
                 lockstep=lockstep,
                 rotor_speed=np.full(airframe.rotor_count, airframe.hover_rotor_speed_rad_s),
+                delay_s=self._delay_s,
             )
             self._stack.callback(controller.close)  # before the pool waits for its threads
             self._controllers.append(controller)
@@ -274,7 +281,7 @@ class _Fleet:
         self.stop()
 
 
-def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> int:
+def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, delay_s: float) -> int:
     """Fly the vehicles of a simulator along their paths, until it ends or this is interrupted.
 
     It waits for a simulator, and for the next one when that has gone. After a collision it waits for a reset.
@@ -283,6 +290,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
         config: What is flown where; None: as the simulator says.
         vehicle: Fly only this one; None: all.
         mode: What to command: motor_speeds, velocity or position.
+        delay_s: How long to sleep before each command [s].
 
     Returns:
         0: the simulator has flown all that it was to fly; 130: interrupted.
@@ -290,6 +298,8 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
     Raises:
         ValueError: An argument is not allowed, there is no such vehicle, or no path.
     """
+    if not 0.0 <= delay_s < math.inf:
+        raise ValueError(f"delay_s must be >= 0, got {delay_s}")
     if mode not in get_args(FollowMode):
         raise ValueError(f"unknown mode {mode!r}, known: {', '.join(get_args(FollowMode))}")
     console, stop = Console(highlight=False), threading.Event()
@@ -302,7 +312,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str) -> i
 
     with (
         Node("controller") as node,
-        _Fleet(node, only=vehicle, mode=cast(FollowMode, mode)) as fleet,
+        _Fleet(node, only=vehicle, mode=cast(FollowMode, mode), delay_s=delay_s) as fleet,
         console.status("") as line,
         handle_signals(on_signal),
     ):

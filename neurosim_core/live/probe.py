@@ -1,4 +1,4 @@
-"""A controller that notes when images arrive, for the benchmark of the live stack."""
+"""Nodes that note when messages arrive, for the benchmarks of the live stack."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex import Node, Publisher, Subscriber, keep_last, latest
-from cortex.messages import Image, MotorCommand, RotorSpeeds
-from neurosim_core.live.topics import command_topic, stream_topic
+from cortex.messages import Events, Image, Imu, MotorCommand, RotorSpeeds, SimulatorStatus
+from neurosim_core.live.topics import STATUS, command_topic, stream_topic
 
 Check = Callable[[], None]
 """Called about five times a second during a wait; raises if the wait is pointless."""
@@ -147,3 +147,95 @@ def _receive(subscriber: Subscriber[Any], check: Check, limit_s: float) -> tuple
             check()
             if time.monotonic() > deadline_s:
                 raise ProbeError(f"{subscriber.topic} was silent for {limit_s:g} s") from None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StreamTrace:
+    """What a `StreamProbe` has noted."""
+
+    imu_stamp_ns: NDArray[np.int64]
+    """Stamps of the samples [ns], shape [samples]."""
+    imu_received_ns: NDArray[np.int64]
+    """When they arrived, by `time.monotonic_ns` [ns], shape [samples]."""
+    imu_lost_count: int
+    packet_count: int
+    """Packets of events."""
+    event_count: int
+    packet_lost_count: int
+    event_dropped_count: int
+    """Events that the simulator dropped."""
+    status: SimulatorStatus
+    """The last one."""
+    resident_bytes: NDArray[np.int64]
+    """Memory of each watched process, about once a second, shape [times, processes]; -1: unknown."""
+    resident_s: NDArray[np.float64]
+    """When, since the first sample [s], shape [times]."""
+
+
+class StreamProbe:
+    """Notes the samples of an IMU and the packets of an event camera. A context manager."""
+
+    def __init__(self, *, vehicle: str, imu: str, camera: str) -> None:
+        """Subscribe; before time begins."""
+        self._node = Node("stream probe")
+        topic = stream_topic(vehicle, camera)
+        self._imu = self._node.subscriber(stream_topic(vehicle, imu), Imu, policy=keep_last(_SMALL_DEPTH))
+        self._events = self._node.subscriber(topic, Events, self._on_events, policy=keep_last(256))
+        self._node.subscriber(STATUS, SimulatorStatus, self._on_status, policy=latest())
+        self._sequences: list[int] = []
+        self._event_count = self._dropped_count = 0
+        self._status: SimulatorStatus | None = None
+
+    def __enter__(self) -> StreamProbe:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._node.close()
+
+    def _on_events(self, events: Events) -> None:
+        self._sequences.append(events.sequence)
+        self._event_count += len(events.t)
+        self._dropped_count += events.dropped_count
+
+    def _on_status(self, status: SimulatorStatus) -> None:
+        self._status = status
+
+    def listen(self, seconds: float, *, resident: Callable[[], list[int]], check: Check) -> StreamTrace:
+        """Note what arrives.
+
+        `seconds`: how long, from the first sample of the IMU on [wall-clock s]. `resident`: returns the
+        memory of the watched processes [bytes]. `check`: see `Check`.
+        """
+        samples: list[tuple[int, int, int]] = []
+        memory: list[list[int]] = []
+        memory_ns: list[int] = []
+        while not samples or samples[-1][1] < samples[0][1] + seconds * 1e9:
+            sample, info = _receive(self._imu, check, _SILENCE_S if samples else _START_S)
+            received_ns = info.publish_ns + info.latency_ns
+            samples.append((sample.stamp_ns, received_ns, sample.sequence))
+            if not memory_ns or received_ns >= memory_ns[-1] + 1_000_000_000:
+                memory.append(resident())
+                memory_ns.append(received_ns)
+        memory.append(resident())
+        memory_ns.append(samples[-1][1])
+        if self._status is None:
+            raise ProbeError(f"{STATUS} was silent for {seconds:g} s")
+        stamps, times, sequences = np.array(samples, dtype=np.int64).T
+        packets = self._sequences[:]
+        return StreamTrace(
+            imu_stamp_ns=stamps,
+            imu_received_ns=times,
+            imu_lost_count=_gaps(sequences.tolist()),
+            packet_count=len(packets),
+            event_count=self._event_count,
+            packet_lost_count=_gaps(packets),
+            event_dropped_count=self._dropped_count,
+            status=self._status,
+            resident_bytes=np.array(memory, dtype=np.int64),
+            resident_s=1e-9 * (np.array(memory_ns) - times[0]),
+        )
+
+
+def _gaps(sequences: list[int]) -> int:
+    """Return how many numbers are missing."""
+    return sequences[-1] - sequences[0] + 1 - len(sequences) if sequences else 0

@@ -125,7 +125,7 @@ class Chunks(NamedTuple):
 
     first: int
     """First row."""
-    future: Future[list[list[bytes]]]
+    future: Future[list[list[Any]]]
     position: int
     """Of their list in its result."""
 

@@ -44,6 +44,7 @@ import queue
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,6 +54,7 @@ import numpy as np
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.install import need
 from neurosim_core.packets import Packet
+from neurosim_core.record.columns import deflate
 from neurosim_core.record.disk import Disk
 from neurosim_core.record.forked import disown_when_forked, forked_error
 from neurosim_core.record.header import RecordingHeader
@@ -63,7 +65,7 @@ log = logging.getLogger(__name__)
 FORMAT = "neurosim.flight"
 FORMAT_VERSION = 2
 _FIRST_FLUSH_BYTES = 65536
-_DEFLATE_THREADS = 8
+_DEFLATE_MAX = 8
 _EXIT_S = 5.0
 """When the interpreter ends, a disk that takes nothing for so long is given up [s]."""
 
@@ -99,6 +101,7 @@ class RecordingWriter:
         *,
         flush_interval_s: float = 1.0,
         buffer_bytes: int = 64_000_000,
+        deflate: Callable[..., list[list[Any]]] = deflate,
     ) -> None:
         """Create the file, replacing one that exists.
 
@@ -108,6 +111,7 @@ class RecordingWriter:
             flush_interval_s: Longest wall-clock time between two flushes [s]; checked when a packet comes.
             buffer_bytes: Flush when the packets that came since the last flush exceed this size. As many may
                 still be in the hands of that flush.
+            deflate: Compresses chunks as `columns.deflate` does, for several threads at a time.
 
         Raises:
             OSError: The file cannot be created.
@@ -118,7 +122,8 @@ class RecordingWriter:
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, Stream] = {}
-        self._pool = ThreadPoolExecutor(min(_DEFLATE_THREADS, os.cpu_count() or 1), "deflate")
+        self._deflate = deflate
+        self._pool = ThreadPoolExecutor(deflate_count(), "deflate")
         self._order = 0
         self._newest_ns = 0
         self.kept_ns = 0
@@ -290,7 +295,7 @@ class RecordingWriter:
             raise ValueError(f"a packet needs a sensor name without '/', got {name!r}")
         self._finish_flush()  # which would otherwise find half of a stream
         group = self._described.get(name) or self._file["sensors"].require_group(name)
-        stream = self._streams[name] = Stream(group, packet, self._pool)
+        stream = self._streams[name] = Stream(group, packet, self._pool, self._deflate)
         if stream.is_events and self._root_camera in (None, name):
             self._root_camera = name
             for key in ("events", "ms_to_idx", "t_offset"):
@@ -327,6 +332,11 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
                 group.attrs["distortion_model"] = lens.distortion_model
                 group.attrs["distortion"] = np.array(lens.distortion, np.float64)
     return groups
+
+
+def deflate_count() -> int:
+    """Return how many chunks are compressed at a time."""
+    return min(_DEFLATE_MAX, os.cpu_count() or 1)
 
 
 def import_h5py() -> Any:

@@ -14,7 +14,6 @@ import pickle
 import queue
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -27,18 +26,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
+from neurosim_core.record.compressors import Compressors
 from neurosim_core.record.forked import disown_when_forked, forked_error
-from neurosim_core.record.hdf5 import RecordingWriter, import_h5py
+from neurosim_core.record.frames import receive_frame, send_frame
+from neurosim_core.record.hdf5 import RecordingWriter, deflate_count, import_h5py
 from neurosim_core.record.header import RecordingHeader
 
 _QUEUE_BYTES = 32_000_000
 """What may wait to be sent [bytes]."""
 _COPIED_BYTES = 4096
 """Smaller arrays are copied at once."""
-_RECEIVED_MAX = 64
-"""Packets that a thread of the process that writes receives ahead."""
-_SIZES = struct.Struct("<QQ")
-"""Sizes of what is pickled, and of the arrays behind it [bytes]."""
+_FRAME_BYTES = 1_000_000
+"""What is larger is not sent together with what comes after it [bytes]."""
+_BUFFER_BYTES = 128_000_000
+"""What the process takes between two flushes [bytes]: each waits for the last chunks to be compressed."""
+_RECEIVED_MAX = 16
+"""Frames that a thread of the process that writes receives ahead."""
 _SCALARS = (int, float, bool, str)
 _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",  # its threads take time to start
@@ -53,7 +56,8 @@ class _Process:
     def __init__(self) -> None:
         self.socket, theirs = socket.socketpair()
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
-        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        path = [entry for entry in sys.path if isinstance(entry, str)]  # Python ignores others
+        program = f"import sys; sys.path[:] = {path!r}; from {__name__} import main; main()"
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-c", program],
@@ -105,7 +109,7 @@ class RecordingProcess:
         self._failure: Exception | None = None
         self._closed = False
         self._classes: dict[type[Packet], tuple[int, tuple[str, ...]]] = {}
-        self._queue: queue.SimpleQueue[tuple[int, list[Any]] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[int, bytes, Sequence[NDArray[Any]]] | None] = queue.SimpleQueue()
         self._put_bytes = self._sent_bytes = 0
         self._is_sending = True
         self._progress = threading.Event()
@@ -123,28 +127,31 @@ class RecordingProcess:
         """
         if self._failure is not None:
             raise self._failure
+        if self._closed:
+            raise ValueError(f"{self._path} is closed")
         kind = type(packet)
         if kind not in self._classes:
-            names = tuple(field.name for field in fields(kind))
-            self._classes[kind] = len(self._classes), names
-            self._put((*self._classes[kind], schema_of(kind).to_json()))
+            schema = schema_of(kind).to_json()
+            self._classes[kind] = len(self._classes), tuple(field.name for field in fields(kind))
+            self._put((*self._classes[kind], schema))
         number, names = self._classes[kind]
         values: list[Any] = []
         arrays: list[NDArray[Any]] = []
         size = 0  # of them
         for name in names:
             value = getattr(packet, name)
-            if type(value) not in _SCALARS:
-                array = as_numpy(value)
+            if type(value) not in _SCALARS and not isinstance(value, np.generic):
+                array = value = as_numpy(value)
                 place: bytes | int = size
-                if array.nbytes >= _COPIED_BYTES:
-                    arrays.append(np.ascontiguousarray(array))
-                    size += array.nbytes
-                else:
-                    place = array.tobytes()
-                value = array.dtype.str, array.shape, place
+                if array.dtype.kind not in "OV":  # of objects it holds addresses; records have names
+                    if array.nbytes >= _COPIED_BYTES:
+                        arrays.append(np.ascontiguousarray(array).view(np.uint8))
+                        size += array.nbytes
+                    else:
+                        place = array.tobytes()
+                    value = array.dtype.str, array.shape, place
             values.append(value)
-        self._put((number, values), arrays)
+        self._put((number, size, values), arrays)
         if self._put_bytes - self._sent_bytes > _QUEUE_BYTES:
             self._wait()
         if not self._is_sending:
@@ -163,7 +170,7 @@ class RecordingProcess:
             self._put(complete)
             self._queue.put(None)
             self._thread.join()
-            self._end()
+            self._end(early=self._sent_bytes < self._put_bytes)
 
     def disown(self) -> None:
         """Leave the recording to the process that this one was forked from."""
@@ -171,23 +178,34 @@ class RecordingProcess:
 
     def _put(self, content: Any, arrays: Sequence[NDArray[Any]] = ()) -> None:
         body = pickle.dumps(content)
-        sizes = len(body), sum(array.nbytes for array in arrays)
-        size = _SIZES.size + sum(sizes)
+        size = len(body) + sum(array.nbytes for array in arrays)
         self._put_bytes += size
-        self._queue.put((size, [_SIZES.pack(*sizes) + body, *arrays]))
+        self._queue.put((size, body, arrays))
 
     def _send(self) -> None:
-        """Send what is put, until that is None or the process has ended."""
-        with contextlib.suppress(OSError):  # why it has ended, `_end` finds out
-            while (entry := self._queue.get()) is not None:
-                size, parts = entry
-                count = self._process.socket.sendmsg(parts)
-                if count < size:  # a signal came
-                    self._process.socket.sendall(b"".join(parts)[count:])
+        """Send what is put, until that is None or the process has ended; together what waits."""
+        is_over = False
+        try:
+            while not is_over:
+                size = 0
+                bodies: list[bytes] = []
+                arrays: list[NDArray[Any]] = []
+                while not bodies or (size < _FRAME_BYTES and not self._queue.empty()):
+                    entry = self._queue.get()
+                    if is_over := entry is None:
+                        break
+                    size += entry[0]
+                    bodies.append(entry[1])
+                    arrays.extend(entry[2])
+                if bodies:
+                    send_frame(self._process.socket, bodies, arrays)
                 self._sent_bytes += size
                 self._progress.set()
-        self._is_sending = False
-        self._progress.set()
+        except OSError:
+            pass  # why it has ended, `_end` finds out
+        finally:
+            self._is_sending = False
+            self._progress.set()
 
     def _wait(self) -> None:
         """Wait until there is room in the queue."""
@@ -214,16 +232,18 @@ class RecordingProcess:
 
 def main() -> None:
     """Be the process: write what comes from file 0, the socket, and report on file 1."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends with the one that flies
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # it ends with the one that flies
+        signal.signal(number, signal.SIG_IGN)
     gc.disable()  # packets have no cycles
+    compressors = Compressors(deflate_count())
     failure, kept_ns = None, None
     with socket.socket(fileno=0) as source:
         try:
             import_h5py()
-            (path, header), _ = _receive(source)
-            writer = RecordingWriter(path, header)
+            ((path, header), *contents), arrays = receive_frame(source)
+            writer = RecordingWriter(path, header, buffer_bytes=_BUFFER_BYTES, deflate=compressors.deflate)
             try:
-                _write(writer, source)
+                _write(writer, source, (contents, arrays))
             finally:
                 kept_ns = writer.kept_ns
         except EOFError:  # nothing is recorded
@@ -234,53 +254,46 @@ def main() -> None:
         pickle.dump((failure, kept_ns), report)
 
 
-def _write(writer: RecordingWriter, source: socket.socket) -> None:
+def _write(
+    writer: RecordingWriter, source: socket.socket, first: tuple[list[Any], NDArray[np.uint8]]
+) -> None:
     """Write what comes until the stream ends; what is cut off is dropped."""
     classes: dict[int, tuple[Any, Sequence[str]]] = {}
     complete = False
-    messages: queue.Queue[tuple[Any, NDArray[np.uint8]] | None] = queue.Queue(_RECEIVED_MAX)
+    frames: queue.Queue[tuple[list[Any], NDArray[np.uint8]] | Exception] = queue.Queue(_RECEIVED_MAX)
+    frames.put(first)
 
     def receive() -> None:
         try:
             while True:
-                messages.put(_receive(source))
-        except EOFError:
-            pass
-        finally:
-            messages.put(None)
+                frames.put(receive_frame(source))
+        except Exception as error:
+            frames.put(error)
 
     threading.Thread(target=receive, name="receive", daemon=True).start()
     try:
-        while (message := messages.get()) is not None:
-            content, arrays = message
-            if isinstance(content, bool):
-                complete = content
-                return
-            number, values, *schema = content
-            if schema:
-                classes[number] = packet_class(PacketSchema.from_json(*schema)), values
-                continue
-            for index, value in enumerate(values):
-                if type(value) is tuple:
-                    dtype, shape, place = value
-                    at = (place, 0) if isinstance(place, bytes) else (arrays, place)
-                    values[index] = np.ndarray(shape, dtype, *at)
-            kind, names = classes[number]
-            writer.write(kind(**dict(zip(names, values, strict=True))))
+        while not isinstance(frame := frames.get(), (EOFError, OSError)):
+            if isinstance(frame, Exception):
+                raise frame
+            contents, arrays = frame
+            begin = 0
+            for content in contents:
+                if isinstance(content, bool):
+                    complete = content
+                    return
+                number, size, values = content
+                if number not in classes:
+                    classes[number] = packet_class(PacketSchema.from_json(values)), size
+                    continue
+                for index, value in enumerate(values):
+                    if type(value) is tuple:
+                        dtype, shape, place = value
+                        at = (place, 0) if isinstance(place, bytes) else (arrays, begin + place)
+                        values[index] = np.ndarray(shape, dtype, *at)
+                begin += size
+                kind, names = classes[number]
+                packet = object.__new__(kind)  # a class that is frozen takes 5 us
+                packet.__dict__.update(zip(names, values, strict=True))
+                writer.write(packet)
     finally:
         writer.close(complete=complete)
-
-
-def _receive(source: socket.socket) -> tuple[Any, NDArray[np.uint8]]:
-    """Return the next content that was put, and the bytes of its arrays.
-
-    Raises:
-        EOFError: The stream has ended.
-    """
-    sizes = source.recv(_SIZES.size, socket.MSG_WAITALL)
-    if len(sizes) < _SIZES.size:
-        raise EOFError
-    parts: list[Any] = [np.empty(size, np.uint8) for size in _SIZES.unpack(sizes)]
-    if source.recvmsg_into(parts, 0, socket.MSG_WAITALL)[0] < len(parts[0]) + len(parts[1]):
-        raise EOFError
-    return pickle.loads(parts[0]), parts[1]

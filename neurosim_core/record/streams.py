@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.packets import FieldSchema, Packet, as_numpy, schema_of
-from neurosim_core.record.columns import Chunks, Column, deflate
+from neurosim_core.record.columns import Chunks, Column
 
 HEADER_COLUMNS = ("stamp_ns", "sequence", "order")
 DSEC_NAMES = {"t": "events/t", "x": "events/x", "y": "events/y", "polarity": "events/p"}
@@ -26,9 +27,12 @@ _ATTRIBUTE_MAX_BYTES = 60000
 class Stream:
     """The packets of one sensor in the file."""
 
-    def __init__(self, group: Any, first: Packet, pool: ThreadPoolExecutor) -> None:
+    def __init__(
+        self, group: Any, first: Packet, pool: ThreadPoolExecutor, deflate: Callable[..., list[list[Any]]]
+    ) -> None:
         self._group = group
         self._pool = pool
+        self._compress = deflate
         self._type = type(first)
         self._columns: dict[str, Column] = {}
         self._last_ns: int | None = None
@@ -137,10 +141,10 @@ class Stream:
         if cut:
             task = [(parts, column.chunk) for column, _, parts in cut]
             try:
-                future = self._pool.submit(deflate, task)
+                future = self._pool.submit(self._compress, task)
             except RuntimeError:  # the interpreter ends, and pools take nothing any more
                 future = Future()
-                future.set_result(deflate(task))
+                future.set_result(self._compress(task))
             for position, (column, first, _) in enumerate(cut):
                 column.note(Chunks(first, future, position))
 

@@ -35,6 +35,7 @@ from neurosim_core.native_code import read_native
 from neurosim_core.render.antialias_groups import group_kernels
 from neurosim_core.render.block_lists import make_lists, thread_counts
 from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.candidate_data import TILE
 from neurosim_core.render.coverage import (
     APART,
     FACE_COUNT_MAX,
@@ -57,6 +58,10 @@ from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, til
 
 _SIDE = 4
 _LANES = _SIDE * _SIDE
+_INSTANTS = 4
+"""Instants of a tile that a thread of a CPU renders, in blocks of 4 x 4 pixels."""
+_BLOCK_COUNT = 4 * _INSTANTS
+_LIGHT_COUNT = 3 * _LANES * _BLOCK_COUNT
 
 
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
@@ -208,37 +213,38 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
 
 
 @cache
-def _block_shader(*, timed: bool) -> Any:
-    """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
+def _tile_shader(*, timed: bool) -> Any:
+    """Return the Warp function, for CPU kernels only, that renders a tile from the faces in and around it.
 
-    Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
+    It does so at a few instants, those whose bit is `wanted`. Its last output has bits for the pixels of each
+    block that have to be rendered by rays.
     """
     points = {"SAMPLES": SAMPLE_COUNT, "MOST": FACE_COUNT_MAX, "SHARPNESS": round(100 * SHARPNESS)}
     lookup = {**PACKET_TERMS, "LIGHT_WITHIN": True, "APART": round(100 * APART)}
+    terms = {"INSTANTS": _INSTANTS, "TIMED": timed, "UNIT": True}
 
-    @wp.func_native(read_native(__file__, "shade_block", TIMED=timed, UNIT=True, **points, **lookup))
-    def shade_block(
+    @wp.func_native(read_native(__file__, "shade_tile", **terms, **points, **lookup))
+    def shade_tile(
         scene: SceneData,
         view: ViewData,
         faces: wp.array3d[int],
         rays: wp.array2d[wp.vec4],
-        first_pixel: int,
-        instant: int,
-        top: int,
-        left: int,
-        rows: int,
-        columns: int,
-        radiance_out: wp.array[wp.vec3],
+        first_ray: int,
+        first_instant: int,
+        wanted: int,
+        tile_top: int,
+        tile_left: int,
+        radiance_out: wp.array[float],
         unresolved_out: wp.array[int],
     ): ...
 
-    return shade_block
+    return shade_tile
 
 
 @cache
 def _pixel_caster(width: int, *, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that renders those of 4 x 4 pixels that have a bit."""
-    packet = {"SAMPLES": RAY_COUNT, "N": _LANES, "SIDE": _SIDE, "WIDTH": width}
+    packet = {"SAMPLES": RAY_COUNT, "N": _LANES, "SIDE": _SIDE, "WIDTH": width, "INSTANTS": _INSTANTS}
 
     @wp.func_native(read_native(__file__, "cast_pixels", TIMED=timed, UNIT=False, **packet, **PACKET_TERMS))
     def cast_pixels(
@@ -253,36 +259,36 @@ def _pixel_caster(width: int, *, timed: bool) -> Any:
         rows: int,
         columns: int,
         unresolved: int,
-        radiance_out: wp.array[wp.vec3],
+        block: int,
+        radiance_out: wp.array[float],
     ): ...
 
     return cast_pixels
 
 
-@wp.func_native(read_native(__file__, "write_log"))
+@wp.func_native(read_native(__file__, "write_log", INSTANTS=_INSTANTS))
 def _write_log(
-    scene: SceneData,
-    radiance: wp.array[wp.vec3],
-    instant: int,
-    top: int,
-    left: int,
-    rows: int,
-    columns: int,
+    dark_floor: float,
+    radiance: wp.array[float],
+    first_instant: int,
+    wanted: int,
+    tile_top: int,
+    tile_left: int,
     log_radiance_out: wp.array3d[float],
 ):
-    """Write the log radiance of 4 x 4 pixels; on a CPU only."""
+    """Write the log radiance of a tile at a few instants; on a CPU only."""
     ...
 
 
-def _block_kernel(terms: RenderTerms) -> wp.Kernel:
-    """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
+def _tile_kernel(terms: RenderTerms) -> wp.Kernel:
+    """Return the kernel of a CPU whose threads are tiles at a few instants, with rays cast by Embree."""
     locate_tile = tile_locator(terms, images=True, instants=True)
     write_images = radiance_writer(RADIANCE[1:], supersampled=False, allocated=True)
-    shade_block = _block_shader(timed=terms.timed)
+    shade_tile = _tile_shader(timed=terms.timed)
     cast_pixels = _pixel_caster(terms.embree, timed=terms.timed)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def average_blocks(
+    def average_tiles(
         first: int,
         # In:
         scene: SceneData,
@@ -294,50 +300,76 @@ def _block_kernel(terms: RenderTerms) -> wp.Kernel:
         out: RenderOutputs,
     ) -> None:
         index = first + wp.tid()
-        place = locate_tile(index // 4 // view.instant_count, index // 4 % view.instant_count, view, worlds)
+        group_count = (view.instant_count + _INSTANTS - 1) // _INSTANTS
+        tile = index // group_count
+        begin = index % group_count * _INSTANTS
+        place = locate_tile(tile, begin, view, worlds)
+        if not place.rendered:
+            return
         if wp.static(terms.world_scenes):
             scene = worlds.scenes[worlds.scene[place.world]]
-        left = place.left + (index % 2) * _SIDE
-        top = place.top + (index // 2 % 2) * _SIDE
-        if not place.rendered or left >= view.width or top >= view.height:
-            return
-        if place.slot < 0 and out.log_radiance.shape[0] == 0:
-            return
-        instant = place.instant
-        rows = wp.min(view.height - top, _SIDE)
-        columns = wp.min(view.width - left, _SIDE)
-        first_ray = place.first_ray + top * view.width + left
-        radiance = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-        unresolved_bits = wp.zeros(shape=(1,), dtype=int)
-        shade_block(
+        count = wp.min(_INSTANTS, view.instant_count - begin)
+        wanted = int(0)
+        for later in range(count):
+            if out.log_radiance.shape[0] > 0 or view.image_slot[place.instant + later] >= 0:
+                wanted = wanted | (1 << later)
+        light = wp.zeros(shape=(_LIGHT_COUNT,), dtype=float)
+        unresolved = wp.zeros(shape=(_BLOCK_COUNT,), dtype=int)
+        shade_tile(
             scene,
             view,
             out.face,
             rays,
-            first_ray,
-            instant,
-            top,
-            left,
-            rows,
-            columns,
-            radiance,
-            unresolved_bits,
+            place.first_ray,
+            place.instant,
+            wanted,
+            place.top,
+            place.left,
+            light,
+            unresolved,
         )
-        unresolved = unresolved_bits[0]
-        if unresolved != 0:
-            cast_pixels(
-                scene, view, rays, first_ray, FAR_M, instant, top, left, rows, columns, unresolved, radiance
-            )
+        block = int(0)
+        while block < _BLOCK_COUNT:  # not `range`, which would be unrolled
+            if unresolved[block] != 0:
+                top = place.top + block % 4 // 2 * _SIDE
+                left = place.left + block % 2 * _SIDE
+                cast_pixels(
+                    scene,
+                    view,
+                    rays,
+                    place.first_ray + top * view.width + left,
+                    FAR_M,
+                    place.instant + block // 4,
+                    top,
+                    left,
+                    wp.min(view.height - top, _SIDE),
+                    wp.min(view.width - left, _SIDE),
+                    unresolved[block],
+                    block,
+                    light,
+                )
+            block += 1
         if out.log_radiance.shape[0] > 0:
-            _write_log(scene, radiance, instant, top, left, rows, columns, out.log_radiance)
-        if place.slot >= 0 and (out.rgb.shape[0] > 0 or out.radiance.shape[0] > 0):
-            for y in range(rows):
-                for x in range(columns):
-                    write_images(
-                        scene, radiance[_SIDE * y + x], 1, instant, place.slot, top + y, left + x, out
-                    )
+            _write_log(
+                scene.dark_floor, light, place.instant, wanted, place.top, place.left, out.log_radiance
+            )
+        if out.rgb.shape[0] > 0 or out.radiance.shape[0] > 0:
+            for later in range(count):
+                slot = view.image_slot[place.instant + later]
+                if slot >= 0:
+                    for y in range(wp.min(view.height - place.top, 2 * _SIDE)):
+                        for x in range(wp.min(view.width - place.left, 2 * _SIDE)):
+                            block = 4 * later + y // _SIDE * 2 + x // _SIDE
+                            red = _LANES * block + _SIDE * (y % _SIDE) + x % _SIDE
+                            green = red + _LANES * _BLOCK_COUNT
+                            blue = green + _LANES * _BLOCK_COUNT
+                            radiance = wp.vec3(light[red], light[green], light[blue])
+                            row = place.top + y
+                            write_images(
+                                scene, radiance, 1, place.instant + later, slot, row, place.left + x, out
+                            )
 
-    return average_blocks
+    return average_tiles
 
 
 @cache
@@ -358,10 +390,10 @@ def antialiasing_kernels(
 @cache
 def _cpu_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return one kernel for all outputs: checking which are allocated takes less than to compile each set."""
-    return (_block_kernel if _in_blocks(terms) else _pixel_kernel)(terms)
+    return (_tile_kernel if _by_tile(terms) else _pixel_kernel)(terms)
 
 
-def _in_blocks(terms: RenderTerms) -> bool:
+def _by_tile(terms: RenderTerms) -> bool:
     return bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
 
 
@@ -375,7 +407,6 @@ class Antialiasing:
         outputs: Collection[str],
         terms: RenderTerms,
         device: str,
-        thread_count: int | None,
         pixel_count: int,
     ) -> None:
         """Choose the kernels and allocate what they share, for launches of at most `pixel_count` pixels.
@@ -383,11 +414,11 @@ class Antialiasing:
         Rays are `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4]; terms are those of
         the first pass.
         """
-        self._device, self._thread_count = device, thread_count
+        self._device = device
         is_cuda = wp.get_device(device).is_cuda
         self._kernels = antialiasing_kernels(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
         self._lists = make_lists(pixel_count // _LANES, device) if is_cuda else None
-        self._pixels_per_thread = _LANES if _in_blocks(terms) else 1
+        self._by_tile = _by_tile(terms)
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 
     def launch(
@@ -403,13 +434,17 @@ class Antialiasing:
         """Write the light of the pixels of all tiles, instants and worlds; `out` has the faces."""
         inputs = [scene, view, bodies, worlds, self._rays]
         if self._lists is None:
+            dim = pixel_count
+            if self._by_tile:
+                count = view.instant_count
+                dim = pixel_count // (TILE * TILE * count) * -(-count // _INSTANTS)
             launch_split(
                 self._kernels[0],
-                dim=pixel_count // self._pixels_per_thread,
+                dim=dim,
                 inputs=inputs,
                 outputs=[out],
                 device=self._device,
-                thread_count=self._thread_count,
+                multiple=1 if self._by_tile else 64,
             )
             return
         self._lists.count.zero_()

@@ -71,15 +71,16 @@ def launch_split(
     outputs: Sequence[Any],
     device: str,
     thread_count: int | None = None,
+    multiple: int = 64,
 ) -> None:
     """Launch a kernel of one dimension: on CUDA as one launch, on the CPU in slices on all cores.
 
     The call returns when a CPU has finished; it does not wait for a CUDA device. The first parameter of the
     kernel is the index of its first thread, before inputs and outputs; threads must not depend on each other.
-    Slices begin at multiples of 64.
+    Slices begin at multiples of `multiple`.
     """
     threads = thread_count or core_count()
-    slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
+    slice_size = -(-dim // (multiple * threads * _SLICES_PER_CORE)) * multiple
     if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=64)
         return

@@ -95,7 +95,6 @@ class WarpRenderer:
         outputs: Collection[str],
         instant_count: int,
         image_count: int = 1,
-        thread_count: int | None = None,
         worlds: RenderWorlds = ONE_WORLD,
         times: RayTimes | None = None,
     ) -> None:
@@ -109,7 +108,6 @@ class WarpRenderer:
         self._tile_count = -(-lens.width // TILE) * -(-lens.height // TILE)
         _check_thread_count(self._tile_count, lens, instant_count, worlds.count)
         self._arrays = arrays
-        self._thread_count = thread_count
         self._stride = instant_count
         self._times = times
         device = arrays.device
@@ -138,8 +136,6 @@ class WarpRenderer:
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
         self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
-        self.antialiased = adaptive
-        """Whether pixels with several faces are resolved (`antialias`)."""
         self._antialiasing = None
         if adaptive:
             fill_factor = arrays.config.fill_factor
@@ -148,7 +144,6 @@ class WarpRenderer:
                 outputs=outputs,
                 terms=self.terms,
                 device=device,
-                thread_count=thread_count,
                 pixel_count=worlds.count * instant_count * self._tile_count * TILE * TILE,
             )
 
@@ -215,7 +210,6 @@ class WarpRenderer:
             inputs=inputs,
             outputs=outputs,
             device=device,
-            thread_count=self._thread_count,
         )
         if self._fallback is not None and self.candidates is not None:
             launch_split(
@@ -260,15 +254,15 @@ class WarpRenderer:
             quads=wp.get_device(arrays.device).is_cuda and len(rays) % 4 == 1 and len(rays) > 1,
         )
         shared = None
-        if not (
-            terms.timed or terms.world_scenes or terms.world_lenses
-        ):  # lists change nothing but the speed
+        # lists change nothing but the speed
+        if not (terms.timed or terms.world_scenes or terms.world_lenses):
             shared = choose_candidate_lists(
                 arrays.config.candidate_lists,
                 rays,
                 instant_count=self._stride,
                 face_count=arrays.face_origin.shape[0],
                 is_cuda=wp.get_device(arrays.device).is_cuda,
+                embree=bool(terms.embree),
             )
         # with several worlds, groups end with the instants of a world
         group = 1 << min(2, self._stride.bit_length() - 1) if several else None
@@ -304,7 +298,6 @@ class WarpRenderer:
             config=config,
             instant_count=count * self._stride,
             has_fallback=self._fallback is not None,
-            thread_count=self._thread_count,
         )
 
 

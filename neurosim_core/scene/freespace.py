@@ -42,6 +42,10 @@ _CPU_CHUNKS = 8
 """Launches that the columns of a grid are divided into on the CPU, for two or more threads to share."""
 
 
+_BESIDE_M = 3.0
+"""How far free space reaches from a scene that is flat, such as a ground or a poster [m]."""
+
+
 class FreeSpaceConfig(Settings):
     """How finely the room in a scene is mapped."""
 
@@ -331,6 +335,9 @@ def map_distances(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") ->
     bounds = scene.bounds_m
     notes: list[str] = []
     voxel = config.voxel_m
+    if (flat := np.ptp(bounds, axis=0) < voxel).any():
+        bounds = bounds + np.outer((-_BESIDE_M, _BESIDE_M), flat)
+        notes.append(f"The scene is flat: free space is mapped up to {_BESIDE_M:g} m on both sides of it.")
     while (counts := _counts(bounds, voxel)).prod(dtype=float) > config.voxel_count_max:
         voxel *= max(1.01, (counts.prod(dtype=float) / config.voxel_count_max) ** (1.0 / 3.0))
     if voxel != config.voxel_m:

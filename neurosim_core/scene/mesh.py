@@ -84,7 +84,7 @@ def scene_kind(settings: Mapping[str, Any]) -> str:
     return str(settings.get("kind", DEFAULT_KIND if only_mesh.isdisjoint(settings) else "mesh"))
 
 
-def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
+def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True, decode: bool = True) -> Scene:
     """Read a mesh file: every instance in metres, z up, with materials, textures and lights.
 
     Every assumption that was made is a sentence in the scene's `notes`. Transparent and metallic materials
@@ -92,7 +92,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     by two texels: bilinear lookup between three texel centres gives the linear blend of its corners. Lights
     come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings. Without `pictures`
     textures of glTF are decoded when they are first looked at, if ever: until then no library is imported for
-    them, and an emissive texture counts as white.
+    them, and an emissive texture counts as white. Without `decode` none but emissive ones are decoded now.
 
     Raises:
         SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is
@@ -152,7 +152,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),
         **arrays,
     )
-    if pictures:  # at the end: what threads do of it in Python would hold up the rest
+    if pictures and decode:  # at the end: what threads do of it in Python would hold up the rest
         textures = dict.fromkeys(m.texture for m in scene.materials if m.texture is not None)
         with ThreadPoolExecutor() as threads:  # Pillow releases the interpreter lock
             list(threads.map(Texture.decode, textures))

@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from neurosim_core.scene.scene import Scene
 
 _ALIGNMENT = 64
+_KEEP_MEMORY = {
+    "MALLOC_ARENA_MAX": "1",
+    "MALLOC_MMAP_THRESHOLD_": "4294967296",
+    "MALLOC_TRIM_THRESHOLD_": "4294967296",
+    "MALLOC_TOP_PAD_": "67108864",
+}
+"""Lets glibc use memory again that NumPy has freed: the kernel is asked for 40,000 pages, not 100,000."""
 
 
 class NotReadError(Exception):
@@ -62,6 +69,7 @@ class SceneReader:
             stdin=self._file,  # which is to be written, too: its number may be 0 here, and is there
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            env={**os.environ, **_KEEP_MEMORY},
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
 
@@ -83,7 +91,8 @@ class SceneReader:
         assert self._process.stdout is not None
         with self._turn:
             while len(self._answers) <= number:
-                self._answers.append(json.loads(self._process.stdout.readline() or "null"))
+                line = self._process.stdout.readline()
+                self._answers.append(json.loads(line) if line.endswith(b"\n") else None)
         places = self._answers[number]
         if places is None:
             raise NotReadError
@@ -120,13 +129,13 @@ def main() -> None:
 def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
     """Read a scene and write its triangles; compute what its light and its pictures need, and write all."""
     from neurosim_core.registry import find
-    from neurosim_core.scene.mesh import scene_kind
+    from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene, scene_kind
 
     given = settings["scene"]
     given = {"kind": given} if isinstance(given, str) else given
     kind = scene_kind(given)
     config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
-    scene = config.load()
+    scene = load_mesh_scene(config, decode=False) if isinstance(config, MeshSceneConfig) else config.load()
     write((config, dataclasses.replace(scene, materials=())))
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
@@ -136,7 +145,7 @@ def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
     if (mesh := refine_within(scene, edge_m)) is not None:
         scene.refined[edge_m] = mesh
         _ = mesh.corner_groups, mesh.corner_normals
-    with ThreadPoolExecutor() as aside:  # now: threads that take much memory hold each other up
+    with ThreadPoolExecutor() as aside:  # at last: decoding and packing hold up the thread that does the rest
         for texture in dict.fromkeys(m.texture for m in scene.materials if m.texture is not None):
             aside.submit(texture.__getstate__)
         if render.samples_per_pixel == "adaptive":

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import EventArrays
 from neurosim_core.runtime.cuda import HostInput, RecordedLaunch
-from neurosim_core.sensors import event_worlds_scan
+from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_cut import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_input import as_frames, invalid_message
@@ -143,9 +143,9 @@ class EventCameraBatch:
         self._counters_on_host = counters
         self._frames_seen = self._cameras.stack.__ctype__().log_radiance
         """Of the recorded launches' parameters: where they read frames."""
-        self._begin = RecordedLaunch(event_worlds_scan.begin_frame, self.device)
-        self._hand_over = RecordedLaunch(event_worlds_scan.hand_over_counters, self.device)
-        self._decode = RecordedLaunch(event_worlds_scan.decode, self.device)
+        self._begin = RecordedLaunch(event_kernels.begin_frame, self.device)
+        self._hand_over = RecordedLaunch(event_kernels.hand_over_counters, self.device)
+        self._decode = RecordedLaunch(event_kernels.decode, self.device)
         self._offsets = HostInput(wp.zeros(count + 1, dtype=wp.int32, device=self.device))
         self._scans = [self._cameras.record_scan(parity) for parity in (0, 1)] if self.device.is_cuda else []
         self._readable: Any = None
@@ -207,7 +207,7 @@ class EventCameraBatch:
         if self._scans:
             self._scans[self._parity].launch()
         else:
-            self._cameras.take_frames(1, event_worlds_scan.ALL, self._parity)
+            self._cameras.take_frames(1, event_kernels.ALL, self._parity)
         counts = self._read_counters()
         dropped_count = 0
         if max(counts) > self._capacity or max(counts) > self._event_count_max:

@@ -9,9 +9,9 @@ The law of a pixel is that of `event_scan`.
 import warp as wp
 
 from neurosim_core.native_code import read_native
+from neurosim_core.sensors.event_kernels import Stack
 from neurosim_core.sensors.event_levels import fall, key_of_level, place_of, quiet_range, reach_up, rise
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, CLOSE, LIMIT, OPEN, PUT, READ
-from neurosim_core.sensors.event_worlds_scan import Stack
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def scan_frame(
     last_out: wp.array2d[wp.float32],
     crossed_out: wp.array2d[wp.vec2i],
 ) -> None:
-    """Do what `event_worlds_scan.scan` does with one frame, all rows of which are kept.
+    """Do what `event_kernels.scan` does with one frame, all rows of which are kept.
 
     Threads are [world, pixel / 4], whole blocks to a world.
     """

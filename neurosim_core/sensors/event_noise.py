@@ -17,7 +17,7 @@ import warp as wp
 
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.sensors.event_config import EventCameraConfig, MeasuredNoiseConfig
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel
 from neurosim_core.sensors.event_noise_pixel import signal_terms
 from neurosim_core.sensors.event_terms import SignalTerm
 
@@ -174,9 +174,9 @@ class PixelNoise:
         seed: int,
         sensor: str,
         device: Any,
-        terms: Sequence[str] | None = None,
+        terms: Sequence[str],
     ) -> None:
-        self.terms = tuple(terms_of(config) if terms is None else terms)
+        self.terms = tuple(terms)
         self._config = config
         self._seed = seed
         self._sensor = sensor
@@ -184,21 +184,15 @@ class PixelNoise:
         self._pixel_count = pixel_count
         self.memories = [self._make_memory() for _ in range(ring_size)]
         self.model = self._make_model()
-        self._reset_ns = 0
 
     def set_reset(self, stamp_ns: int) -> None:
         """Let the noise that follows be that after a reset at a stamp."""
-        self._reset_ns = stamp_ns
         self.model.seed = mix_seed(self._seed, stamp_ns)
 
     def phase(self) -> tuple[int, bool]:
         """Return the stream of random phases, and whether voltages begin at one."""
         stochastic = self._config.stochastic
         return self._stream("phase"), stochastic is not None and stochastic.random_phase
-
-    def since_reset_ns(self, origin_ns: int) -> int:
-        """Return how long after the reset an origin of time lies [ns]."""
-        return origin_ns - self._reset_ns
 
     def _stream(self, use: str) -> int:
         return stream_id(f"{self._sensor}/events/{use}")

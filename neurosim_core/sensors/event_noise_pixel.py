@@ -173,40 +173,6 @@ def mean_light(
     return (end - begin) / rise
 
 
-@wp.func
-def begin_pixel(
-    model: PixelModel,
-    phase_stream: wp.uint32,
-    random_phase: wp.bool,
-    value: wp.float64,
-    pixel: wp.int32,
-    memory_out: Memory,
-) -> None:
-    """Let a pixel begin anew at what it sees now."""
-    if memory_out.reference.shape[0] > 0:
-        memory_out.reference[pixel] = value
-    if memory_out.event_count.shape[0] > 0:
-        memory_out.event_count[pixel] = 0
-    if memory_out.filtered.shape[0] > 0:
-        memory_out.filtered[pixel] = value
-    if memory_out.exposure_ns.shape[0] > 0:
-        memory_out.exposure_ns[pixel] = _ZERO
-    if memory_out.held_ns.shape[0] > 0:
-        memory_out.held_ns[pixel] = -_ONE
-    if memory_out.next_ns.shape[0] > 0:
-        state = NoisyPixel()
-        rate = model.rates[pixel][0] + model.rates[pixel][1]
-        memory_out.next_ns[pixel] = wait_ns(rate, draw_noise(model, pixel, state)[0])
-        memory_out.noise_count[pixel] = 0
-    if memory_out.voltage.shape[0] > 0:
-        voltage = _ZERO
-        if random_phase:
-            voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
-            if model.thresholds.shape[0] > 0:
-                voltage *= model.thresholds[pixel][0] / model.threshold_on
-        memory_out.voltage[pixel] = voltage
-
-
 @functools.cache
 def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
     """Return the kernel that begins what pixels with some `signal_terms` remember."""
@@ -225,12 +191,34 @@ def make_begin(signals: tuple[tuple[str, Any], ...]) -> Any:
         # Out:
         memory_out: wp.array[Memory],
     ):
-        """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
+        """Let the memory of pixels begin anew in some worlds with what they see; threads: [world, pixel]."""
         world, pixel = wp.tid()
-        if mask[world] != 0:
-            model = models[world]
-            seen = see(model, pixel, wp.int64(0), base[world, pixel])
-            begin_pixel(model, phase_stream, random_phase[world], seen, pixel, memory_out[world])
+        if mask[world] == 0:
+            return
+        model = models[world]
+        memory = memory_out[world]
+        seen = see(model, pixel, wp.int64(0), base[world, pixel])
+        if memory.reference.shape[0] > 0:
+            memory.reference[pixel] = seen
+        if memory.event_count.shape[0] > 0:
+            memory.event_count[pixel] = 0
+        if memory.filtered.shape[0] > 0:
+            memory.filtered[pixel] = seen
+        if memory.exposure_ns.shape[0] > 0:
+            memory.exposure_ns[pixel] = _ZERO
+        if memory.held_ns.shape[0] > 0:
+            memory.held_ns[pixel] = -_ONE
+        if memory.next_ns.shape[0] > 0:
+            rate = model.rates[pixel][0] + model.rates[pixel][1]
+            memory.next_ns[pixel] = wait_ns(rate, draw_noise(model, pixel, NoisyPixel())[0])
+            memory.noise_count[pixel] = 0
+        if memory.voltage.shape[0] > 0:
+            voltage = _ZERO
+            if random_phase[world]:
+                voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
+                if model.thresholds.shape[0] > 0:
+                    voltage *= model.thresholds[pixel][0] / model.threshold_on
+            memory.voltage[pixel] = voltage
 
     return begin
 

@@ -69,7 +69,7 @@ def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
 def make_pixel_scan(terms: frozenset[str]) -> Any:
     """Return the function that takes a pixel with only the given terms over a stack of frames.
 
-    Its parameters are those of the kernel of `event_worlds_scan.make_noisy_scan`, of one world and one pixel.
+    Its parameters are those of the kernel of `event_kernels.make_noisy_scan`, of one world and one pixel.
     """
     signals = signal_terms(terms)
     see, changed = make_see(signals), len(signals) > 0

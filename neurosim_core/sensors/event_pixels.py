@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.launch import core_count, share
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
-from neurosim_core.sensors import event_worlds_scan
+from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_states import PixelStates
@@ -147,10 +147,6 @@ class Pixels:
         self.states.set_reset(stamp_ns)
         self.states.begin_noise(self._overflow, 0)
 
-    def since_reset_ns(self, origin_ns: int) -> int:
-        """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
-        return 0 if self.noise is None else self.noise.since_reset_ns(origin_ns)
-
     def next_state(self, state: int) -> int:
         """Return where in the ring the state after another is."""
         return (state + 1) % len(self.states.last)
@@ -229,7 +225,7 @@ class Pixels:
                 before,
                 after,
                 frame_count=len(scan.stamps_ns),
-                part=event_worlds_scan.COUNT if tabulate else event_worlds_scan.ALL,
+                part=event_kernels.COUNT if tabulate else event_kernels.ALL,
                 pixels=(chunk.first_pixel, chunk.end_pixel),
             )
             chunk.counters_on_host.fetch(0, _COUNTERS)
@@ -239,7 +235,7 @@ class Pixels:
 
     def _stack(self, scan: Scan, chunk: Chunk) -> Any:
         """Return what the kernels take for a chunk of a scan: the arrays of one world."""
-        stack = event_worlds_scan.Stack()
+        stack = event_kernels.Stack()
         stack.log_radiance = scan.frames.reshape((1, scan.frames.shape[0], self._width * self._height))
         stack.stamps = scan.stamps.reshape((1, -1))
         stack.since_reset_ns = scan.since_reset_ns

@@ -3,7 +3,7 @@
 
 What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in
 `event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed. The kernels
-are in `event_worlds_scan`.
+are in `event_kernels`.
 
 Pixels that are not ideal have a scan of their own, made to measure, in `event_noise_scan`.
 """
@@ -15,7 +15,6 @@ from neurosim_core.sensors.event_levels import (
     fall,
     key_of_level,
     place_of,
-    quiet_range,
     reach_down,
     reach_up,
     rise,
@@ -25,8 +24,6 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK_SIZE = wp.constant(256)
 """Threads of a block on CUDA."""
-TILE_SIZE = wp.constant(256)
-"""Pixels that a thread of `screen` takes."""
 SINGLY = wp.constant(wp.int32(4))
 """Levels that are found one by one; few samples cross more, and theirs are found at once."""
 LOG_RADIANCE_MAX = 1.0e3
@@ -83,20 +80,6 @@ def keep_crossing(
 @wp.func
 def _read_word(place: wp.int32, index: wp.int32, counters: wp.array[wp.int64]) -> wp.int32:
     return wp.int32(keep_crossing(READ, 0, 0, wp.float32(0.0), 0, 0, place, index, counters))
-
-
-@wp.func_native(read_native(__file__, "count_lead"))
-def _count_lead(
-    begin: wp.int32,
-    end: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    frame_count: wp.int32,
-    low_32: wp.array[wp.float32],
-    high_32: wp.array[wp.float32],
-    lead_out: wp.array[wp.int32],
-) -> None:
-    """Count for at most 256 pixels the frames before the first that leaves (low, high)."""
-    ...
 
 
 @wp.func_native(read_native(__file__, "end_of_round"))
@@ -318,30 +301,3 @@ def scan_pixel(
             flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
             wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
             wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
-
-
-@wp.func
-def screen_tile(
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    begin: wp.int32,
-    end: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    frame_count: wp.int32,
-    base: wp.array[wp.float32],
-    crossed: wp.array[wp.vec2i],
-    low_out: wp.array[wp.float32],
-    high_out: wp.array[wp.float32],
-    lead_out: wp.array[wp.int32],
-) -> None:
-    """Count the frames of the pixels [begin, end), at most 256, before the first that may fire.
-
-    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
-    event. The quiet range of each pixel is left in `low_out` and `high_out`.
-    """
-    for pixel in range(begin, end):
-        before = crossed[pixel]
-        quiet = quiet_range(wp.float64(base[pixel]), before[0], before[1], threshold_on, threshold_off)
-        low_out[pixel] = quiet[0]
-        high_out[pixel] = quiet[1]
-    _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)

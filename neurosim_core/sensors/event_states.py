@@ -8,13 +8,13 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.sensors import event_worlds_scan
+from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, Memory, PixelModel
 from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+from neurosim_core.sensors.event_scan import BLOCK_SIZE
 
 
 class PixelStates:
@@ -61,10 +61,10 @@ class PixelStates:
         self.noise: list[PixelNoise] = []
         self._models: Any = None
         self._memories: list[Any] = []
-        self._scan: Any = event_worlds_scan.scan
-        modules = [event_worlds_scan]
+        self._scan: Any = event_kernels.scan
+        modules = [event_kernels]
         if self.terms:
-            self._scan = event_worlds_scan.make_noisy_scan(frozenset(self.terms))
+            self._scan = event_kernels.make_noisy_scan(frozenset(self.terms))
             self._begin_noise = make_begin(signal_terms(self.terms))
             modules += [self._scan.module, self._begin_noise.module]
             self.seed(seeds)
@@ -144,7 +144,7 @@ class PixelStates:
         after: int,
         *,
         frame_count: int,
-        part: int = event_worlds_scan.ALL,
+        part: int = event_kernels.ALL,
         worlds: tuple[int, int] | None = None,
         pixels: tuple[int, int] | None = None,
         record_cmd: bool = False,
@@ -156,8 +156,8 @@ class PixelStates:
         extent = [first_world, first_pixel, end_pixel, frame_count]
         if self.screened:
             wp.launch(
-                event_worlds_scan.screen,
-                dim=(world_count, -(-pixel_count // int(TILE_SIZE))),
+                event_kernels.screen,
+                dim=(world_count, -(-pixel_count // int(event_kernels.TILE_SIZE))),
                 inputs=[self.thresholds, *extent, stack, self.base, self.crossed[before]],
                 outputs=[*self._quiet_range, self._lead],
                 device=self._device,

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.render.launch import core_count, share
-from neurosim_core.sensors import event_worlds_scan as scan
+from neurosim_core.sensors import event_kernels as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
 from neurosim_core.sensors.event_noise_model import terms_of
@@ -123,7 +123,7 @@ class WorldEventCamera:
         self.row_shift, self.time_shift = self._states.row_shift, self._states.time_shift
         self._shape = (world_count, pixel_count)
         self.stack: Any = self._make_stack(frames, frame_count)
-        """What a step sees and what comes of it, `event_worlds_scan.Stack`."""
+        """What a step sees and what comes of it, `event_kernels.Stack`."""
         self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
         self._offsets_ns: dict[tuple[int, ...], Any] = {}
         room = world_count * capacity if takes_apart else 0

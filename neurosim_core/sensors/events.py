@@ -285,7 +285,7 @@ class EventCamera:
         scan.origin_us = self._keys.origin_us
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
-        scan.times[0] = self._pixels.since_reset_ns(origin_ns)
+        scan.times[0] = origin_ns - self._reset_ns
         scan.times[1] = self._fed_ns - origin_ns
         np.subtract(stamps, origin_ns, out=scan.times[2 : count + 2])
         return scan

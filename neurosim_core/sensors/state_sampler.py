@@ -380,6 +380,10 @@ def make_reader(
         is_scalar: An output is only the first number of what is read, float64, in place of vec3d.
         late: Delay and dropouts; see `StateSampler`.
     """
+    for each in errors.values() if is_scalar else ():
+        for key in ("white", "walk", "markov", "resolution"):
+            if isinstance(value := getattr(each, key), tuple):
+                raise ValueError(f"sensor {context.name!r}: {key} must be one number, got {list(value)}")
     made = [
         make_errors(each, rate_hz=rate_hz, name=f"{context.name}/{name}") for name, each in errors.items()
     ]

@@ -216,11 +216,17 @@ def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
         free_space: Where it can fly in the scene of `config`.
 
     Raises:
-        ValueError: No path exists, or it begins inside a solid.
+        ValueError: No path exists, or it begins inside a solid or below the ground.
     """
     path = make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
     if not isinstance(config.path, CollisionFreeConfig):  # those begin in free space
-        free_space.check_start(path.evaluate([0]).position[0])
+        start = path.evaluate([0]).position[0]
+        free_space.check_start(start)
+        ground = None if config.path.kind == "poses" else config.vehicle.airframe().ground
+        if ground is not None and start[2] < ground.height_m:
+            raise ValueError(
+                f"the path begins at z = {start[2]:g} m, below the ground at {ground.height_m:g} m"
+            )
     return path
 
 

@@ -160,7 +160,7 @@ def test_json_is_all_that_is_printed(asked, tmp_path, capsys):
         (["all", "--quickly"], "unrecognized arguments: --quickly"),
         (["pixel", "--scene", "a.glb"], "unrecognized arguments: --scene a.glb"),
         (["worlds", "--worlds", "1,b"], "takes whole numbers with commas between them, got '1,b'"),
-        (["closed-loop", "--renderer", "fast"], "invalid choice: 'fast'"),
+        (["delay", "--mode", "fast"], "invalid choice: 'fast'"),
         (["nothing"], "invalid choice: 'nothing'"),
         ([], "the following arguments are required: WHAT"),
     ],

@@ -199,6 +199,14 @@ def test_a_recording_that_is_not_still_is_said(recordings):
     assert "the still recording is not still" in " ".join(fit.notes)
 
 
+def test_light_that_rises_longer_than_it_stays_is_refused(recordings):
+    stimulus = Stimulus(
+        width=WIDTH, height=HEIGHT, still=recordings[0], steps=recordings[1], contrast=CONTRAST, rise_s=5.0
+    )
+    with pytest.raises(ValueError, match=r"--rise must be shorter than a level of the steps, 0\.25 s, got 5"):
+        fit_sensor(stimulus, repeats=2)
+
+
 def test_steps_are_found_where_they_are(recordings):
     rises, falls = find_steps(recordings[1])
     assert len(rises) == len(falls) == 8  # the last one may not have been read

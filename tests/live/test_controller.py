@@ -103,12 +103,8 @@ def start_pilot(shared_runtime) -> Iterator[Callable[..., PathController]]:
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(Node("controller"))
 
-        def start(
-            vehicle: str = "drone", *, mode: Any = "motor_speeds", slow_s: float = 0.0, **options: Any
-        ) -> PathController:
+        def start(vehicle: str = "drone", *, mode: Any = "motor_speeds", **options: Any) -> PathController:
             follower = PathFollower(PATH, VEHICLE, mode=mode)
-            at_once = follower.command
-            follower.command = lambda **state: (time.sleep(slow_s), at_once(**state))[1]
             pilot = PathController(
                 node, vehicle, follower, **{"lockstep": True, "rotor_speed": HOVER, **options}
             )
@@ -214,7 +210,7 @@ def test_missing_rotor_speeds_are_said_and_replaced(stage, start_pilot, caplog, 
 def test_in_streaming_the_newest_counts(stage, start_pilot, monkeypatch):
     """A pilot that is slow answers what is new when it looks again."""
     monkeypatch.setitem(controller._ROTORS_S, "streaming", SOON_S)
-    start_pilot(lockstep=False, slow_s=0.3)
+    start_pilot(lockstep=False, delay_s=0.3)
     stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
     stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     ticks = itertools.count()
@@ -231,6 +227,13 @@ def test_in_streaming_the_newest_counts(stage, start_pilot, monkeypatch):
 
     wait_for(lambda: answers() <= 2)
     assert stage.silence()
+
+
+def test_a_pilot_ends_while_it_sleeps(stage, start_pilot):
+    pilot = start_pilot(delay_s=1e4)
+    stage.send(0)
+    wait_for(lambda: stage.rotor_speeds.subscriber_count)
+    pilot.close()  # the fixture joins its thread
 
 
 def test_vehicles_do_not_wait_for_each_other(shared_runtime, start_pilot):
@@ -393,15 +396,16 @@ def test_a_signal_ends_fly_though_what_it_interrupts_swallows_exceptions(shared_
                 simulator.say("ended")
 
         monkeypatch.setattr(Status, "update", update)
-        assert fly(None, vehicle=None, mode="position") == 130
+        assert fly(None, vehicle=None, mode="position", delay_s=0.0) == 130
     assert "interrupted" in capsys.readouterr().err
 
 
 def test_wrong_use_is_refused(shared_runtime):
     for arguments, text in (
         ({"mode": "rates"}, "unknown mode 'rates', known: motor_speeds, velocity, position"),
+        ({"delay_s": -1.0}, "delay_s must be >= 0, got -1.0"),
         ({"vehicle": "plane"}, "unknown vehicle 'plane', known: drone"),
     ):
-        options: dict[str, Any] = {"vehicle": None, "mode": "position", **arguments}
+        options: dict[str, Any] = {"vehicle": None, "mode": "position", "delay_s": 0.0, **arguments}
         with pytest.raises(ValueError, match=text):
             fly(load_config(CONFIG), **options)

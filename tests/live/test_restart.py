@@ -181,19 +181,16 @@ def test_the_others_go_on_without_those_that_are_killed_and_meet_them_again(stac
 
 
 @pytest.mark.parametrize("stack", ["lockstep"], indirect=True)
-@pytest.mark.parametrize("name", ["simulator", "controller"])
-def test_in_lockstep_time_stands_still_until_who_was_killed_is_back(stack, name):
-    stack.kill(name)
-    others = {other: process.process for other, process in stack.running.items()}
-    if name == "controller":
-        waiting = stack.wait_for_status(lambda s: s.phase == "waiting")
-        assert "command" in waiting.reason
-    else:
-        stack.hear("controller", "waiting for a simulator")
-    stack.start(name)
+def test_in_lockstep_time_stands_still_until_a_controller_that_was_killed_is_back(stack):
+    """A simulator that comes back is in the test before, and in lockstep in test_controller.py."""
+    simulator = stack.running["simulator"].process
+    stack.kill("controller")
+    waiting = stack.wait_for_status(lambda s: s.phase == "waiting")
+    assert "command" in waiting.reason
+    stack.start("controller")
     stack.hear("controller", "flying drone")
     stack.wait_for_flight()
-    assert all(process.poll() is None for process in others.values())
+    assert simulator.poll() is None
 
 
 def test_ctrl_c_ends_all_that_one_command_started(runtime, tmp_path, monkeypatch):

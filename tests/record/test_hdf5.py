@@ -26,8 +26,8 @@ from neurosim_core.record import (
     RecordingHeader,
     RecordingWriter,
     SensorDescription,
-    streams,
 )
+from neurosim_core.record.columns import deflate
 from neurosim_core.record.disk import Disk
 
 HEADER = RecordingHeader(config_yaml="duration_s: 1.0\n", seed=7, version="0.1.0", scene="flat")
@@ -600,15 +600,14 @@ except OSError as error:
         assert len(list(flight.packets())) == int(kept_ns) + 1
 
 
-def test_a_thread_that_fails_is_reported_once_and_leaves_what_was_flushed(tmp_path, monkeypatch):
-    writer = RecordingWriter(tmp_path / "f.h5", HEADER)
-    writer.write(image(stamp_ns=1, shape=(90, 90)))
-    writer.flush()
-
-    def fail(*_: object) -> list[bytes]:
+def test_a_thread_that_fails_is_reported_once_and_leaves_what_was_flushed(tmp_path):
+    def fail(_: object) -> list[list[bytes]]:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(streams, "deflate", fail)
+    deflates = [deflate, fail]
+    writer = RecordingWriter(tmp_path / "f.h5", HEADER, deflate=lambda columns: deflates.pop(0)(columns))
+    writer.write(image(stamp_ns=1, shape=(90, 90)))
+    writer.flush()
     writer.write(image(stamp_ns=2, shape=(90, 90)))
     with pytest.raises(MemoryError, match="no room"):
         writer.flush()
@@ -643,6 +642,15 @@ def test_what_is_missing_in_a_recording_is_damage(tmp_path, lost):
         del file[lost]
     with pytest.raises(ValueError, match=r"f.h5 is damaged: "), Recording(tmp_path / "f.h5") as flight:
         list(flight.packets())
+
+
+def test_a_flipped_bit_in_a_schema_is_damage(tmp_path):
+    write(tmp_path / "f.h5", make_flight(0, [1]))
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        attributes = file["sensors/imu"].attrs
+        attributes["schema"] = attributes["schema"].replace("dtype", "etype", 1)
+    with pytest.raises(ValueError, match=r"f.h5 is damaged: .*etype"):
+        Recording(tmp_path / "f.h5")
 
 
 def test_unknown_names_list_the_known_ones(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from render_scenes import LUMA, UNSHADOWED, box, plane, point_light, scene_of
+from render_scenes import LUMA, UNSHADOWED, box, on_cores, plane, point_light, scene_of
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Q_FORWARD_OPTICAL
@@ -59,22 +59,17 @@ def look(scene, bodies, poses, stamps_ns, *, config=UNSHADOWED, device="cpu", th
     """Return all outputs of poses (p_WC, q_WC) at stamps, and the names of instances."""
     arrays = upload_scene(scene, config, device=device, bodies=make_bodies(bodies))
     count = len(stamps_ns)
-    renderer = WarpRenderer(
-        arrays, lens, outputs=OUTPUTS, instant_count=count, image_count=count, thread_count=threads
-    )
+    renderer = WarpRenderer(arrays, lens, outputs=OUTPUTS, instant_count=count, image_count=count)
     slot = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     where = make_body_poses(count, len(bodies), device) if bodies else None
     if where is not None:
         stamps = wp.array(np.array(stamps_ns)[:, None], dtype=wp.int64, device=device)
         pose_bodies(upload_motions(bodies, device), stamps, slot, count=count, poses=where)
     poses = poses * count if len(poses) == 1 else poses
-    renderer.render(
-        wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device),
-        wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device),
-        slot,
-        instant_count=count,
-        bodies=where,
-    )
+    positions = wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device)
+    orientations = wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device)
+    with on_cores(threads):
+        renderer.render(positions, orientations, slot, instant_count=count, bodies=where)
     return {name: getattr(renderer, name).numpy().copy() for name in OUTPUTS}, arrays.instance_names
 
 

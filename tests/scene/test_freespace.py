@@ -228,6 +228,19 @@ def test_open_ground_has_free_space_above_it():
     assert space.reachable(0.3).any()
 
 
+@pytest.mark.parametrize("axis", [0, 2], ids=["poster", "ground"])
+def test_there_is_room_beside_a_flat_scene(axis):
+    low, high = [-5.0] * 3, [5.0] * 3
+    low[axis] = high[axis] = 0.0
+    space = make_free_space(as_scene(box(tuple(low), tuple(high))), FreeSpaceConfig())
+    beside = np.zeros(3)
+    beside[axis] = 1.5
+    assert space.clearance(beside[None])[0] == pytest.approx(1.5, abs=0.1)
+    assert any("flat" in note for note in space.notes)
+    with pytest.raises(ValueError, match="the scene has no free space"):
+        make_free_space(as_scene(box((0.0, 0.0, 0.0), (0.15, 0.15, 0.15))), FreeSpaceConfig())
+
+
 def test_the_seed_of_the_scene_and_of_the_configuration_win():
     scene = two_rooms(0.0)
     assert make_free_space(scene, FreeSpaceConfig()).seed_m == pytest.approx([1.0, 1.0, 1.0])

@@ -146,8 +146,8 @@ def test_report_of_a_house(house, tmp_path):
     ids=["lying", "standing"],
 )
 def test_a_sheet_is_described_and_drawn(tmp_path, corners):
-    """No room around it: that is said, and everything else too."""
-    vertices = np.array(corners, dtype=np.float32)
+    """No room beside something so small: that is said, and everything else too."""
+    vertices = 0.5 * np.array(corners, dtype=np.float32)
     normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])
     sheet = dataclasses.replace(
         hall(),
@@ -164,7 +164,7 @@ def test_a_sheet_is_described_and_drawn(tmp_path, corners):
     report_scene(sheet, tmp_path / "sheet.png", console=Console(file=stream, width=200))
     assert "2, median edge" in stream.getvalue()
     assert "none with 0.3 m clear" in stream.getvalue()
-    assert "There is no room to fly in: the scene has no free space" in stream.getvalue()
+    assert "The scene is flat: free space is mapped up to 3 m on both sides of it" in stream.getvalue()
     with Image.open(tmp_path / "sheet.png") as opened:
         picture = np.asarray(opened).astype(int)
     assert ((picture[:, :1010] < 250).any(axis=2)).mean() > 0.02  # it is drawn

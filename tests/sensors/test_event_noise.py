@@ -15,8 +15,8 @@ from neurosim_core.config import load_config
 from neurosim_core.packets import EventArrays, Events
 from neurosim_core.sensors import event_pixels
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_kernels import make_noisy_scan
 from neurosim_core.sensors.event_noise_model import terms_of
-from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sim import run
 

@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurosim_core.sensors import event_worlds_scan as scan
+from neurosim_core.sensors import event_kernels as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.sensors.events import EventCamera

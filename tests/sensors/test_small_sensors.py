@@ -120,6 +120,11 @@ def test_errors_are_of_the_seed_the_name_and_the_number_of_the_sample():
     np.testing.assert_array_equal(alone[:, 0], first["position"][:, 0])
 
 
+def test_errors_of_what_is_one_number_have_no_axes():
+    with pytest.raises(ValueError, match=r"sensor 'air': white must be one number, got \[1.0, 2.0, 3.0\]"):
+        sampler(BarometerConfig(errors={"white": [1, 2, 3]}), name="air")
+
+
 def test_readings_have_a_resolution():
     values = record(BarometerConfig(errors={"white": 3.0, "resolution": 0.5}), "pressure_pa", slots=50)[:, 0]
     np.testing.assert_array_equal(values, 0.5 * np.rint(values / 0.5))

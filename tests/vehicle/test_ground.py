@@ -251,6 +251,14 @@ def test_a_run_lands_rests_and_takes_off():
     assert packets[-1].position[2] > 0.4
 
 
+def test_a_run_below_the_ground_is_refused():
+    ground = {"height_m": 50.0, "rotor_radius_m": 0.1}
+    path = {"kind": "hover", "position_m": [0, 0, 1.2]}
+    config = load_config({"vehicle": {"parameters": {"ground": ground}}, "path": path, "scene": {"rooms": 1}})
+    with pytest.raises(ValueError, match=r"the path begins at z = 1.2 m, below the ground at 50 m"):
+        sim.plan_paths(config)
+
+
 def test_walls_still_end_a_run_with_a_ground():
     model, state = start_run(velocity=(5.0, 0.0, 0.0))
     packets = fly_run(model, state, HUMMINGBIRD.hover_rotor_speed_rad_s, 5.0)

@@ -1,5 +1,5 @@
-// CPU: radiance of those of 4 x 4 pixels that have a bit in `unresolved`, the mean of SAMPLES rays each, to `radiance_out` [16].
-// Four rays of 2 x 2 pixels are a packet. `rays` has the directions of pixels: centre and spread, and the changes across and down.
+// CPU: radiance of those of 4 x 4 pixels that have a bit in `unresolved`, the mean of SAMPLES rays each, to `radiance_out`
+// [3][INSTANTS][64] at 16 times `block`. Four rays of 2 x 2 pixels are a packet. `rays` has the directions of pixels: centre and spread, and the changes across and down.
 #include "pixel_poses.cuh"
 #include "sample_points.cuh"
 const float width_of_ray = 1.0f / wp::sqrt((float)SAMPLES);
@@ -44,4 +44,5 @@ for (int quarter = 0; quarter < 4; ++quarter) {
 }
 for (int lane = 0; lane < N; ++lane)
     if (unresolved >> lane & 1)
-        for (int channel = 0; channel < 3; ++channel) radiance_out.data[lane][channel] = total[channel][lane] / (float)SAMPLES;
+        for (int channel = 0; channel < 3; ++channel)
+            radiance_out.data[64 * INSTANTS * channel + 16 * block + lane] = total[channel][lane] / (float)SAMPLES;

@@ -3,8 +3,9 @@ auto nearest_part = [&](int face, const wp::vec3& from, const wp::vec3& directio
     int found = scene.whole_first.data[face];
     const int end = scene.whole_first.data[face + 1];
     if (end - found == 1) return found;
+    constexpr float WITHIN = 1e-3f; // no other part is as far around the direction
     float most = -1e30f;
-    for (int part = found; part < end; ++part) {
+    for (int part = found; part < end && most < WITHIN; ++part) {
         const int* index = &mesh.indices[3 * (size_t)part];
         const wp::vec3 a = mesh.points[index[0]] - from, b = mesh.points[index[1]] - from, c = mesh.points[index[2]] - from;
         const float at[3] = {wp::dot(wp::cross(b, c), direction), wp::dot(wp::cross(c, a), direction),

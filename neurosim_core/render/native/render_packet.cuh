@@ -32,6 +32,6 @@ for (int sample = 0; sample < samples; ++sample) {
         for (int lane = 0; lane < N; ++lane)
             for (int channel = 0; channel < 3; ++channel) total[channel][place_of(lane)] += radiance[channel][lane];
 }
-const float share = layers > 1 ? 1.0f / (float)(layers - 1) : 1.0f;
+const float dark_floor = scene.dark_floor, share = layers > 1 ? 1.0f / (float)(layers - 1) : 1.0f;
 auto radiance_of = [&](int channel, int lane) { return share * total[channel][lane]; };
 #include "log_luma.cuh"

@@ -2,10 +2,11 @@
 # mypy: disable-error-code="no-untyped-def,valid-type"
 """Kernels of event cameras in one world or many: the scan of all pixels, and keys in order.
 
-The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise_scan`: their functions get the
-arrays of one world. Every world has keys and counters of its own, and no block of threads takes pixels of
-two, so a block finds room for its events in its world with one atomic operation. Nothing here depends on
-other worlds.
+The law of a pixel is a function that gets the arrays of one world: that of ideal pixels is in `event_scan`,
+that of others in `event_noise_scan`. A kernel for single frames on CUDA is in `event_frame_scan`.
+
+Every world has keys and counters of its own, and no block of threads takes pixels of two, so a block finds
+room for its events in its world with one atomic operation. Nothing here depends on other worlds.
 
 Keys are sorted within each world, by one block each: how many there are is known only to the device, and a
 sort of all worlds together would have to be launched over all the room there is.
@@ -18,6 +19,7 @@ import warp as wp
 
 from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_cut import take_apart
+from neurosim_core.sensors.event_levels import quiet_range
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
 from neurosim_core.sensors.event_noise_scan import make_pixel_scan
 from neurosim_core.sensors.event_scan import (
@@ -25,9 +27,7 @@ from neurosim_core.sensors.event_scan import (
     CLOSE,
     LIMIT,
     OPEN,
-    TILE_SIZE,
     scan_pixel,
-    screen_tile,
     write_key,
 )
 
@@ -39,6 +39,8 @@ AGAIN = wp.constant(2)
 """What a scan is for: all worlds; those with too many events, to count these by row; the same with fewer
 rows."""
 
+TILE_SIZE = wp.constant(256)
+"""Pixels that a thread of `screen` takes."""
 SECTION = wp.constant(64)
 """Worlds whose events are added up first: of N worlds no thread reads more than N / 64 + 64 counts."""
 
@@ -117,6 +119,20 @@ def hand_over_counters(
         counters[world, counter] = wp.int64(0)
 
 
+@wp.func_native(read_native(__file__, "count_lead"))
+def _count_lead(
+    begin: wp.int32,
+    end: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    frame_count: wp.int32,
+    low_32: wp.array[wp.float32],
+    high_32: wp.array[wp.float32],
+    lead_out: wp.array[wp.int32],
+) -> None:
+    """Count for at most 256 pixels the frames before the first that leaves (low, high)."""
+    ...
+
+
 @wp.kernel
 def screen(
     # Model:
@@ -134,19 +150,27 @@ def screen(
     high_out: wp.array2d[wp.float32],
     lead_out: wp.array2d[wp.int32],
 ) -> None:
-    """Count the quiet frames at the start of each pixel; threads are [world, tile], see `event_scan`."""
+    """Count the frames of each pixel before the first that may fire; threads are [world, tile].
+
+    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
+    event. The quiet range of each pixel is left in `low_out` and `high_out`.
+    """
     index, tile = wp.tid()
     world = first_world + index
     begin = first_pixel + tile * TILE_SIZE
-    screen_tile(
-        thresholds[world][0],
-        thresholds[world][1],
+    end = wp.min(begin + TILE_SIZE, end_pixel)
+    on = thresholds[world][0]
+    off = thresholds[world][1]
+    for pixel in range(begin, end):
+        before = crossed[world, pixel]
+        quiet = quiet_range(wp.float64(base[world, pixel]), before[0], before[1], on, off)
+        low_out[world, pixel] = quiet[0]
+        high_out[world, pixel] = quiet[1]
+    _count_lead(
         begin,
-        wp.min(begin + TILE_SIZE, end_pixel),
+        end,
         stack.log_radiance[world],
         frame_count,
-        base[world],
-        crossed[world],
         low_out[world],
         high_out[world],
         lead_out[world],
