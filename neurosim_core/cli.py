@@ -383,6 +383,9 @@ def _scene(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    kinds = (".rrd",) if arguments.flight is None else (".rrd", ".webp", ".gif")
+    if arguments.save is not None and arguments.save.suffix not in kinds:
+        raise ValueError(f"--save writes {' or '.join(kinds)} here, got {arguments.save}")
     if arguments.flight is None:
         from neurosim_core.live.viewer import view
 
@@ -396,9 +399,10 @@ def _view(arguments: argparse.Namespace) -> int:
             open_browser=not arguments.no_browser,
         )
     from neurosim_core.flight import rerun_file
-    from neurosim_core.view.film import SUFFIXES, save_film
 
-    if arguments.save is not None and arguments.save.suffix in SUFFIXES:
+    if arguments.save is not None and arguments.save.suffix != ".rrd":
+        from neurosim_core.view.film import save_film
+
         flight = arguments.flight
         save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
         print(f"wrote {arguments.save}")

@@ -41,6 +41,10 @@ def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     settings = read_settings(arguments.settings)
     settings |= {key: getattr(arguments, name) for key, name in _given(arguments).items()}
     if hasattr(arguments, "lockstep"):  # a live run
+        if arguments.lockstep and arguments.factor is not None:
+            raise ValueError(
+                "--factor is for streaming; with --lockstep a run is as fast as its commands come"
+            )
         settings |= {"live.mode": "lockstep"} if arguments.lockstep else {}
         settings |= {} if arguments.duration is None else {"live.run_on": False}
     return settings

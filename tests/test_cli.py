@@ -261,6 +261,44 @@ def test_an_interrupted_run_is_kept_whole(tmp_path):
         assert flight.packet_count("imu") > 10
 
 
+def test_a_signal_ends_a_command_that_cannot_say_so():
+    program = (
+        "import os, signal\n"
+        "from neurosim_core.signals import handle_signals, leave_at_once\n"
+        "os.close(2)\n"
+        "with handle_signals(leave_at_once):\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], timeout=60.0).returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (
+            "convert in.csv out.raw --set pixel.threshold_on=0.3 --seed 0",
+            "--seed, --set: for a film, and this",
+        ),
+        ("convert in.mp4 out.h5 --from-zero --to evt3", "--to, --from-zero: for a file of events, and this"),
+        ("view flight --save film.mp4", "--save writes .rrd or .webp or .gif here, got film.mp4"),
+        ("view --save film.webp", "--save writes .rrd here, got film.webp"),
+        ("serve --lockstep --factor 2", "--factor is for streaming"),
+    ],
+)
+def test_options_without_effect_are_refused(tmp_path, monkeypatch, capsys, command, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in.csv").write_text("t,x,y,p\n1,2,3,1\n")
+    assert cli.main(command.split()) == 1
+    assert said in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["in.csv"]
+
+
+def test_a_size_that_a_file_does_not_say_is_said(tmp_path, capsys):
+    (tmp_path / "in.csv").write_text("t,x,y,p\n1,2,3,1\n")
+    assert cli.main(["convert", str(tmp_path / "in.csv"), str(tmp_path / "out.raw")]) == 0
+    assert "the size of the sensor is not in the file: 3x4 is" in " ".join(capsys.readouterr().out.split())
+
+
 def test_an_interrupted_conversion_leaves_nothing(tmp_path):
     count, draft = 5_000_000, tmp_path / ".out.csv.part"
     zeros = np.zeros(count, np.uint8)

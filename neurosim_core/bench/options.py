@@ -23,7 +23,7 @@ def _numbers(kind: type) -> Callable[[str], tuple[Any, ...]]:
     return read
 
 
-def _pixels(text: str) -> int:
+def _whole(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number, at least 1, got {text}")
     return int(text)
@@ -44,13 +44,13 @@ class Options:
     quick: bool = _option("a small version; its figures are rough", False, action="store_true")
     scene: Path | None = _option("mesh file; default: a generated scene", type=Path, metavar="FILE")  # noqa: RUF009
     device: str = _option("auto, cpu, cuda:0, ... (default: auto)", default="auto")
-    width: int | None = _option("columns of the camera", type=_pixels, metavar="PX")
-    height: int | None = _option("rows of the camera", type=_pixels, metavar="PX")
+    width: int | None = _option("columns of the camera", type=_whole, metavar="PX")
+    height: int | None = _option("rows of the camera", type=_whole, metavar="PX")
     samples: tuple[int, ...] | None = _option("rays per pixel", type=_numbers(int), metavar="N,...")
     seconds: float | None = _option("how long to measure or fly each case", type=float, metavar="S")
     worlds: tuple[int, ...] | None = _option("numbers of worlds", type=_numbers(int), metavar="N,...")
-    instants: int = _option("renders per launch (default: 16)", 16, type=int, metavar="K")
-    steps: int = _option("steps per repetition (default: 1600)", 1600, type=int, metavar="N")
+    instants: int = _option("renders per launch (default: 16)", 16, type=_whole, metavar="K")
+    steps: int = _option("steps per repetition (default: 1600)", 1600, type=_whole, metavar="N")
     max_displacement: float | None = _option(
         "render only so often that nothing moves further between two renders", type=float, metavar="PX"
     )

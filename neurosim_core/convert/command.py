@@ -102,9 +102,22 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _convert(arguments: argparse.Namespace) -> int:
     from neurosim_core.io import is_event_file
 
-    if arguments.source_format is not None or is_event_file(arguments.source):
-        return _transfer(arguments)
-    return _convert_video(arguments)
+    is_events = arguments.source_format is not None or is_event_file(arguments.source)
+    _check_options(arguments, is_events=is_events)
+    return _transfer(arguments) if is_events else _convert_video(arguments)
+
+
+def _check_options(arguments: argparse.Namespace, *, is_events: bool) -> None:
+    """Refuse options that do nothing with what is converted."""
+    films = {name: option.setting for name, option in _OPTIONS.items() if name not in ("size", "time-unit")}
+    events = {"to": "out_format", "sensor": "sensor", "from-zero": "from_zero"}
+    others = films | {"set": "settings"} if is_events else events
+    values = {name: getattr(arguments, key) for name, key in others.items()}
+    if given := [
+        f"--{name}" for name, value in values.items() if value or (value == 0 and value is not False)
+    ]:
+        kind = "a film, and this is a file of events" if is_events else "a file of events, and this is none"
+        raise ValueError(f"{', '.join(given)}: for {kind}: {arguments.source}")
 
 
 def _transfer(arguments: argparse.Namespace) -> int:

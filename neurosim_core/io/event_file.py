@@ -112,6 +112,12 @@ class EventReader:
         except BaseException:
             source.close()
             raise
+        if not (size or source.size):
+            self._first_notes.append(
+                f"the size of the sensor is not in the file: {self.width}x{self.height} is the smallest that "
+                "has all events; `neurosim convert --size` makes it larger"
+            )
+            self.notes[:] = self._first_notes
 
     def blocks(self) -> Iterator[EventArrays]:
         """Yield all events from the first on, sorted by time, about a million at a time.

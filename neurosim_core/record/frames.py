@@ -15,6 +15,16 @@ from numpy.typing import NDArray
 _SIZES = struct.Struct("<QQ")
 _PARTS_MAX = 1000
 """More than that no system takes in one call."""
+_BUFFER_BYTES = 1 << 20
+"""What a connection holds, where the system allows it [bytes]: about a frame."""
+
+
+def connect() -> tuple[socket.socket, socket.socket]:
+    """Return the ends of a connection that holds more than usual: each time it is full wakes both sides."""
+    ends = socket.socketpair()
+    for end in ends:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+    return ends
 
 
 def send_frame(link: socket.socket, bodies: Sequence[bytes], arrays: Sequence[NDArray[Any]]) -> None:
@@ -38,14 +48,21 @@ def receive_frame(link: socket.socket) -> tuple[list[Any], NDArray[np.uint8]]:
     Raises:
         EOFError: The other side is gone.
     """
-    sizes = link.recv(_SIZES.size, socket.MSG_WAITALL)
-    if len(sizes) < _SIZES.size:
-        raise EOFError
+    sizes = bytearray(_SIZES.size)
+    _receive_into(link, [memoryview(sizes)])
     bodies, arrays = (np.empty(size, np.uint8) for size in _SIZES.unpack(sizes))
-    parts: list[Any] = [bodies, arrays]
-    if link.recvmsg_into(parts, 0, socket.MSG_WAITALL)[0] < bodies.size + arrays.size:
-        raise EOFError
+    _receive_into(link, [bodies.data, arrays.data])
     stream, contents = io.BytesIO(bodies.tobytes()), []
     while stream.tell() < bodies.size:
         contents.append(pickle.load(stream))
     return contents, arrays
+
+
+def _receive_into(link: socket.socket, parts: list[memoryview]) -> None:
+    """Fill all parts; one call does, unless the process was stopped and goes on, or they exceed 2 GB."""
+    while parts := [part for part in parts if len(part)]:
+        received = link.recvmsg_into(parts, 0, socket.MSG_WAITALL)[0]
+        if received == 0:
+            raise EOFError
+        for index, part in enumerate(parts):
+            parts[index], received = part[received:], max(0, received - len(part))

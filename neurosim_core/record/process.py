@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
 from neurosim_core.record.compressors import Compressors
 from neurosim_core.record.forked import disown_when_forked, forked_error
-from neurosim_core.record.frames import receive_frame, send_frame
+from neurosim_core.record.frames import connect, receive_frame, send_frame
 from neurosim_core.record.hdf5 import RecordingWriter, deflate_count, import_h5py
 from neurosim_core.record.header import RecordingHeader
 
@@ -54,9 +54,10 @@ class _Process:
     """A process that writes a recording, or waits for one."""
 
     def __init__(self) -> None:
-        self.socket, theirs = socket.socketpair()
+        self.socket, theirs = connect()
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
-        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        path = [entry for entry in sys.path if isinstance(entry, str)]  # Python ignores others
+        program = f"import sys; sys.path[:] = {path!r}; from {__name__} import main; main()"
         with theirs:
             self.popen = subprocess.Popen(
                 [sys.executable, "-c", program],
@@ -126,26 +127,29 @@ class RecordingProcess:
         """
         if self._failure is not None:
             raise self._failure
+        if self._closed:
+            raise ValueError(f"{self._path} is closed")
         kind = type(packet)
         if kind not in self._classes:
-            names = tuple(field.name for field in fields(kind))
-            self._classes[kind] = len(self._classes), names
-            self._put((*self._classes[kind], schema_of(kind).to_json()))
+            schema = schema_of(kind).to_json()
+            self._classes[kind] = len(self._classes), tuple(field.name for field in fields(kind))
+            self._put((*self._classes[kind], schema))
         number, names = self._classes[kind]
         values: list[Any] = []
         arrays: list[NDArray[Any]] = []
         size = 0  # of them
         for name in names:
             value = getattr(packet, name)
-            if type(value) not in _SCALARS:
-                array = as_numpy(value)
+            if type(value) not in _SCALARS and not isinstance(value, np.generic):
+                array = value = as_numpy(value)
                 place: bytes | int = size
-                if array.nbytes >= _COPIED_BYTES:
-                    arrays.append(np.ascontiguousarray(array))
-                    size += array.nbytes
-                else:
-                    place = array.tobytes()
-                value = array.dtype.str, array.shape, place
+                if array.dtype.kind not in "OV":  # of objects it holds addresses; records have names
+                    if array.nbytes >= _COPIED_BYTES:
+                        arrays.append(np.ascontiguousarray(array).view(np.uint8))
+                        size += array.nbytes
+                    else:
+                        place = array.tobytes()
+                    value = array.dtype.str, array.shape, place
             values.append(value)
         self._put((number, size, values), arrays)
         if self._put_bytes - self._sent_bytes > _QUEUE_BYTES:
@@ -166,7 +170,7 @@ class RecordingProcess:
             self._put(complete)
             self._queue.put(None)
             self._thread.join()
-            self._end()
+            self._end(early=self._sent_bytes < self._put_bytes)
 
     def disown(self) -> None:
         """Leave the recording to the process that this one was forked from."""
@@ -180,8 +184,8 @@ class RecordingProcess:
 
     def _send(self) -> None:
         """Send what is put, until that is None or the process has ended; together what waits."""
-        with contextlib.suppress(OSError):  # why it has ended, `_end` finds out
-            is_over = False
+        is_over = False
+        try:
             while not is_over:
                 size = 0
                 bodies: list[bytes] = []
@@ -197,8 +201,11 @@ class RecordingProcess:
                     send_frame(self._process.socket, bodies, arrays)
                 self._sent_bytes += size
                 self._progress.set()
-        self._is_sending = False
-        self._progress.set()
+        except OSError:
+            pass  # why it has ended, `_end` finds out
+        finally:
+            self._is_sending = False
+            self._progress.set()
 
     def _wait(self) -> None:
         """Wait until there is room in the queue."""
@@ -225,7 +232,8 @@ class RecordingProcess:
 
 def main() -> None:
     """Be the process: write what comes from file 0, the socket, and report on file 1."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends with the one that flies
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # it ends with the one that flies
+        signal.signal(number, signal.SIG_IGN)
     gc.disable()  # packets have no cycles
     compressors = Compressors(deflate_count())
     failure, kept_ns = None, None
@@ -252,21 +260,21 @@ def _write(
     """Write what comes until the stream ends; what is cut off is dropped."""
     classes: dict[int, tuple[Any, Sequence[str]]] = {}
     complete = False
-    frames: queue.Queue[tuple[list[Any], NDArray[np.uint8]] | None] = queue.Queue(_RECEIVED_MAX)
+    frames: queue.Queue[tuple[list[Any], NDArray[np.uint8]] | Exception] = queue.Queue(_RECEIVED_MAX)
     frames.put(first)
 
     def receive() -> None:
         try:
             while True:
                 frames.put(receive_frame(source))
-        except EOFError:
-            pass
-        finally:
-            frames.put(None)
+        except Exception as error:
+            frames.put(error)
 
     threading.Thread(target=receive, name="receive", daemon=True).start()
     try:
-        while (frame := frames.get()) is not None:
+        while not isinstance(frame := frames.get(), (EOFError, OSError)):
+            if isinstance(frame, Exception):
+                raise frame
             contents, arrays = frame
             begin = 0
             for content in contents:

@@ -57,10 +57,17 @@ def choose_candidate_lists(
     instant_count: int,
     face_count: int,
     is_cuda: bool,
+    embree: bool = False,
 ) -> CandidateListConfig | None:
     """Return the settings of candidate lists for a renderer; None: rays traverse the tree.
 
-    Rays are those of `ray_layers`; a launch has at most `instant_count` instants of one world.
+    Args:
+        requested: `RenderConfig.candidate_lists`.
+        rays: Those of `ray_layers`.
+        instant_count: The most instants of one world in a launch.
+        face_count: Triangles of the scene, as cut for baked light.
+        is_cuda: The device is one of CUDA, else a CPU.
+        embree: Embree casts rays; on a CPU without it lists are always sooner, or as soon.
     """
     if requested != "auto":
         return requested
@@ -68,7 +75,8 @@ def choose_candidate_lists(
     sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
     pixel_rad = float(np.median(rays[..., 3])) * math.sqrt(sample_count)
     small = pixel_rad <= widest and face_count * pixel_rad**2 <= _AUTO_FACES_MAX
-    return CandidateListConfig() if is_cuda and small and looks_forward(rays) else None
+    pays = small if is_cuda else not embree
+    return CandidateListConfig() if pays and looks_forward(rays) else None
 
 
 def _check_counts(config: CandidateListConfig, *, groups: int, tiles: int) -> None:

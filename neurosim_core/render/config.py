@@ -60,14 +60,15 @@ class RenderConfig(Settings):
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Library that intersects rays on a CPU device. `embree`: Embree, in packets of rays, several times
-    faster. `warp`: Warp kernels, as on CUDA. `auto`: Embree where it can be loaded, and Warp with explicit
+    faster. `warp`: Warp kernels. `auto`: Embree where it can be loaded, and Warp with explicit
     `candidate_lists`."""
     candidate_lists: CandidateListConfig | Literal["auto"] | None = "auto"
     """The rays of a tile of pixels share one search of the tree over several instants: the same pictures and
     events to the last bit, sooner. `auto`: lists are used on CUDA, where a launch has 8 instants or more of
     pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of 6 mrad, the lens
     looks forward, and lists stay short: the square of a pixel's width [rad] times the triangles of the scene,
-    as cut for baked light, is at most 7. null: each ray traverses the tree."""
+    as cut for baked light, is at most 7; and on a CPU without Embree, where the lens looks forward. null:
+    each ray traverses the tree."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

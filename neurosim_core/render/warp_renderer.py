@@ -254,15 +254,15 @@ class WarpRenderer:
             quads=wp.get_device(arrays.device).is_cuda and len(rays) % 4 == 1 and len(rays) > 1,
         )
         shared = None
-        if not (
-            terms.timed or terms.world_scenes or terms.world_lenses
-        ):  # lists change nothing but the speed
+        # lists change nothing but the speed
+        if not (terms.timed or terms.world_scenes or terms.world_lenses):
             shared = choose_candidate_lists(
                 arrays.config.candidate_lists,
                 rays,
                 instant_count=self._stride,
                 face_count=arrays.face_origin.shape[0],
                 is_cuda=wp.get_device(arrays.device).is_cuda,
+                embree=bool(terms.embree),
             )
         # with several worlds, groups end with the instants of a world
         group = 1 << min(2, self._stride.bit_length() - 1) if several else None

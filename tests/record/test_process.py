@@ -46,13 +46,20 @@ class LabelledEvents(Events):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Note(Packet):
-    """All that a packet may hold besides: texts, an array that is empty or not contiguous, a truth."""
+    """What a packet may hold besides: texts, also as objects, arrays that are empty or not contiguous."""
 
     text: str
     table: Annotated[NDArray[np.float32], FieldSpec("n", 2)]
+    words: Annotated[NDArray[np.str_], FieldSpec("n", dtype="str")]
     picture: Annotated[NDArray[np.int16], FieldSpec("H", "W")]
     is_last: bool
     who: Annotated[str, FieldSpec(constant=True)]
+
+
+class Word(str):
+    """A text of a class that the process which writes cannot import."""
+
+    __module__ = "notebook"
 
 
 def run(code: str, path: Path) -> subprocess.Popen[str]:
@@ -102,7 +109,8 @@ def test_the_file_is_that_of_the_writer(tmp_path):
         picture = rng.integers(0, 99, (120, 160), dtype=np.int16)[::2, ::2]
         table = rng.random((k, 2), dtype=np.float32)
         note = {"text": f"ä{k}", "table": table, "picture": picture, "is_last": k == 2, "who": "me"}
-        packets.append(Note(stamp_ns=(k + 1) * MS, sequence=k, sensor="note", **note))
+        words = np.array(["yes", "no"][:k], object)
+        packets.append(Note(stamp_ns=(k + 1) * MS, sequence=k, sensor=np.str_("note"), words=words, **note))
     write(tmp_path / "wanted.h5", packets, flush_interval_s=1e9)
     start_process()
     writer = RecordingProcess(tmp_path / "found.h5", HEADER)
@@ -119,6 +127,36 @@ def test_the_file_is_that_of_the_writer(tmp_path):
 def test_a_file_that_cannot_be_created_is_told_at_once(tmp_path):
     with pytest.raises(OSError, match=r"cannot write .*nowhere/f.h5: No such file or directory"):
         RecordingProcess(tmp_path / "nowhere" / "f.h5", HEADER)
+
+
+def test_a_class_that_cannot_be_recorded_is_refused_each_time_and_changes_nothing(tmp_path):
+    @dataclass(frozen=True, kw_only=True, eq=False)
+    class Bad(Packet, known=False):
+        table: dict
+
+    writer = RecordingProcess(tmp_path / "f.h5", HEADER)
+    for _ in range(2):
+        with pytest.raises(TypeError, match="field 'table' of packet Bad"):
+            writer.write(Bad(sensor="bad", table={}))
+    writer.write(image(stamp_ns=10))
+    writer.close()
+    with pytest.raises(ValueError, match=r"f\.h5 is closed"):
+        writer.write(image(stamp_ns=11))
+    with Recording(tmp_path / "f.h5") as flight:
+        assert_same(list(flight.packets()), [image(stamp_ns=10)])
+
+
+def test_what_cannot_be_received_is_told_by_close(tmp_path, monkeypatch):
+    @dataclass(frozen=True, kw_only=True, eq=False)
+    class Words(Packet, known=False):
+        words: Annotated[NDArray[np.str_], FieldSpec("n", dtype="str")]
+
+    monkeypatch.setitem(sys.modules, "notebook", sys.modules[__name__])
+    writer = RecordingProcess(tmp_path / "f.h5", HEADER)
+    writer.write(image(stamp_ns=10))
+    writer.write(Words(sensor="words", words=np.array([Word("yes")], object)))
+    with pytest.raises(ModuleNotFoundError, match="notebook"):
+        writer.close()
 
 
 def test_what_the_writer_refuses_is_raised_by_a_later_call_and_once(tmp_path):
@@ -233,21 +271,27 @@ if "leave" not in sys.argv[1]:
             os.kill(child, signal.SIGKILL)
 
 
-def test_an_interrupt_of_all_processes_leaves_a_complete_file(tmp_path):
-    """Ctrl-C goes to all processes of a terminal."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_all_processes_leaves_a_complete_file(tmp_path, number):
+    """Ctrl-C goes to all processes of a terminal, that of a service manager to other sessions, too."""
     code = """
+number = int(sys.argv[1].rpartition(".")[2])
 os.setpgrp()
 stopped = []
-signal.signal(signal.SIGINT, lambda *_: stopped.append(1))
+signal.signal(number, lambda *_: stopped.append(1))
+while not os.path.getsize(sys.argv[1]):
+    time.sleep(0.01)
 for k, packet in enumerate(PACKETS):
     writer.write(packet)
     if k == 50:
-        os.killpg(0, signal.SIGINT)
+        os.killpg(0, number)
+        os.killpg(writer._process.popen.pid, number)
 writer.close()
 print(stopped)
 """
-    assert run(code, tmp_path / "f.h5").communicate(timeout=300.0) == ("[1]\n", "")
-    with Recording(tmp_path / "f.h5") as flight:
+    path = tmp_path / f"f.h5.{int(number)}"
+    assert run(code, path).communicate(timeout=300.0) == ("[1]\n", "")
+    with Recording(path) as flight:
         assert flight.clean
         assert_same(list(flight.packets()), PACKETS)
 

@@ -440,8 +440,16 @@ def test_the_default_is_for_many_instants_of_small_pixels(pixel_rad, least, samp
     for count in (1, 7, 8, 15, 16, 31, 32, 1000):
         chosen = choose_candidate_lists("auto", rays, instant_count=count, face_count=1000, is_cuda=True)
         assert (chosen is not None) is (least is not None and count >= least)
-    assert choose_candidate_lists("auto", rays, instant_count=1000, face_count=1000, is_cuda=False) is None
     assert choose_candidate_lists("auto", -rays, instant_count=1000, face_count=1000, is_cuda=True) is None
+
+
+def test_the_default_of_a_cpu_is_for_rays_without_embree():
+    rays = ray_layers(LENS, 1)
+    for given, embree, shared in ((rays, False, True), (rays, True, False), (-rays, False, False)):
+        chosen = choose_candidate_lists(
+            "auto", given, instant_count=1, face_count=10**7, is_cuda=False, embree=embree
+        )
+        assert (chosen is not None) is shared
 
 
 @pytest.mark.parametrize(("pixel_rad", "most"), [(1.2e-3, 4_861_000), (2.24e-3, 1_395_000)])
@@ -453,11 +461,13 @@ def test_the_default_is_not_for_lists_that_are_long(pixel_rad, most):
         assert (chosen is not None) is shared
 
 
-def test_lists_are_the_default_on_cuda_alone(device):
+def test_lists_are_the_default_where_they_pay(device):
+    """On CUDA for many instants of small pixels; on a CPU in place of rays that Warp casts one by one."""
     arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED, device)
+    alone = arrays.embree is None and device == "cpu"
     is_cuda = wp.get_device(device).is_cuda
     narrow = PinholeConfig(width=45, height=34, fx=800.0, fy=760.0, cx=21.0, cy=18.5)
-    for lens, count, shared in ((narrow, 7, False), (narrow, 8, is_cuda), (LENS, 8, False)):
+    for lens, count, shared in ((narrow, 7, alone), (narrow, 8, alone or is_cuda), (LENS, 8, alone)):
         renderer = WarpRenderer(arrays, lens, outputs=("depth",), instant_count=count)
         assert (renderer.candidates is not None) is shared
     shared = upload_scene(scene_of(plane(1.0)), with_lists(instants=2, face_count_max=8), device)

@@ -77,7 +77,7 @@ KINDS = pytest.mark.parametrize(
 @KINDS
 def test_packets_are_shaded_like_single_rays(kind, settings):
     scene = scene_of(kind)
-    alone = pictures(scene, cpu_traversal="warp", **settings)
+    alone = pictures(scene, cpu_traversal="warp", candidate_lists=None, **settings)
     packets = pictures(scene, candidate_lists={}, **settings)
     assert packets.tobytes() == alone.tobytes()
     sky = np.log(np.float32(0.2126 * 0.55 + 0.7152 * 0.7 + 0.0722 * 0.95 + 1e-3))

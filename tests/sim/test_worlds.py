@@ -153,7 +153,7 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     left, left_room = int(walk.data.unresolved_count.numpy()[0]), walk.data.unresolved.shape[0]
     assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
     for world in range(2):
-        for render in (walking, {**UNSHADOWED, "cpu_traversal": "warp"}):
+        for render in (walking, {**UNSHADOWED, "cpu_traversal": "warp", "candidate_lists": None}):
             config = settings(textured, seed=7 + world, sensors=rig, render=render)
             for step, packets in enumerate(fly_alone(config, commands[:, world])):
                 assert_same(seen[step][world], packets)
