@@ -38,7 +38,7 @@ class Texture:
         self._source = srgb
         self._levels: list[NDArray[np.uint32]] | None = None
 
-    # No `cached_property`: before Python 3.12 it has one lock for all textures, and threads decode one by one.
+    # No `cached_property`: before Python 3.12 it has one lock for all textures, so threads would take turns.
     @property
     def srgb(self) -> NDArray[np.uint8]:
         """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
