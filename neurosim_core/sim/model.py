@@ -148,10 +148,6 @@ def _make_fleet(
     bodies = make_bodies(config.bodies) if seeing else ()
     with ThreadPoolExecutor(max_workers=4) as aside:
         beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
-        if reader is None:
-            reading = aside.submit(config.scene.load, pictures=seeing)
-        else:
-            reading = aside.submit(reader.geometry, config.scene)
 
         def map_scene() -> FreeSpace:
             geometry = reading.result()
@@ -168,6 +164,11 @@ def _make_fleet(
             )
 
         with phase("scene"):
+            if reader is None:  # in this thread, where Ctrl-C interrupts it
+                scene = config.scene.load(pictures=seeing)
+                reading = aside.submit(lambda: scene)
+            else:
+                reading = aside.submit(reader.geometry, config.scene)
             mapping, lighting = aside.submit(map_scene), aside.submit(light_scene)
             if reader is not None:
                 load_scipy()  # while the other process reads, and distances are mapped

@@ -7,6 +7,7 @@ import errno
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,20 @@ def test_what_is_wrong_with_a_file_is_said_here(tmp_path):
         pytest.raises(SceneError, match=r"no\.glb: no such file"),
     ):
         make_model(settings_in(MeshSceneConfig(file=Path("no.glb"))), reader=reader)
+
+
+def test_ctrl_c_interrupts_the_reading_of_a_scene(monkeypatch):
+    """Without another process the thread that is interrupted reads it, so nobody waits for the rest."""
+    readers = []
+    load = HallConfig.load
+
+    def load_here(config, **options):
+        readers.append(threading.current_thread())
+        return load(config, **options)
+
+    monkeypatch.setattr(HallConfig, "load", load_here)
+    make_model(settings_in(HallConfig()))
+    assert readers == [threading.current_thread()]
 
 
 def test_modules_of_the_working_directory_are_left_alone(tmp_path, monkeypatch):
