@@ -196,7 +196,7 @@ class BridgeConfig:
     """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
     routes: tuple[Annotated[RouteChange, BeforeValidator(_without_nulls)], ...] = ()
     """Changes, in order; later ones win."""
-    converters: tuple[str, ...] = ()
+    converters: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Modules, or .py files, that register conversions."""
     ros: RosArguments = field(default_factory=RosArguments)
     """What followed `--ros-args`; no setting of the file."""
@@ -288,6 +288,8 @@ _OWNERS: dict[int | str, type[Any]] = {"routes": RouteChange, "frames": FrameNam
 
 def _bridge_config(raw: object) -> BridgeConfig:
     given = _without_nulls(raw)
+    if isinstance(given, dict) and "ros" in given:  # a field, but no setting
+        raise ConfigError(_unknown("ros", list(SETTINGS)))
     if isinstance(given, dict) and "domain" in given:  # its old name, easily taken for that of ROS
         given = {"cortex_domain": given["domain"], **{k: v for k, v in given.items() if k != "domain"}}
     try:
@@ -299,7 +301,8 @@ def _bridge_config(raw: object) -> BridgeConfig:
 def _explain(error: ValidationError) -> str:
     """Say what the first of the errors is, and of which key."""
     item = error.errors()[0]
-    loc, text = item["loc"], item["msg"].removeprefix("Value error, ")
+    loc = [part for part in item["loc"] if part != "[key]"]
+    text = item["msg"].removeprefix("Value error, ")
     *groups, key = ["", *(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)]
     place = "".join(groups).lstrip(".")
     if item["type"] in ("unexpected_keyword_argument", "extra_forbidden"):

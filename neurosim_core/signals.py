@@ -76,10 +76,12 @@ def raise_at_signals() -> Iterator[Callable[[], None]]:
 
 def leave_at_once(_signal: int, _frame: FrameType | None) -> None:
     """End the process on the spot, as long as nothing is open; imports may swallow a `KeyboardInterrupt`."""
-    for terminal in filter(os.isatty, (1, 2)):
-        os.write(terminal, b"\x1b[?25h")  # lines of progress hide the cursor
-    os.write(2, f"{INTERRUPTED_LINE}\n".encode())
-    os._exit(130)
+    try:
+        for terminal in filter(os.isatty, (1, 2)):
+            os.write(terminal, b"\x1b[?25h")  # lines of progress hide the cursor
+        os.write(2, f"{INTERRUPTED_LINE}\n".encode())
+    finally:  # nobody may read that
+        os._exit(130)
 
 
 def end_with_parent(number: signal.Signals) -> Callable[[], None] | None:

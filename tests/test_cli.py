@@ -261,6 +261,17 @@ def test_an_interrupted_run_is_kept_whole(tmp_path):
         assert flight.packet_count("imu") > 10
 
 
+def test_a_signal_ends_a_command_that_cannot_say_so():
+    program = (
+        "import os, signal\n"
+        "from neurosim_core.signals import handle_signals, leave_at_once\n"
+        "os.close(2)\n"
+        "with handle_signals(leave_at_once):\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], timeout=60.0).returncode == 130
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [

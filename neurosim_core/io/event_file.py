@@ -115,7 +115,7 @@ class EventReader:
         if not (size or source.size):
             self._first_notes.append(
                 f"the size of the sensor is not in the file: {self.width}x{self.height} is the smallest that "
-                "has all events; --size says it"
+                "has all events; `neurosim convert --size` makes it larger"
             )
             self.notes[:] = self._first_notes
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.record.columns import deflate
-from neurosim_core.record.frames import receive_frame, send_frame
+from neurosim_core.record.frames import connect, receive_frame, send_frame
 
 
 class Compressors:
@@ -28,7 +28,7 @@ class Compressors:
         self.count = count
         self._idle: queue.SimpleQueue[socket.socket] = queue.SimpleQueue()
         for _ in range(count):
-            ours, theirs = socket.socketpair()
+            ours, theirs = connect()
             if os.fork() == 0:
                 os.closerange(0, 3)  # the end of this process must be seen by those who have them
                 ours.close()

@@ -15,6 +15,16 @@ from numpy.typing import NDArray
 _SIZES = struct.Struct("<QQ")
 _PARTS_MAX = 1000
 """More than that no system takes in one call."""
+_BUFFER_BYTES = 1 << 20
+"""What a connection holds, where the system allows it [bytes]: about a frame."""
+
+
+def connect() -> tuple[socket.socket, socket.socket]:
+    """Return the ends of a connection that holds more than usual: each time it is full wakes both sides."""
+    ends = socket.socketpair()
+    for end in ends:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+    return ends
 
 
 def send_frame(link: socket.socket, bodies: Sequence[bytes], arrays: Sequence[NDArray[Any]]) -> None:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
 from neurosim_core.record.compressors import Compressors
 from neurosim_core.record.forked import disown_when_forked, forked_error
-from neurosim_core.record.frames import receive_frame, send_frame
+from neurosim_core.record.frames import connect, receive_frame, send_frame
 from neurosim_core.record.hdf5 import RecordingWriter, deflate_count, import_h5py
 from neurosim_core.record.header import RecordingHeader
 
@@ -54,7 +54,7 @@ class _Process:
     """A process that writes a recording, or waits for one."""
 
     def __init__(self) -> None:
-        self.socket, theirs = socket.socketpair()
+        self.socket, theirs = connect()
         # `-m` would look for modules in the working directory first, where a yaml.py may lie
         path = [entry for entry in sys.path if isinstance(entry, str)]  # Python ignores others
         program = f"import sys; sys.path[:] = {path!r}; from {__name__} import main; main()"

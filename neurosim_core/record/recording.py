@@ -247,7 +247,7 @@ def _damage_of(path: Path) -> Iterator[None]:
     """Say of the errors of HDF5 that they are damage of a file."""
     try:
         yield
-    except (KeyError, OSError, RuntimeError) as error:
+    except (IndexError, KeyError, OSError, RuntimeError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 

@@ -36,28 +36,29 @@ class Texture:
         """Take texels as `srgb` has them, or what paints them."""
         self.name = name
         self._source = srgb
+        self._levels: list[NDArray[np.uint32]] | None = None
 
-    @cached_property
+    # No `cached_property`: before Python 3.12 it has one lock for all textures, so threads would take turns.
+    @property
     def srgb(self) -> NDArray[np.uint8]:
         """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
-        return self._source() if callable(self._source) else self._source
+        source = self._source
+        if callable(source):
+            source = self._source = source()
+        return source
 
     def decode(self) -> None:
         """Look at the texels now: raises what is wrong with their picture."""
         self.srgb  # noqa: B018
 
-    @cached_property
-    def _levels(self) -> list[NDArray[np.uint32]]:
-        return packed_levels(self.srgb)
-
     def take_levels(self) -> list[NDArray[np.uint32]]:
         """Return the packed texels of all mip levels, shape [H, W] each; they are not kept."""
-        levels = self._levels
-        self.__dict__.pop("_levels", None)
-        return levels
+        levels, self._levels = self._levels, None
+        return packed_levels(self.srgb) if levels is None else levels
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process gets: the texels and their levels, in place of what paints them."""
+        self._levels = self._levels or packed_levels(self.srgb)
         return {"name": self.name, "_source": self.srgb, "_levels": self._levels}
 
 

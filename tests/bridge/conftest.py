@@ -13,7 +13,7 @@ from foreigners import Foreigner
 from processes import processes_with, wait_for
 from runtime_directory import runtime
 
-# Stand-ins check what they are given; the classes of ROS since Jazzy do so only then.
+# Classes of ROS since Jazzy check what they are given only then.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
 __all__ = ["dds_domain", "foreigner", "runtime", "short_lease"]

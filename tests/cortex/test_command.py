@@ -436,6 +436,7 @@ def test_a_signal_ends_a_command_though_what_it_interrupts_swallows_exceptions(
         return interrupted
 
     path, robot = tmp_path / "run.mcap", make_node("robot")
+    subscriber = robot.subscriber("/played", Number)
     publisher = robot.publisher("/number", Number)
 
     def publish_two() -> None:
@@ -446,13 +447,13 @@ def test_a_signal_ends_a_command_though_what_it_interrupts_swallows_exceptions(
     with Recorder(robot, path, ["/number"]) as recorder:
         publish_two()
         wait_for(lambda: recorder.stats.written == 2)
+    wait_for(lambda: publisher.subscriber_count == 0)
     monkeypatch.setattr(watch, "message_lines", swallowing(message_lines))
     with Beside(publish_two):
         status, output, _ = cortex("echo", "/number", "-n", 2)
     assert (status, output.count("---")) == ({signal.SIGINT: 0, signal.SIGTERM: 143}[number], 1)
     monkeypatch.setattr(player, "RawMessage", swallowing(RawMessage))
-    subscriber = robot.subscriber("/number", Number)
-    assert cortex("play", path)[0] == 128 + number
+    assert cortex("play", path, "--remap", "/number:=/played")[0] == 128 + number
     assert subscriber.recv(SOON_S) == Number(0, 0)
     with pytest.raises(TimeoutError):
         subscriber.recv(0.1)

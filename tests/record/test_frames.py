@@ -5,12 +5,14 @@ from __future__ import annotations
 import pickle
 import signal
 import socket
+import sys
 import threading
 import time
 
 import numpy as np
+import pytest
 
-from neurosim_core.record.frames import receive_frame, send_frame
+from neurosim_core.record.frames import connect, receive_frame, send_frame
 
 
 def test_a_frame_is_received_whole_though_a_signal_comes_within():
@@ -42,3 +44,12 @@ def test_a_frame_is_received_whole_though_a_signal_comes_within():
             link.close()
     assert contents == ["text"]
     assert received.tobytes() == data.tobytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what a socket holds differs")
+def test_a_packet_is_sent_before_anybody_receives_it():
+    near, far = connect()
+    with near, far:
+        near.setblocking(False)
+        send_frame(near, [pickle.dumps("text")], [np.zeros(300_000, np.uint8)])
+        assert receive_frame(far)[1].size == 300_000

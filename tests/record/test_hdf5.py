@@ -644,6 +644,15 @@ def test_what_is_missing_in_a_recording_is_damage(tmp_path, lost):
         list(flight.packets())
 
 
+def test_a_flipped_bit_in_a_schema_is_damage(tmp_path):
+    write(tmp_path / "f.h5", make_flight(0, [1]))
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        attributes = file["sensors/imu"].attrs
+        attributes["schema"] = attributes["schema"].replace("dtype", "etype", 1)
+    with pytest.raises(ValueError, match=r"f.h5 is damaged: .*etype"):
+        Recording(tmp_path / "f.h5")
+
+
 def test_unknown_names_list_the_known_ones(tmp_path):
     write(tmp_path / "f.h5", make_flight(0, [1]))
     with Recording(tmp_path / "f.h5") as flight:

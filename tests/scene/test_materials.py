@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import warp as wp
 from hypothesis import given, settings
@@ -197,3 +200,15 @@ def test_a_scene_without_textures_packs_nothing():
 
 def test_encoding_clips():
     assert encode_texels(np.array([[2.0, -1.0, 1.0]], np.float32))[0] == 2047 | (1023 << 22)
+
+
+def test_threads_decode_textures_at_once():
+    """Each picture waits for the other; before Python 3.12 a `cached_property` would let in one at a time."""
+    both = threading.Barrier(2)
+
+    def paint():
+        both.wait(60.0)
+        return np.zeros((2, 2, 3), np.uint8)
+
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(Texture.decode, [Texture(name=name, srgb=paint) for name in "ab"]))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import ValidationError
 
+from neurosim_core.scene import gltf
 from neurosim_core.scene.mesh import MeshSceneConfig, SceneError, load_mesh_scene
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Scene
@@ -469,20 +470,23 @@ def test_equal_pictures_are_one_texture(tmp_path):
     assert scene.materials[0].texture is scene.materials[1].texture
 
 
-def test_pictures_may_wait_until_somebody_looks(tmp_path):
+def test_pictures_may_wait_until_somebody_looks(tmp_path, monkeypatch):
     """The same triangles and texels; one picture that two materials wear is decoded once."""
     model = Gltf().textured([(0, 0), (1, 0), (0, 1)])
     model.tree["materials"].append({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}})
     model.node(mesh=model.mesh(material=1))
     now = load(tmp_path / "a.glb", model.glb())
+    decode, decoded = gltf.decode_picture, []
+    monkeypatch.setattr(gltf, "decode_picture", lambda *args, **kw: decoded.append(1) or decode(*args, **kw))
     later = load_mesh_scene(MeshSceneConfig(file=tmp_path / "a.glb"), pictures=False)
     for name in ("vertices", "faces", "normals", "uv", "face_material", "face_instance"):
         np.testing.assert_array_equal(getattr(later, name), getattr(now, name))
     textures = [material.texture for material in later.materials]
     assert textures[0] is textures[1]
-    assert "srgb" not in vars(textures[0])
+    assert not decoded
     np.testing.assert_array_equal(textures[0].srgb, now.materials[0].texture.srgb)
-    assert "srgb" in vars(textures[0])
+    assert textures[0].srgb is textures[1].srgb
+    assert len(decoded) == 1
 
 
 @pytest.mark.parametrize("mode", ["L", "P", "RGBA", "I;16"])

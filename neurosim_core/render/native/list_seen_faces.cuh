@@ -1,7 +1,6 @@
-// Lists the faces of the scene, as they were before they were cut for baked light, that the first rays hit in the
-// 4 x 4 pixels at `top`, `left` and in a ring of one pixel around them, at a border of the picture in
-// 6 x 6 pixels: `seen` [seen_count], with a part of each that was
-// hit, `part_hit`, and `sky`, whether some rays hit nothing. More than MOST, or a moving body: `listed` is false.
+// Lists the faces of the scene, as they were before they were cut for baked light, that the first rays hit in the 4 x 4 pixels at
+// `top`, `left` and in a ring of one pixel around them, at a border of the picture in 6 x 6 pixels: `seen` [seen_count], with a part
+// of each that was hit, `part_hit`, and `sky`, whether some rays hit nothing. More than MOST, or a moving body: `listed` is false.
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 int seen[MOST], part_hit[MOST], seen_count = 0;
 for (int& face : seen) face = -1;
