@@ -15,12 +15,15 @@ from typing import Any
 
 from cortex.bench import peer_cortex  # noqa: F401  # here, so that its children need not
 from cortex.bench.cases import choose
-from cortex.bench.measure import Results, Settings, run_case
+from cortex.bench.measure import CaseResult, Settings, run_case
 from cortex.bench.peers import import_cortex, runtime_dir
 from cortex.bench.processes import Child
-from cortex.bench.report import print_case, print_header, write_csv
+from cortex.bench.report import print_case, print_header, print_summary, write_csv
 from cortex.places import NETWORK_VARIABLES
 
+_QUICK_SECONDS = 0.05
+_QUICK_REPEATS = 2
+_QUICK_COUNT = 5_000
 _REGISTRY_START_S = 10.0
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
@@ -36,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--seconds", type=float, default=0.3, help="length of each repetition (0.3)")
     against = "measure Cortex of this checkout (built) beside ours"
     add("--against", type=Path, metavar="CHECKOUT", help=against)
+    add("--quick", action="store_true", help="tiny runs: shows that it works, measures nothing")
     add("--csv", type=Path, metavar="FILE", help="write every figure there, too")
     options = parser.parse_args(arguments)
     try:
@@ -48,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(options: argparse.Namespace) -> dict[str, Results]:
+def _run(options: argparse.Namespace) -> list[CaseResult]:
     cases = choose(options.case)
     if options.against is not None:
         cases = [case.beside(str(options.against.resolve())) for case in cases]
@@ -56,7 +60,9 @@ def _run(options: argparse.Namespace) -> dict[str, Results]:
     if repeats < 1 or not 0.0 < seconds <= 600.0:  # also refuses nan
         raise ValueError(f"wants repeats >= 1 and 0 < seconds <= 600, got {repeats}, {seconds}")
     settings = Settings(repeats, seconds)
-    results: dict[str, Results] = {}
+    if options.quick:
+        settings = Settings(min(repeats, _QUICK_REPEATS), min(seconds, _QUICK_SECONDS), _QUICK_COUNT)
+    results: list[CaseResult] = []
     with ExitStack() as stack:
         _make_place(stack, options.against)
         print_header()
@@ -66,10 +72,11 @@ def _run(options: argparse.Namespace) -> dict[str, Results]:
         )
         try:
             for case in cases:
-                results[case.name] = run_case(case, settings)
-                print_case(case, results[case.name])
+                results.append(run_case(case, settings))
+                print_case(results[-1])
         except KeyboardInterrupt:
-            print("interrupted")
+            print("interrupted; what was measured until then:\n")
+    print_summary(results, judged=not options.quick)
     return results
 
 

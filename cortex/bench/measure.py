@@ -1,7 +1,8 @@
 """Runs a case: its contestants in turn, again and again, each repetition in processes of its own.
 
 What a machine does besides changes by the second, and from process to process: so repetitions are short,
-their order is turned round each time, and ratios are taken within each.
+their order is turned round each time, ratios are taken within each, and a bar that lies between the quartiles
+of what was measured is said to.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import os
 import socket
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,11 +21,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cortex.bench import roles
-from cortex.bench.cases import Case, Contestant
+from cortex.bench.cases import METRICS, Bar, Case, Contestant
 from cortex.bench.peers import Job, missing
 from cortex.bench.processes import Child, ChildFailed
 
+_SHM = Path("/dev/shm")
 _GRACE_S = 120.0
+_SLOWEST_HZ = 2_000.0
+_LOADED_S = 0.3
+"""So long after the beginning of a flood a process is killed [s]."""
 
 
 Report = dict[str, Any]
@@ -34,6 +41,8 @@ class Settings(NamedTuple):
 
     repeats: int = 5
     seconds: float = 0.5
+    count_max: int = 0
+    """Bounds the messages of cases that count them; 0: no bound."""
 
 
 class Spread(NamedTuple):
@@ -65,54 +74,102 @@ def faults_of(reports: list[Report]) -> str:
     return ", ".join(parts)
 
 
-def ratio_of(ours: list[Report], theirs: list[Report], metric: str) -> Spread | None:
-    """Divide within each repetition, so that what slows the machine slows both sides."""
-    pairs = zip(ours, theirs, strict=False)
-    return spread_of(
-        [own[metric] / other[metric] for own, other in pairs if metric in own and other.get(metric)]
-    )
+class Verdict(NamedTuple):
+    """A bar and what was measured."""
+
+    bar: Bar
+    measured: Spread | None
+    against: str
+    """Name of the best of those it is measured against."""
+    note: str
+    """Why there is nothing to judge, or what spoils a figure that would do."""
+
+    @property
+    def word(self) -> str:
+        """Met, missed, or not measured."""
+        if self.measured is None or self.note:
+            return f"{'missed' if self.measured else 'not measured'} ({self.note})"
+        value, bound = self.measured.median, self.bar.bound
+        return "met" if (value >= bound if self.bar.wanted == ">=" else value <= bound) else "missed"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the bar lies between the quartiles: more repetitions might give another verdict."""
+        found = None if self.note else self.measured
+        return found is not None and found.low < self.bar.bound < found.high
 
 
-Results = dict[str, list[Report]]
-"""What the contestants of a case did, by name, one report for each repetition."""
+def judge(bar: Bar, results: dict[str, list[Report]]) -> Verdict:
+    """Compare: ratios are taken within each repetition, so that what slows the machine slows both sides."""
+    ours, metric = results[bar.who], bar.metric
+    values, note = values_of(ours, metric), faults_of(ours)
+    if not bar.against or not values:
+        return Verdict(bar, spread_of(values), "", note)
+    rivals = [name for name in bar.against if values_of(results[name], metric)]
+    if not rivals:
+        return Verdict(bar, None, "", f"{bar.against[0]}: {faults_of(results[bar.against[0]])}")
+    pick = max if METRICS[metric].larger_is_better else min
+    best = pick(rivals, key=lambda name: float(np.median(values_of(results[name], metric))))
+    pairs = zip(ours, results[best], strict=True)
+    ratios = [own[metric] / other[metric] for own, other in pairs if metric in own and other.get(metric)]
+    return Verdict(bar, spread_of(ratios), best, note if ratios else "never both in one repetition")
 
 
-def run_case(case: Case, settings: Settings) -> Results:
+@dataclass
+class CaseResult:
+    """What the contestants of a case did, by name, one report for each repetition."""
+
+    case: Case
+    reports: dict[str, list[Report]]
+
+    def verdicts(self) -> list[Verdict]:
+        """Return the case's bars with what was measured."""
+        return [judge(bar, self.reports) for bar in self.case.bars]
+
+
+def run_case(case: Case, settings: Settings) -> CaseResult:
     """Measure all contestants of a case, interleaved: A B C, C B A, and so on.
 
     A repetition that fails is recorded, and the next one begins afresh.
     """
+    repeats = min(settings.repeats, case.repeats or settings.repeats)
     absent = {c.name: [{"absent": missing(c.peer)}] if missing(c.peer) else [] for c in case.contestants}
-    results: Results = dict(absent)
+    result = CaseResult(case, absent)
     present = [contestant for contestant in case.contestants if not absent[contestant.name]]
-    for repetition in range(settings.repeats):
+    for repetition in range(repeats):
         for contestant in reversed(present) if repetition & 1 else present:
-            results[contestant.name].append(_repeat(case, contestant, settings))
-    return results
+            result.reports[contestant.name].append(_repeat(case, contestant, settings))
+    return result
 
 
-def _repeat(case: Case, contestant: Contestant, settings: Settings) -> Report:
+def _repeat(case: Case, contestant: Contestant, settings: Settings) -> dict[str, Any]:
+    runs: dict[str, Callable[..., dict[str, Any]]] = {
+        "flood": partial(_flood, subscribers=case.subscribers),
+        "roundtrip": _round_trips,
+        "copy": _copies,
+        "publisher dies": partial(_dies, reader_dies=False),
+        "reader dies": partial(_dies, reader_dies=True),
+    }
     with tempfile.TemporaryDirectory(dir=os.environ["CORTEX_BENCH_DIR"], prefix="r") as folder:
         job = Job(
             peer=contestant.peer,
             floats=case.floats,
             seconds=settings.seconds,
+            count=min(case.count, settings.count_max) if settings.count_max else case.count,
             options=contestant.options,
             folder=Path(folder),
             port=_free_port(),
         )
-        child = partial(Child, deadline_s=_GRACE_S + 4.0 * job.seconds)
+        deadline_s = _GRACE_S + 4.0 * job.seconds + job.count / _SLOWEST_HZ
+        before = set(_SHM.glob("*"))
         try:
-            if not contestant.peer:
-                return _copies(job, child)
-            if contestant.kind == "roundtrip":
-                return _round_trips(job, child)
-            return _flood(job, child, subscribers=case.subscribers)
+            report = runs[contestant.kind](job, partial(Child, deadline_s=deadline_s))
         except ChildFailed as failure:
             return {"error": str(failure)}
+        return {**report, "shm_files": len(set(_SHM.glob("*")) - before)}
 
 
-def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> Report:
+def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> dict[str, Any]:
     """One publisher, some subscribers; the slowest one's rate counts, and the losses of all."""
     with ExitStack() as stack:
         publisher = stack.enter_context(child(roles.publish, job))
@@ -128,23 +185,38 @@ def _flood(job: Job, child: Callable[..., Child], *, subscribers: int) -> Report
     result = {**reports[0], **total, "sent": sent["sent"] * subscribers}
     result["rate"] = min(report["rate"] for report in reports)
     result["lost"] = result["sent"] - result["received"]
+    result["grown_kb"] = max(sent["grown_kb"], *(report["grown_kb"] for report in reports))
     result["cpu_us"] = 1e6 * sum(report["cpu_s"] for report in reports) / max(1, result["received"])
     return result
 
 
-def _round_trips(job: Job, child: Callable[..., Child]) -> Report:
+def _round_trips(job: Job, child: Callable[..., Child]) -> Any:
     with child(roles.ask, job) as client, child(roles.answer, job) as server:
-        report: Report = client.expect([server])
+        report = client.expect([server])
         server.expect()
         return report
 
 
-def _copies(job: Job, child: Callable[..., Child]) -> Report:
+def _dies(job: Job, child: Callable[..., Child], *, reader_dies: bool) -> dict[str, float]:
+    """Kill one side under load; how long the other takes to know."""
+    job = replace(job, seconds=_GRACE_S)
+    sender, receiver = (
+        (roles.publish_until_freed, roles.stop_reading) if reader_dies else (roles.publish, roles.await_death)
+    )
+    with child(sender, job) as publisher, child(receiver, job) as reader:
+        reader.expect([publisher])
+        publisher.tell("go")
+        time.sleep(_LOADED_S)
+        killed, other = (reader, publisher) if reader_dies else (publisher, reader)
+        killed_ns = killed.kill()
+        return {"known_ms": (other.expect() - killed_ns) / 1e6}
+
+
+def _copies(job: Job, child: Callable[..., Child]) -> Any:
     with child(roles.copy, job) as copier:
         copier.expect()
         copier.tell("go")
-        report: Report = copier.expect()
-        return report
+        return copier.expect()
 
 
 def _free_port() -> int:

@@ -1,6 +1,6 @@
 """Cortex itself, used as its documentation says: typed messages, decoded to objects.
 
-Options: ``loan``, ``inline_max``, ``tcp`` (an address).
+Options: ``loan``, ``inline_max``, ``max_wait_s``, ``tcp`` (an address).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _topic(job: Job, topic: str) -> str:
 
 def _publisher(job: Job, topic: str) -> Send:
     floats = job.floats
-    options = {key: job.options[key] for key in ("inline_max",) if key in job.options}
+    options = {key: job.options[key] for key in ("inline_max", "max_wait_s") if key in job.options}
     publisher = _node(job, listens=topic != "pong").publisher(_topic(job, topic), Sample, **options)
     publish, loan = publisher.publish, publisher.loan
 
@@ -102,6 +102,12 @@ def _by_async(subscriber: Any, handle: Handler) -> None:
 
 
 _BY = {"recv": _by_recv, "iterator": _by_iterator, "async": _by_async}
+
+
+def tell_death(job: Job, callback: Any) -> None:
+    """Call back when the publisher of a flood has died."""
+    node, topic = _node(job, listens=False), _topic(job, "flood")
+    node.watch(topic, lambda change: None if change.alive else callback())
 
 
 def _close() -> None:

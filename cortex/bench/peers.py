@@ -44,7 +44,9 @@ class Job:
     peer: str
     floats: int
     seconds: float = 0.5
-    """How long to publish [s]."""
+    """How long to publish [s], if ``count`` is 0."""
+    count: int = 0
+    """How many messages to publish; 0: as many as go into ``seconds``."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """What the peer wants to know besides: policy, way of receiving, and so on."""
     folder: Path = Path()

@@ -6,14 +6,13 @@ import csv
 import importlib.metadata
 import os
 import platform
-from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
 import zmq
 
-from cortex.bench.cases import METRICS, Case, Contestant
-from cortex.bench.measure import Results, Spread, faults_of, ratio_of, spread_of, values_of
+from cortex.bench.cases import METRICS, Bar
+from cortex.bench.measure import CaseResult, Spread, Verdict, faults_of, spread_of, values_of
 from cortex.commands.text import table
 
 _PEERS = ("pyzmq", "numpy", "cyclonedds", "rclpy")
@@ -33,26 +32,41 @@ def print_header() -> None:
     print(", ".join(versions))
 
 
-def print_case(case: Case, results: Results) -> None:
+def print_case(result: CaseResult) -> None:
     """Print what each contestant of a case did."""
+    case = result.case
     print(f"{case.name}: {case.title}; payload {4 * case.floats:,} B")
     rows = []
-    for contestant in case.contestants:
-        reports = results[contestant.name]
+    for name, reports in result.reports.items():
         cells = (_cell(spread_of(values_of(reports, metric)), metric) for metric in case.metrics)
-        rows.append((contestant.name, *cells, _ratio(case, contestant, results), faults_of(reports)))
-    head = ("", *(METRICS[metric].text for metric in case.metrics), f"{case.contestants[0].name} / it", "<")
-    for line in table(head, rows):
+        rows.append((name, *cells, faults_of(reports)))
+    for line in table(("", *(METRICS[metric].text for metric in case.metrics), "<"), rows):
         print(line)
     print(flush=True)
 
 
-def write_csv(path: Path, results: Mapping[str, Results]) -> None:
+def print_summary(results: list[CaseResult], *, judged: bool) -> None:
+    """Print the table of all bars, and how many are met."""
+    words, rows = [], []
+    for result in results:
+        for verdict in result.verdicts():
+            words.append(_word(verdict, judged).partition(" (")[0])  # the reason stands above
+            what, measured = _what(verdict.bar, verdict.against), _measured(verdict)
+            rows.append((result.case.name, what, measured, _bound(verdict.bar), words[-1]))
+    if words:
+        for line in table(("case", "<what", "measured", "<bar", "<verdict"), rows):
+            print(line)
+    known = ("met", "missed", "not measured", "not judged")
+    counts = {word: sum(each.startswith(word) for each in words) for word in known}
+    print(", ".join(f"{count} {word}" for word, count in counts.items() if count))
+
+
+def write_csv(path: Path, results: list[CaseResult]) -> None:
     """Write a line for each repetition of each contestant; one that did not take part has one line."""
     lines = [
-        {"case": case, "contestant": name, "repetition": number, **report}
-        for case, contestants in results.items()
-        for name, reports in contestants.items()
+        {"case": result.case.name, "contestant": name, "repetition": number, **report}
+        for result in results
+        for name, reports in result.reports.items()
         for number, report in enumerate(reports)
     ]
     with path.open("w", newline="") as file:
@@ -68,16 +82,33 @@ def _cell(spread: Spread | None, metric: str) -> str:
     return f"{_number(spread.median)} {METRICS[metric].unit} ± {percent:.0f} %"
 
 
-def _ratio(case: Case, contestant: Contestant, results: Results) -> str:
-    ours = case.compared_with(contestant)
-    if ours is None:
-        return ""
-    spread = ratio_of(results[ours.name], results[contestant.name], contestant.metric)
-    return "" if spread is None else f"{spread.median:.2f} ± {(spread.high - spread.low) / 2:.2f}"
-
-
 def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def _word(verdict: Verdict, judged: bool) -> str:
+    if not judged and verdict.measured is not None:
+        return "not judged"
+    return f"{verdict.word}, within noise" if verdict.is_open else verdict.word
+
+
+def _what(bar: Bar, best: str = "") -> str:
+    against = f" / {best or ' or '.join(bar.against)}" if bar.against else ""
+    return f"{bar.who}{against}, {METRICS[bar.metric].text}"
+
+
+def _measured(verdict: Verdict) -> str:
+    spread = verdict.measured
+    if spread is None:
+        return "-"
+    if verdict.bar.against:
+        return f"{spread.median:.2f} ± {(spread.high - spread.low) / 2:.2f}"
+    return f"{_number(spread.median)} {METRICS[verdict.bar.metric].unit}".strip()
+
+
+def _bound(bar: Bar) -> str:
+    unit = "" if bar.against else METRICS[bar.metric].unit
+    return f"{bar.wanted} {_number(bar.bound)} {unit}".rstrip()
 
 
 def _processor() -> str:

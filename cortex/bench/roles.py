@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import mmap
 import threading
 import time
@@ -11,11 +12,13 @@ from typing import Any
 import numpy as np
 
 from cortex.bench.peers import PATIENCE_S, PONG_FLOATS, Job, Peer, Send, peer_of
-from cortex.bench.tally import END, WARM, Finished, Floats, Handler, Tally, make_payloads
+from cortex.bench.tally import END, WARM, Finished, Floats, Handler, Tally, make_payloads, resident_kb
 
 _WARM_PINGS = 20
 _WARM_S = 0.005
 """Between two WARM messages [s]."""
+_BLOCKED_NS = 50_000_000
+"""A call of `publish` that takes longer was waiting for a reader."""
 
 
 def publish(pipe: Any, job: Job) -> None:
@@ -29,7 +32,8 @@ def publish(pipe: Any, job: Job) -> None:
             raise TimeoutError("no subscriber received anything")
         send(WARM, payloads[0])
     pipe.recv()
-    pipe.send({"sent": _flood(send, payloads, job)})
+    sent, grown_kb = _flood(send, payloads, job)
+    pipe.send({"sent": sent, "grown_kb": grown_kb})
     while not pipe.poll(4 * _WARM_S):
         send(END, payloads[0])
     peer.close()
@@ -47,7 +51,7 @@ def receive(pipe: Any, job: Job) -> None:
 
     peer = peer_of(job)
     how = job.options.get("how", "callback")
-    tally = Tally(job.floats, connected)
+    tally = Tally(job.floats, connected, settle_at=job.count // 10)
     _receive(peer, job, "flood", tally.handler(consume=bool(job.options.get("consume"))), how)
     pipe.send({"cpu_s": time.process_time() - cpu_s, **tally.report})
     peer.close()
@@ -114,6 +118,43 @@ def answer(pipe: Any, job: Job) -> None:
     pipe.send("closed")
 
 
+def publish_until_freed(pipe: Any, job: Job) -> None:
+    """Publish to a reader that takes nothing; report the time at which a blocked `publish` returns."""
+    send = peer_of(job).publisher(job, "flood")
+    payload = make_payloads(job.floats)[0]
+    while not pipe.poll(_WARM_S):
+        send(WARM, payload)
+    pipe.recv()
+    before_ns = time.monotonic_ns()
+    for sequence in range(1 << 62):
+        send(sequence, payload)
+        now_ns = time.monotonic_ns()
+        if now_ns - before_ns > _BLOCKED_NS:
+            break
+        before_ns = now_ns
+    pipe.send(now_ns)
+
+
+def stop_reading(pipe: Any, job: Job) -> None:
+    """Receive one message, and stand still in its callback for ever."""
+
+    def handle(_sequence: int, _data: Floats) -> None:
+        pipe.send("connected")
+        threading.Event().wait()
+
+    peer_of(job).receive(job, "flood", handle, "callback")
+
+
+def await_death(pipe: Any, job: Job) -> None:
+    """Receive a flood; report the time at which the publisher is known to be dead."""
+    peer = peer_of(job)
+    importlib.import_module("cortex.bench.peer_cortex").tell_death(
+        job, lambda: pipe.send(time.monotonic_ns())
+    )
+    tally = Tally(job.floats, lambda: pipe.send("connected"))
+    peer.receive(job, "flood", tally.handler(), "callback")
+
+
 def copy(pipe: Any, job: Job) -> None:
     """Copy payloads in turn into the slots of a ring, again and again for the job's time, once told to go."""
     stride = -(-job.payload_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -138,13 +179,15 @@ def _receive(peer: Peer, job: Job, topic: str, handle: Handler, how: str) -> Non
         peer.receive(job, topic, handle, how)
 
 
-def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> int:
+def _flood(send: Send, payloads: tuple[Floats, Floats], job: Job) -> tuple[int, int]:
     pairs = max(1, min(32, 500_000 // job.payload_bytes))
-    sent = 0
-    end = time.perf_counter() + job.seconds
-    while time.perf_counter() < end:
+    sent = settled_kb = 0
+    begin = time.perf_counter()
+    while sent < job.count if job.count else time.perf_counter() < begin + job.seconds:
         for _ in range(pairs):
             send(sent, payloads[0])
             send(sent + 1, payloads[1])
             sent += 2
-    return sent
+        if job.count and not settled_kb and sent >= job.count // 10:
+            settled_kb = resident_kb()
+    return sent, resident_kb() - settled_kb if settled_kb else 0

@@ -1,9 +1,11 @@
-"""What a subscriber counts: messages, gaps, order, payload; in what time."""
+"""What a subscriber counts: messages, gaps, order, payload; and what it costs in time and memory."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,17 +40,20 @@ class Tally:
     Args:
         floats: Items of each payload.
         connected: Called at the first message of any kind.
+        settle_at: Sequence from which on memory must not grow.
     """
 
-    def __init__(self, floats: int, connected: Callable[[], None]) -> None:
+    def __init__(self, floats: int, connected: Callable[[], None], *, settle_at: int = 0) -> None:
         self.report: dict[str, Any] = {
-            "rate": 0.0, "received": 0, "lost": 0, "misordered": 0, "corrupt": 0
+            "rate": 0.0, "received": 0, "lost": 0, "misordered": 0, "corrupt": 0, "grown_kb": 0
         }  # fmt: skip
         self._floats = floats
         self._mask = 0 if floats >= _LARGE_FLOATS else 63
         self._connected = connected
         self._is_connected = False
         self._marks: list[tuple[int, float]] = []
+        self._settle_at = settle_at
+        self._settled_kb = 0
 
     def handler(self, *, consume: bool = False) -> Handler:
         """Return the function to call with each message's sequence and payload."""
@@ -77,6 +82,8 @@ class Tally:
         if len(data) != self._floats or not (data[0] == tag == data[-1] == data[self._floats // 2]):
             self.report["corrupt"] += 1
         self._marks[1:] = [(sequence - self.report["lost"], time.perf_counter())]
+        if self._settle_at and not self._settled_kb and sequence >= self._settle_at:
+            self._settled_kb = resident_kb()
 
     def _jump(self, sequence: int, expected: int, data: Floats) -> int:
         """Take a message that is not the expected one; return what is expected next."""
@@ -100,4 +107,12 @@ class Tally:
             (first, begin_s), (last, end_s) = self._marks
             self.report["rate"] = (last - first) / (end_s - begin_s)
         self.report["received"] = expected - self.report["lost"]
+        if self._settled_kb:
+            self.report["grown_kb"] = resident_kb() - self._settled_kb
         raise Finished
+
+
+def resident_kb() -> int:
+    """Return the memory that this process holds now [kB], its shared pages included."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1]) if os.path.exists("/proc/self/statm") else 0
+    return pages * os.sysconf("SC_PAGE_SIZE") // 1024

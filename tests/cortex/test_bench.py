@@ -1,4 +1,4 @@
-"""The benchmark counts right, prints a table, never hangs; what it measures is not tested."""
+"""The benchmark counts right, judges right, prints a table, never hangs; what it measures is not tested."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from processes import SOON_S, wait_for
 
-from cortex.bench.cases import CASES, Case, Contestant, choose
+from cortex.bench.cases import CASES, Bar, Case, Contestant, choose
 from cortex.bench.command import main
-from cortex.bench.measure import Report, Settings, Spread, faults_of, ratio_of, run_case
+from cortex.bench.measure import Report, Settings, Spread, judge, run_case
 from cortex.bench.peers import PEERS
 from cortex.bench.processes import Child, ChildFailed
 from cortex.bench.report import print_case
@@ -130,24 +130,48 @@ def rates(*values: float, **more: object) -> list[Report]:
 
 
 def test_ratio_is_taken_within_each_repetition():
-    """A machine that is twice as slow in the second repetition changes no ratio; one that failed has none."""
-    ours = [*rates(90.0, 45.0, 80.0), {"error": "died"}]
-    assert ratio_of(ours, rates(100.0, 50.0, 100.0, 10.0), "rate") == Spread(
-        *map(pytest.approx, (0.9, 0.85, 0.9))
-    )
-    assert ratio_of(ours, [{"absent": "not installed"}], "rate") is None
+    """A machine that is twice as slow in the second repetition changes no ratio."""
+    outcomes = {"a": rates(90.0, 45.0, 80.0), "b": rates(100.0, 50.0, 100.0)}
+    verdict = judge(Bar("a", ("b",), ">=", 0.85), outcomes)
+    assert verdict.measured == Spread(*map(pytest.approx, (0.9, 0.85, 0.9)))
+    assert verdict.word == "met"
+    assert judge(Bar("a", ("b",), ">=", 0.91), outcomes).word == "missed"
+    assert judge(Bar("a", ("b",), "<=", 0.91), outcomes).word == "met"
 
 
-def test_losses_and_failures_are_said():
-    assert faults_of(rates(10.0, 10.0, lost=1)) == "LOST 2 of 20"
-    assert faults_of(rates(10.0, 10.0, corrupt=3)) == "CORRUPT 6 of 20"
-    assert faults_of([{"rate": 10.0}, {"error": "died"}]) == "1 of 2 failed: died"
+def test_the_best_rival_counts():
+    outcomes = {"a": rates(100.0), "b": rates(50.0), "c": rates(80.0)}
+    verdict = judge(Bar("a", ("b", "c"), ">=", 2.0), outcomes)
+    assert (verdict.against, verdict.word) == ("c", "missed")
+    latencies = {name: [{"rtt_p50_us": value}] for name, value in (("a", 6.0), ("b", 8.0), ("c", 20.0))}
+    verdict = judge(Bar("a", ("b", "c"), "<=", 0.8, "rtt_p50_us"), latencies)
+    assert (verdict.against, verdict.word) == ("b", "met")
 
 
-def test_names_of_contestants_and_cases_are_unique():
+def test_losses_and_failures_spoil_a_figure_that_would_do():
+    bar = Bar("a", ("b",), ">=", 0.5)
+    rival = {"b": rates(10.0, 10.0)}
+    assert judge(bar, rival | {"a": rates(10.0, 10.0, lost=1)}).word == "missed (LOST 2 of 20)"
+    assert judge(bar, rival | {"a": rates(10.0, 10.0, corrupt=3)}).word == "missed (CORRUPT 6 of 20)"
+    half = [{"rate": 10.0}, {"error": "died"}]
+    assert judge(bar, rival | {"a": half}).word == "missed (1 of 2 failed: died)"
+
+
+def test_what_is_not_there_is_neither_met_nor_missed():
+    bar = Bar("a", ("b",), ">=", 0.5)
+    absent = {"a": rates(10.0), "b": [{"absent": "not installed"}]}
+    assert judge(bar, absent).word == "not measured (b: not installed)"
+    failed = {"a": [{"error": "died"}], "b": rates(10.0)}
+    assert judge(bar, failed).word == "not measured (1 of 1 failed: died)"
+
+
+def test_every_bar_names_contestants_and_metrics_of_its_case():
     for case in CASES:
         names = [contestant.name for contestant in case.contestants]
         assert len(set(names)) == len(names), case.name
+        for bar in case.bars:
+            assert {bar.who, *bar.against} <= set(names), case.name
+            assert bar.metric in case.metrics, case.name
     assert len({case.name for case in CASES}) == len(CASES)
 
 
@@ -161,23 +185,25 @@ def test_cases_are_chosen_by_name_or_family():
 def test_a_peer_that_is_not_installed_is_reported(monkeypatch):
     monkeypatch.setattr("cortex.bench.measure.missing", lambda transport: "not installed")
     case = Case("x", "title", 10, (Contestant("a peer", "Cyclone DDS"),))
-    results = run_case(case, Settings())
-    assert results == {"a peer": [{"absent": "not installed"}]}
-    with contextlib.redirect_stdout(io.StringIO()) as output:
-        print_case(case, results)
-    assert "not installed" in output.getvalue()
+    result = run_case(case, Settings())
+    assert result.reports == {"a peer": [{"absent": "not installed"}]}
+    assert "not installed" in printed(print_case, result)
 
 
 def test_another_checkout_is_measured_beside_each_way_of_cortex():
-    """Each way is compared with itself, what is no way of Cortex with the first."""
-    case = choose(["receive"])[0].beside("/there")
-    assert case.contestants[-1] == Contestant(
-        "async, before", "cortex", {"checkout": "/there", "how": "async"}
-    )
-    ways = {each.name: each for each in case.contestants}
-    for name in ("callback", "iterator", "recv", "async"):
-        assert case.compared_with(ways[f"{name}, before"]) == ways[name]
-        assert case.compared_with(ways[name]) == (ways["callback"] if name != "callback" else None)
+    """The rate bounds from below, a time from above."""
+    batch, latency = (choose([name])[0].beside("/there") for name in ("typed-40", "roundtrip-40"))
+    assert batch.contestants[-1] == Contestant("cortex, before", "cortex", {"checkout": "/there"})
+    assert batch.bars[-1] == Bar("cortex", ("cortex, before",), ">=", 2.0)
+    assert latency.bars[-1] == Bar("cortex", ("cortex, before",), "<=", 1.05, "rtt_p50_us")
+    for case in (case.beside("/there") for case in CASES):
+        assert all(bar.metric in case.metrics for bar in case.bars), case.name
+
+
+def printed(function: Any, results: Any, **options: Any) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        function(results, **options)
+    return output.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -193,8 +219,8 @@ def test_wrong_arguments_are_refused(arguments, said, capsys):
 # The real thing, tiny.
 
 OPTIONAL = {name for name, peer in PEERS.items() if peer.needs}
-TINY = ["typed-40", "medium", "large", "consume", "loan", "roundtrip-40", "tcp-39k", "fanout"]
-TINY += ["threshold-64k", "receive"]
+TINY = ["typed-40", "medium", "large", "consume", "loan", "roundtrip-40", "tcp-39k", "async", "fanout"]
+TINY += ["memory-40", "deaths", "threshold-64k", "receive"]
 """One of the cases that differ by the size of their messages only."""
 BENCH = [sys.executable, "-m", "cortex", "bench"]
 
@@ -222,17 +248,23 @@ def test_case(tiny_run, name):
         if contestant.peer in OPTIONAL and (row["absent"] or row.get("error")):  # said in words
             continue
         assert not row.get("error"), contestant.name
-        assert float(row[contestant.metric]) > 0.0, contestant.name
+        # Memory may shrink: the ring that one with more room has replaced is let go. On a busy machine a
+        # publisher that is held up may go on before its reader is killed.
+        signed = ("grown_kb", "known_ms")
+        figures = [row[metric] for metric in case.metrics if row[metric] and metric not in signed]
+        assert figures or any(row[metric] for metric in signed), contestant.name
+        assert min(map(float, figures), default=0.0) >= 0.0, contestant.name
         faults = {row[count] for count in ("lost", "misordered", "corrupt")}
         assert faults <= {"0", ""}, contestant.name
         if row["rate"]:
             assert int(row["received"]) == int(row["sent"]) > 0, contestant.name
 
 
-def test_tiny_run_prints_every_ratio(tiny_run):
-    cases = choose(TINY)
-    assert tiny_run[0].count(" ± ") >= sum(len(case.contestants) for case in cases)
-    assert max(len(line) for line in tiny_run[0].splitlines()) <= 120
+def test_tiny_run_prints_every_bar(tiny_run):
+    text = tiny_run[0]
+    counts = [int(part.split()[0]) for part in text.strip().splitlines()[-1].split(", ")]
+    assert sum(counts) == sum(len(case.bars) for case in choose(TINY))
+    assert max(len(line) for line in text.splitlines()) <= 120
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
@@ -248,6 +280,6 @@ def test_a_run_that_is_ended_leaves_no_process(number):
             text, _ = bench.communicate(timeout=SOON_S)
         if number == signal.SIGINT:
             assert bench.returncode == 0
-            assert text.endswith("interrupted\n")
+            assert "interrupted; what was measured until then:" in text
             assert not os.listdir(folder), "files are left"
         wait_for(lambda: all(gone(pid) for pid in children))
