@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ import zmq
 
 from cortex import wire
 from cortex.broadcast import Broadcast, Reader
+from cortex.large import LargeSender
 from cortex.pub_socket import DONTWAIT, SNDMORE, PubSocket
 
 if TYPE_CHECKING:
@@ -21,46 +21,10 @@ READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
-PRIVATE_BYTES = 64 << 20
-"""Most bytes of bodies that wait to be sent through lossy sockets."""
-STRICT_BYTES = 8 << 20
-"""Most that wait for strict ones, which hold up the publisher then: few enough to be sent from the cache."""
+FORGET_NS = 10_000_000_000
+"""After so long without a message the memory of large bodies that were sent is given back."""
 TELL_AGAIN_S = 0.02
 """A reader that was late when the publisher is closed is told this often how many messages there were."""
-
-
-class LargeSender:
-    """Bodies of one publisher that its sockets still read. The caller holds the sockets' lock."""
-
-    def __init__(self) -> None:
-        self._waiting: defaultdict[PubSocket, deque[tuple[zmq.MessageTracker, int]]] = defaultdict(deque)
-        """What each socket has still to send, in order, and its bytes."""
-        self.waiting_bytes = {False: 0, True: 0}
-
-    def has_room(self, pub_socket: PubSocket, body: memoryview) -> bool:
-        """Whether a body more may wait."""
-        self.prune()
-        size = body.nbytes
-        most = max(STRICT_BYTES, 2 * size) if pub_socket.strict else max(PRIVATE_BYTES, 4 * size)
-        return self.waiting_bytes[pub_socket.strict] + size <= most
-
-    def send(self, pub_socket: PubSocket, body: memoryview) -> None:
-        """Send the body that follows a header; nobody writes there any more. Who took the header gets it."""
-        if pub_socket.strict:
-            pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 0)
-        try:
-            tracker = pub_socket.send_uncopied(body)
-        finally:
-            if pub_socket.strict:
-                pub_socket.socket.setsockopt(zmq.XPUB_NODROP, 1)
-        self._waiting[pub_socket].append((tracker, body.nbytes))
-        self.waiting_bytes[pub_socket.strict] += body.nbytes
-
-    def prune(self) -> None:
-        """Let go of what has been sent."""
-        for pub_socket, waiting in self._waiting.items():
-            while waiting and waiting[0][0].done:
-                self.waiting_bytes[pub_socket.strict] -= waiting.popleft()[1]
 
 
 class Fanout:
@@ -175,6 +139,8 @@ class Fanout:
         if self.back_pressure.is_waiting:
             return
         sequence, silent_ns = self._fast_send.sequence, now_ns - self._fast_send.refresh_ns
+        if silent_ns > FORGET_NS:
+            self.large.forget()
         if self._told != sequence:
             self._told, self._tell_after_ns = sequence, SILENCE_NS
         if self.readers and silent_ns > self._tell_after_ns:

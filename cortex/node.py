@@ -448,7 +448,7 @@ class Node(Closing):
             self.id,
             [publisher.stats() for publisher in publishers],
             [subscriber.stats() for subscriber in subscribers],
-            self.rejected + self._directory.rejected,
+            self.rejected + self._directory.rejected + self._server.rejected,
         )
 
 

@@ -147,8 +147,8 @@ class Publisher(Closing, Generic[T]):
         return self._fanout.ring.acquire(size, exact=exact, may_wait=may_wait)
 
     def _memory(self, slot: Any, size: int) -> np.ndarray:
-        """Where a body is written: a slot, or else memory of its own."""
-        return np.empty(size, np.uint8) if slot is None else np.frombuffer(slot, np.uint8)
+        """Where a body is written: a slot, or else memory of its own. The lock is held."""
+        return self._fanout.large.acquire(size) if slot is None else np.frombuffer(slot, np.uint8)
 
     @contextmanager
     def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:
@@ -261,7 +261,7 @@ class Publisher(Closing, Generic[T]):
         body = buffer[:size]
         if slot is not None:  # who reads it elsewhere gets a copy
             wanted = self.latch or self._fanout.has_sockets or not slot.is_current
-            body = self._memory(None, size) if wanted else body[:0]
+            body = self._memory(None, size)[:size] if wanted else body[:0]
             np.copyto(body, buffer[: len(body)])
         sequence = self._fast_send.sequence
         self._fast_send.sequence += 1

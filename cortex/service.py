@@ -69,6 +69,7 @@ class Server:
         self._lock = threading.Lock()
         self._services: dict[int, Service] = {}
         self._pending = 0
+        self.rejected = 0
 
     def add(self, service: Service) -> None:
         """Offer a service.
@@ -115,13 +116,19 @@ class Server:
         elif busy:
             reply(_error(header, "busy", f"{PENDING_MAX} requests wait already"))
         else:
+            self._submit(lambda: self._serve(service, header, frame, deadline_ns, reply))
 
-            def serve() -> None:
-                with self._lock:
-                    self._pending -= 1
-                reply(_serve(service, header, frame, deadline_ns))
-
-            self._submit(serve)
+    def _serve(
+        self,
+        service: Service,
+        header: wire.Header,
+        frame: bytes,
+        deadline_ns: int,
+        reply: Callable[[bytes], None],
+    ) -> None:
+        with self._lock:
+            self._pending -= 1
+        reply(_serve(service, header, frame, deadline_ns))
 
 
 def _serve(service: Service, header: wire.Header, frame: bytes, deadline_ns: int) -> bytes:

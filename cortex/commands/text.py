@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cortex.schema import ArrayType, FieldType, ListType, OptionalType, Schema
+from cortex.schema import ArrayType, Field, FieldType, ListType, OptionalType, Schema
 
 WIDTH_UNKNOWN = 120
 _LIST_ITEMS_MAX = 8
@@ -100,38 +100,44 @@ def message_lines(schema: Schema, message: Any, *, arrays: str = "short") -> Ite
         arrays: "none" shows dtype and shape, "short" what fits into the line, "full" everything.
     """
     width = terminal_width()
-    for line in _children(schema, message, "", arrays):
-        yield line if arrays == "full" else shorten(line, width)
-
-
-def _children(schema: Schema, message: Any, indent: str, arrays: str) -> Iterator[str]:
     for field in schema.fields:
-        unit = f"  {plain(field.unit)}" if field.unit else ""
-        yield from _lines(f"{indent}{field.name}: ", field.type, getattr(message, field.name), unit, arrays)
+        for line in _field_lines(field, field.type, getattr(message, field.name), field.name, "", arrays):
+            yield line if arrays == "full" else shorten(line, width)
 
 
-def _lines(start: str, kind: FieldType, value: Any, unit: str, arrays: str) -> Iterator[str]:
-    indent = " " * (len(start) - len(start.lstrip()) + 2)
+def _field_lines(
+    field: Field, kind: FieldType, value: Any, name: str, indent: str, arrays: str
+) -> Iterator[str]:
+    start, unit = f"{indent}{name}: ", f"  {plain(field.unit)}" if field.unit else ""
     if isinstance(kind, OptionalType) and value is not None:
         kind = kind.item
-    if isinstance(kind, Schema) and value is not None:
+    if isinstance(kind, Schema):
         yield start.rstrip()
-        yield from _children(kind, value, indent, arrays)
-    elif isinstance(kind, ArrayType) and value is not None:
+        for inner in kind.fields:
+            of_inner = getattr(value, inner.name), inner.name, indent + "  ", arrays
+            yield from _field_lines(inner, inner.type, *of_inner)
+    elif isinstance(kind, ListType):
+        yield from _list_lines(field, kind, value, start, unit, arrays)
+    elif isinstance(kind, ArrayType):
         yield from _array_lines(value, start, unit, arrays)
-    elif isinstance(kind, ListType) and value is not None:
-        inner = kind.item.item if isinstance(kind.item, OptionalType) else kind.item
-        shown = value if arrays == "full" else value[:_LIST_ITEMS_MAX]
-        more = f" … {len(value)} in all" if len(shown) < len(value) else ""
-        if value and isinstance(inner, (Schema, ArrayType, ListType)):
-            yield start.rstrip()
-            for index, item in enumerate(shown):
-                yield from _lines(f"{indent}- {index}: ", kind.item, item, unit, arrays)
-            yield from (indent + more for _ in more[:1])
-        else:
-            yield f"{start}[{', '.join(_scalar(item, arrays) for item in shown)}{more}]{unit}"
     else:
         yield f"{start}{_scalar(value, arrays)}{unit if value is not None else ''}"
+
+
+def _list_lines(
+    field: Field, kind: ListType, value: Sequence[Any], start: str, unit: str, arrays: str
+) -> Iterator[str]:
+    inner = kind.item.item if isinstance(kind.item, OptionalType) else kind.item
+    shown = value if arrays == "full" else value[:_LIST_ITEMS_MAX]
+    more = f" … {len(value)} in all" if len(shown) < len(value) else ""
+    if isinstance(inner, (Schema, ArrayType, ListType)) and value:
+        indent = " " * (len(start) - len(start.lstrip()) + 2)
+        yield start.rstrip()
+        for index, item in enumerate(shown):
+            yield from _field_lines(field, kind.item, item, f"- {index}", indent, arrays)
+        yield from (indent + more for _ in more[:1])
+    else:
+        yield f"{start}[{', '.join(_scalar(item, arrays) for item in shown)}{more}]{unit}"
 
 
 def _array_lines(value: np.ndarray, start: str, unit: str, arrays: str) -> Iterator[str]:

@@ -230,7 +230,7 @@ def tiny_run(tmp_path_factory):
     """One repetition of every case, a few milliseconds each, in a process that has no ZeroMQ context yet."""
     path = tmp_path_factory.mktemp("bench") / "out.csv"
     before = set(Path("/dev/shm").glob("cortex*"))
-    command = [*BENCH, *TINY, "--repeats", "1", "--seconds", "0.02", "--csv", path]
+    command = [*BENCH, *TINY, "--quick", "--repeats", "1", "--seconds", "0.02", "--csv", path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600.0, check=False)
     assert done.returncode == 0, done.stderr
     assert not set(Path("/dev/shm").glob("cortex*")) - before

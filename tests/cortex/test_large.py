@@ -17,7 +17,7 @@ from processes import SOON_S, Beside, shared_mappings, wait_for
 
 import cortex.back_pressure
 import cortex.broadcast
-import cortex.fanout
+import cortex.large
 import cortex.link
 from cortex import Closed, keep_last, latest, reliable
 from cortex.pub_socket import Backoff
@@ -239,23 +239,51 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
     assert plain.counters.rejected == 0
 
 
-def test_sockets_send_a_body_that_is_copied_once(node, monkeypatch):
-    """And not at all where it is written on loan."""
+def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
+    """No second copy of it is made, and nothing is allocated for it once one has been sent."""
     monkeypatch.setattr(cortex.link, "native", None)
     publisher, subscriber = connected(node, Scan, reliable())
-    message = scan(7, 1_000_000)
+    message, peaks = scan(7, 1_000_000), []
+    for _ in range(6):
+        tracemalloc.start()
+        assert publisher.publish(message)
+        peaks.append(tracemalloc.get_traced_memory()[1] / message.ranges.nbytes)
+        tracemalloc.stop()
+        assert subscriber.recv(SOON_S) == message
+        wait_for(lambda: publisher._fanout.large._free, SOON_S)
+    assert max(peaks) < 1.5
+    assert min(peaks) < 0.5
     tracemalloc.start()
-    assert publisher.publish(message)
-    assert tracemalloc.get_traced_memory()[1] / message.ranges.nbytes < 1.5
-    tracemalloc.reset_peak()
-    assert subscriber.recv(SOON_S) == message
-    wait_for(lambda: tracemalloc.get_traced_memory()[0] < 0.5 * message.ranges.nbytes)
-    tracemalloc.reset_peak()
     with publisher.loan(n=1_000_000) as draft:
         draft.stamp_ns, draft.ranges[:] = message.stamp_ns, message.ranges
     assert tracemalloc.get_traced_memory()[1] / message.ranges.nbytes < 1.5
     tracemalloc.stop()
     assert subscriber.recv(SOON_S) == message
+    del draft
+    wait_for(lambda: publisher._fanout.large._free, SOON_S)
+
+    def is_given_back(after_s):
+        publisher.tick(time.monotonic_ns() + int(1e9 * after_s))
+        return not publisher._fanout.large._free
+
+    assert not is_given_back(after_s=1.0)
+    wait_for(lambda: is_given_back(after_s=11.0))
+
+
+def test_a_small_body_in_memory_of_a_larger_one_counts_as_that(node, monkeypatch):
+    """What waits for a reliable reader is bounded by the memory that it takes."""
+    monkeypatch.setattr(cortex.link, "native", None)
+    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
+    large = publisher._fanout.large
+    bodies = [large.acquire(4_000_000) for _ in range(8)]
+    bodies.clear()
+    assert len(large._free) == 8
+    with subscriber._receive_lock:
+        for _ in range(10):
+            publisher.publish(scan(0, 300_000))  # 1.2 MB
+    held = sum(large._lent.values())
+    assert 0 < held <= large.waiting_bytes[True] <= 8 << 20
+    del bodies
 
 
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
@@ -368,7 +396,7 @@ def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkey
         assert readers[-1].wait_for_publisher(SOON_S)
         monkeypatch.setattr(readers[-1], "top_up", lambda now_ns: None)
     fill_slots(publisher)
-    monkeypatch.setattr(cortex.fanout, "STRICT_BYTES", 0)
+    monkeypatch.setattr(cortex.large, "STRICT_BYTES", 0)
     waits_s = recorded_waits_s(monkeypatch)
     assert not publisher.publish(scan(1, 25_000))
     assert len(waits_s) > 1
