@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-import select
+import selectors
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -68,11 +68,11 @@ class Subscriber(Closing, Generic[T]):
         self._receive_lock = ReceiveLock()
         self._lock = self._receive_lock.lock
         self.wakeup = Wakeup()
-        self._epoll = select.epoll()
+        self._selector = selectors.DefaultSelector()
         """Waits for `wakeup` and all sockets; changed under the lock.
 
         It ends with us: somebody may still watch `fd` when we are closed."""
-        self._epoll.register(self.wakeup.fd, select.EPOLLIN)
+        self._selector.register(self.wakeup.fd, selectors.EVENT_READ)
         self._problems: deque[Exception] = deque()
         self._intake = Intake(policy, self.counters, self._receive_lock)
         self._links, self._queue = self._intake.links, self._intake.queue
@@ -128,7 +128,7 @@ class Subscriber(Closing, Generic[T]):
             if self._closed or self._queue:
                 return True
         until_ns = monotonic_ns() + round(spin_s * 1e9)
-        while not (found := self._epoll.poll(0, 1)) and monotonic_ns() < until_ns:
+        while not (found := self._selector.select(0)) and monotonic_ns() < until_ns:
             os.sched_yield()
         self.wakeup.clear()
         self._looks_left_out = 0 if found else LOOK_EVERY
@@ -260,7 +260,7 @@ class Subscriber(Closing, Generic[T]):
         with self._receive_lock:
             if self._closed or not self._fast_receive.exhausted:
                 return
-        self._epoll.poll(timeout_s, 1)
+        self._selector.select(timeout_s)
         self.wakeup.clear()
 
     def dispatch(self, *, block: bool = False) -> bool:
@@ -322,12 +322,12 @@ class Subscriber(Closing, Generic[T]):
     @property
     def fd(self) -> int:
         """A descriptor that is readable when a message may have come, and while `wakeup` is set."""
-        return self._epoll.fileno()
+        return self._selector.fileno()
 
     @property
     def has_input(self) -> bool:
         """Whether that descriptor is readable."""
-        return bool(self._epoll.poll(0, 1))
+        return bool(self._selector.select(0))
 
     def top_up(self, now_ns: int) -> None:
         """Read the sockets of a subscriber that nobody reads at the moment; for the node's control thread.
@@ -394,7 +394,7 @@ class Subscriber(Closing, Generic[T]):
                 return
             self._links.append(link)
             for fd in link.fds:
-                self._epoll.register(fd, select.EPOLLIN)
+                self._selector.register(fd, selectors.EVENT_READ)
             self._fast_receive.exhausted = False  # its descriptor shows nothing until it was found empty
             self._links_changed()
 
@@ -451,7 +451,7 @@ class Subscriber(Closing, Generic[T]):
 
     def _part(self, link: Link) -> None:
         for fd in link.fds:  # before it is closed: its number may be given out again
-            self._epoll.unregister(fd)
+            self._selector.unregister(fd)
         link.close()
 
     def dismiss(self, now_ns: int) -> None:
