@@ -296,9 +296,8 @@ class Directory:
         named = dict(zip(welcome.nodes, welcome.revisions, strict=True))
         named.pop(self._own.node, None)
         self._named = named
-        self._doubt_until_ns = (
-            now_ns + control.LEASE_NS
-        )  # one that was just started does not know everybody yet
+        # A registry that was just started does not know everybody yet: one lease of grace.
+        self._doubt_until_ns = now_ns + control.LEASE_NS
 
     def _on_alive(self, alive: records.Alive, now_ns: int) -> None:
         if not self._welcomed or now_ns < self._quiet_ns:

@@ -39,13 +39,11 @@ class ReceiveLock:
                     )
                 with self._guard:
                     ownerless = not any(map(self._holds, sys._current_frames().values()))
-                    if (
-                        ownerless and ownerless_since == self._takeovers
-                    ):  # twice: a holder may only just leave
+                    # seen twice, as a holder may only just leave
+                    if ownerless and ownerless_since == self._takeovers:
                         self._takeovers += 1
-                        self.lock.acquire(
-                            blocking=False
-                        )  # unless it was given back just now, it is ours as it is
+                        # unless it was given back just now, it is ours as it is
+                        self.lock.acquire(blocking=False)
                         return
                     ownerless_since = self._takeovers if ownerless else -1
         finally:

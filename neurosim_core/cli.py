@@ -51,10 +51,9 @@ def _run_command(argv: Sequence[str] | None) -> int:
     began_s = time.perf_counter()
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser(argv).parse_args(argv)
-    if (
-        arguments.command.__module__ != "neurosim_core.learn.command"
-    ):  # whose PyTorch may multiply with OpenBLAS
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
+    # Matrices are small, and threads cost time; only the PyTorch of learning may multiply with OpenBLAS.
+    if arguments.command.__module__ != "neurosim_core.learn.command":
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments.began_s = began_s
     if arguments.computes:
         from neurosim_core.warp_start import start_warp
