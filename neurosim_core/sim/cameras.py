@@ -93,7 +93,7 @@ def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> li
             stamps_ns=[batch.boundaries[place].stamp_ns for place in places],
             buffer_index=batch.number % len(state.batch_done),
             wanted=batch.wanted,
-            active=state.fleet.active if state.world_count > 1 else None,
+            active=state.worlds.active if state.world_count > 1 else None,
         )
         for group, places in zip(state.groups, chosen, strict=True)
         if places
@@ -160,7 +160,7 @@ def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> l
     for group, offsets_ns, parity in _frames_of_worlds(state, batch, last_seen_ns):
         for sensor in group.world_frames.values():
             held.append(sensor.offsets(offsets_ns))
-            sensor.find(state.fleet.clock_ns, offsets_ns, parity)
+            sensor.find(state.worlds.clock_ns, offsets_ns, parity)
     return held
 
 

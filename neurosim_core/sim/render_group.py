@@ -129,7 +129,7 @@ class RenderGroupState:
     lens_of_world: Any
     """Which of its lenses a world has, int32, shape [N]."""
     offsets_ns: Any
-    """From an instant to its J rays [ns], device array; None: all are cast at the instant."""
+    """From an instant to its J rays [ns], device array; [0] where all are cast at the instant."""
     instants: Any
     """0, 1, ... N K - 1: the instants in order."""
     motions: wp.array[Motion] | None
@@ -258,7 +258,7 @@ def _make_group(
                     ordered=worlds.ordered,
                 )
             )
-    offsets_ns = None if plan.times is None else plan.times.offsets_ns
+    offsets_ns = [0] if plan.times is None else plan.times.offsets_ns
     return RenderGroupState(
         device=device,
         world_count=count,
@@ -274,7 +274,7 @@ def _make_group(
         p_BC=wp.full(count, p_BC, dtype=wp.vec3d, device=device),
         q_BC=wp.full(count, q_BC, dtype=wp.quatd, device=device),
         lens_of_world=plan.worlds.lens_of_world,
-        offsets_ns=None if offsets_ns is None else wp.array(offsets_ns, dtype=wp.int64, device=device),
+        offsets_ns=wp.array(offsets_ns, dtype=wp.int64, device=device),
         instants=wp.array(np.arange(first.stamps.shape[0], dtype=np.int32), dtype=int, device=device),
         motions=plan.motions,
         rule=rule,

@@ -83,7 +83,7 @@ def choose_ticks(
     last_ns = group.rate.stamp_ns(group.rate.first_tick(end_ns + 1) - 1)
     forced = [s == last_ns or any(required[name].has_tick(s) for name in looking) for s in stamps_ns]
     forced[0] |= not all(group.frames[name].watching for name in looking)
-    places = group.rule.choose(trace.states, slots, stamps_ns, forced)
+    places = group.rule.choose(trace.arrays.states, slots, stamps_ns, forced)
     return Choice(places, len(slots) - len(places), group.rule.coarse_count)
 
 
@@ -147,26 +147,21 @@ def plan_render(
     def render() -> tuple[Any, Any]:
         if chosen is not None:
             chosen.upload()
-        mount: dict[str, Any] = {"p_BC": group.p_BC, "q_BC": group.q_BC}
-        poses = {"count": len(posed), **mount, "p_WC": p_WC, "q_WC": q_WC, "stamps": stamps}
-        if group.offsets_ns is None:
-            trace.camera_poses(from_slots, **poses)
-        else:
-            trace.ray_poses(from_slots, group.offsets_ns, **poses)
+        mount: dict[str, Any] = {"count": len(posed), "p_BC": group.p_BC, "q_BC": group.q_BC}
+        trace.camera_poses(from_slots, group.offsets_ns, **mount, p_WC=p_WC, q_WC=q_WC, stamps=stamps)
         if group.motions is not None and bodies is not None:
-            rays = 1 if group.offsets_ns is None else group.offsets_ns.shape[0]
-            count = len(slots) * rays if group.world_count == 1 else stamps.shape[0]
+            count = len(slots) * group.offsets_ns.shape[0] if group.world_count == 1 else stamps.shape[0]
             pose_bodies(group.motions, stamps, group.instants, count=count, poses=bodies)
         buffers.renderer.render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=bodies, active=active)
 
         def look(offsets_ns: Any, **there: Any) -> None:
             bodies_then = there.pop("bodies")
-            trace.ray_poses(from_slots, offsets_ns, count=len(posed), **mount, **there)
+            trace.camera_poses(from_slots, offsets_ns, **mount, **there)
             if group.motions is not None:
                 times = there["stamps"]
                 pose_bodies(group.motions, times, group.instants, count=times.shape[0], poses=bodies_then)
 
-        find_twists = partial(trace.camera_twists, from_slots, count=len(posed), **mount)
+        find_twists = partial(trace.camera_twists, from_slots, **mount)
         views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, bodies, look, find_twists)
         for name in {name: None for _, _, name in pictures}:
             if name in buffers.processes:

@@ -34,6 +34,7 @@ from neurosim_core.sim.render_job import acquire_room, disable_frame_sensors, fl
 from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
 from neurosim_core.sim.state import Batch, PlannedStep, State, make_state
 from neurosim_core.sim.step import launch, read
+from neurosim_core.vehicle.arrays import read_state
 
 
 def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = None) -> Iterator[Packet]:
@@ -292,7 +293,7 @@ def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
 def observe(state: State) -> Odometry:
     """Return the true state of the vehicle at the end of what was flown, as a packet named `odometry`."""
     if state.last is None:
-        now = state.vehicle.state
+        now = read_state(state.vehicle.arrays)
         state.last = Odometry(
             sensor="odometry",
             position=now.position[0],

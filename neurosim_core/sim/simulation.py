@@ -24,7 +24,6 @@ from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
-from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, check_rows, checked_mask, checked_seeds, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
@@ -295,7 +294,7 @@ class Simulation:
         self._take_start(start)
         state, period = self._state, self._timetable.first()
         reset_vehicles(self._model, state, self._mask)
-        wp.copy(state.fleet.active, self._mask)  # sensors of the others do not see this
+        wp.copy(state.worlds.active, self._mask)  # sensors of the others do not see this
         now_ns = state.launched_ns
         self._launch_reset(state, period)
         state.launched_ns = 0 if mask is None else now_ns
@@ -347,7 +346,7 @@ class Simulation:
         self._require_reset()
         if periods < 1:
             raise ValueError(f"periods must be 1 at least, got {periods}")
-        if not isinstance(self._state.vehicle, Carrier):  # after a reset or a step there is no command of it
+        if self._state.path_controller is not None:  # after a reset or a step there is no command of it
             self._state.path_controller.update(self._state.vehicle.arrays)
         for _ in range(periods):
             observation = self._advance(closed_loop=True)
@@ -385,7 +384,7 @@ class Simulation:
         for group in state.groups:
             for sensor in group.world_frames.values():
                 sensor.begin(self._mask, group.parity)
-        state.fleet.active.fill_(1)
+        state.worlds.active.fill_(1)
 
     def _observe(self, period: Period) -> Observation:
         """Return the views of what a period yields: the same arrays each time."""
