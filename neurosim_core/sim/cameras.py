@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
@@ -150,45 +151,44 @@ def read_cameras(
     return packets + events
 
 
-def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:
+class WorldFrames(NamedTuple):
+    """What the frame sensors of a group see of a batch in many worlds."""
+
+    group: RenderGroupState
+    offsets_ns: tuple[int, ...]
+    """From the end of the batch to the instant before it and to those within it [ns]."""
+    parity: int
+    """Which of the two states of the sensors is the present one."""
+
+
+def plan_world_frames(state: State, batch: Batch) -> list[WorldFrames]:
+    """Return what frame sensors see of a batch in many worlds; groups that do are in their other state then.
+
+    What they need on the device is allocated.
+    """
+    begin_ns, end_ns = batch.until_ns - sum(batch.elapsed_ns), batch.until_ns
+    found = []
+    for index, group in enumerate(state.groups):
+        seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
+        if group.world_frames:
+            offsets_ns = (batch.last_seen_ns[index] + begin_ns - end_ns, *seen)
+            found.append(WorldFrames(group, offsets_ns, group.parity))
+            for sensor in group.world_frames.values():
+                sensor.offsets(offsets_ns)
+        if seen:
+            group.parity = 1 - group.parity
+    return found
+
+
+def find_in_worlds(state: State, frames: Sequence[WorldFrames]) -> list[object]:
     """Let the frame sensors of many worlds see what was rendered; launches only.
 
-    The clocks of the worlds are at the end of the batch; `last_seen_ns` leads for each group from its begin
-    to the instant before it, <= 0. What is returned has to be kept by a graph of these launches.
+    The clocks of the worlds are at the end of the batch. What is returned has to be kept by a graph of these
+    launches.
     """
     held: list[object] = []
-    for group, offsets_ns, parity in _frames_of_worlds(state, batch, last_seen_ns):
+    for group, offsets_ns, parity in frames:
         for sensor in group.world_frames.values():
             held.append(sensor.offsets(offsets_ns))
             sensor.find(state.worlds.clock_ns, offsets_ns, parity)
     return held
-
-
-def prepare_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> Hashable:
-    """Allocate what `find_in_worlds` needs for a batch, and return what its launches depend on."""
-    frames = _frames_of_worlds(state, batch, last_seen_ns)
-    for group, offsets_ns, _ in frames:
-        for sensor in group.world_frames.values():
-            sensor.offsets(offsets_ns)
-    return tuple((offsets_ns, parity) for _, offsets_ns, parity in frames)
-
-
-def _frames_of_worlds(
-    state: State, batch: Batch, last_seen_ns: Sequence[int]
-) -> list[tuple[RenderGroupState, tuple[int, ...], int]]:
-    """Return for each group with frame sensors when they see a batch, from its end [ns], and the parity."""
-    begin_ns, end_ns = batch.until_ns - sum(batch.elapsed_ns), batch.until_ns
-    found = []
-    for index, group in enumerate(state.groups):
-        if group.world_frames:
-            seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
-            last_ns = last_seen_ns[index] + begin_ns - end_ns
-            found.append((group, (last_ns, *seen), group.parity))
-    return found
-
-
-def turn_parities(state: State, batch: Batch) -> None:
-    """Note that groups which saw a frame are in the other of their two states."""
-    for index, group in enumerate(state.groups):
-        if any(index in boundary.groups for boundary in batch.boundaries):
-            group.parity = 1 - group.parity

@@ -101,12 +101,18 @@ def refuse_commands(model: Model) -> None:
 
 
 def plan_batch(
-    state: State, stretch: Sequence[Boundary], *, closed_loop: bool, begin_ns: int | None = None
+    state: State,
+    stretch: Sequence[Boundary],
+    *,
+    closed_loop: bool,
+    begin_ns: int | None = None,
+    last_seen_ns: Sequence[int] = (),
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
     It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
-    controller commands; otherwise the last command is held.
+    controller commands; otherwise the last command is held. Of many worlds `last_seen_ns` is for each group
+    the instant before the stretch, from its begin [ns], <= 0.
     """
     closed_loop = closed_loop and state.path_controller is not None
     number, max_step_ns = state.launched_count, state.vehicle.max_step_ns
@@ -127,6 +133,7 @@ def plan_batch(
         number=number,
         slot=number % state.render_backlog * (state.trace.arrays.states.shape[0] // state.render_backlog),
         wanted=state.wanted,
+        last_seen_ns=last_seen_ns,
         until_ns=at_ns,
     )
 

@@ -1,9 +1,7 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type"
-"""Where vehicles begin, and the kernels that put them there and take masks and rows of any type."""
+"""Where vehicles begin, and the kernels that put them there."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -94,39 +92,6 @@ def normalise(
         total += orientation[world, part] * orientation[world, part]
     for part in range(4):
         orientation[world, part] = orientation[world, part] / wp.sqrt(total)
-
-
-@wp.kernel
-def take_rows(
-    # In:
-    rows: wp.array2d[Any],
-    # Out:
-    rows_out: wp.array2d[wp.float64],
-) -> None:
-    """Copy numbers of any floating type."""
-    row, column = wp.tid()
-    rows_out[row, column] = wp.float64(rows[row, column])
-
-
-wp.overload(take_rows, {"rows": wp.array2d[wp.float32]})
-wp.overload(take_rows, {"rows": wp.array2d[wp.float64]})
-
-
-@wp.kernel
-def take_mask(
-    # In:
-    mask: wp.array[Any],
-    # Out:
-    mask_out: wp.array[wp.int32],
-) -> None:
-    """Copy a mask: not 0 is 1."""
-    world = wp.tid()
-    mask_out[world] = wp.where(wp.int32(mask[world]) != 0, 1, 0)
-
-
-wp.overload(take_mask, {"mask": wp.array[wp.bool]})
-wp.overload(take_mask, {"mask": wp.array[wp.uint8]})
-wp.overload(take_mask, {"mask": wp.array[wp.int32]})
 
 
 @wp.kernel

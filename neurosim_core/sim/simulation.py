@@ -29,7 +29,7 @@ from neurosim_core.sim.integrate import checked_command, command_buffer, plan_ba
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, make_observation
 from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
-from neurosim_core.sim.reset import begin_of_paths, normalise, take_mask, take_rows, take_seeds
+from neurosim_core.sim.reset import begin_of_paths, normalise, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, make_state, reset_vehicles
@@ -363,8 +363,10 @@ class Simulation:
         period = self._timetable.at(now_ns)
         state = self._state
         stretch = [b._replace(stamp_ns=b.stamp_ns + now_ns) for b in period.boundaries]
-        batch = plan_batch(state, stretch, closed_loop=closed_loop, begin_ns=now_ns)
-        launch(self._model, state, batch, last_seen_ns=period.last_seen_ns)
+        batch = plan_batch(
+            state, stretch, closed_loop=closed_loop, begin_ns=now_ns, last_seen_ns=period.last_seen_ns
+        )
+        launch(self._model, state, batch)
         self._now_ns = now_ns + period.duration_ns
         self.duration_ns = period.duration_ns
         if state.graphs.dropped_count > 0 and not self._warned:
@@ -407,7 +409,7 @@ class Simulation:
 
     def _take_rows(self, rows: Any, out: Any, name: str) -> None:
         check_rows(rows, out, name)
-        wp.launch(take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
+        wp.utils.array_cast(rows, out)
 
     def _take_mask(self, mask: Any) -> None:
         if mask is None:
@@ -415,18 +417,18 @@ class Simulation:
         elif isinstance(mask, np.ndarray):
             self._mask.assign(mask)
         else:
-            self._launch(take_mask, [mask], [self._mask])
+            wp.utils.array_cast(mask, self._mask)
 
     def _checked_start(self, **given: Any) -> dict[str, Any]:
         """Return where vehicles are to begin: arrays of the device, rows on the host, None: by default."""
         checked: dict[str, Any] = {}
         for name, value in given.items():
             array = getattr(self._state.start, name)
-            if (on_device := as_device_array(value, self.device)) is not None:
+            if value is None:
+                checked[name] = None
+            elif (on_device := as_device_array(value, self.device)) is not None:
                 check_rows(on_device, array, name)
                 checked[name] = on_device
-            elif value is None:
-                checked[name] = None
             else:
                 rows = as_rows(value, name=name, count=self.count, width=array.shape[1])
                 checked[name] = normalised(rows) if name == "orientation" else rows

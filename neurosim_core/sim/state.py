@@ -33,7 +33,7 @@ from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_rend
 from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, restart
 from neurosim_core.sim.scene_table import single_scene
-from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
+from neurosim_core.sim.schedule import Boundary, boundary_count_max
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.config import VehicleContext
@@ -77,6 +77,8 @@ class Batch:
     """Slot of the first boundary in the trace, and of its first sample in the arrays of each sampler."""
     wanted: frozenset[str]
     """Cameras that look."""
+    last_seen_ns: Sequence[int]
+    """Of many worlds, for each group the instant before the batch, from its begin [ns], <= 0."""
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     jobs: Sequence[RenderJob] | None = None
@@ -332,7 +334,7 @@ def _single_world(model: Model, seed: int | None) -> WorldSettings:
 def _history_length(model: Model, slot_count: int) -> int:
     """Return how many boundaries are kept for cameras, whatever is flown ahead."""
     window_ns = max((group.window_ns for group in model.groups), default=0)
-    return boundary_count_within(model.schedule, window_ns) + slot_count + 1
+    return boundary_count_max(model.schedule, 1e-9 * window_ns) + slot_count
 
 
 def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:

@@ -14,7 +14,7 @@ changes no result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.timing import timed
@@ -23,10 +23,9 @@ from neurosim_core.sim.cameras import (
     find_in_worlds,
     launch_cameras,
     plan_jobs,
-    prepare_worlds,
+    plan_world_frames,
     read_cameras,
     scan,
-    turn_parities,
 )
 from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
 from neurosim_core.sim.model import Model
@@ -35,11 +34,10 @@ from neurosim_core.sim.state import Batch, State
 from neurosim_core.warp_start import refuse_forked_process
 
 
-def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[int] = ()) -> None:
+def launch(model: Model, state: State, batch: Batch) -> None:
     """Launch one batch, from the command to the events, without waiting for a device.
 
-    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`). Of many
-    worlds `last_seen_ns` is for each group the instant before it, from its begin [ns], <= 0.
+    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
     """
     refuse_forked_process()
     # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
@@ -54,15 +52,15 @@ def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[i
             jobs = plan_jobs(state, batch, choose(model, state, batch))
         for job in jobs:
             acquire_room(job)
-        worlds_key = prepare_worlds(state, batch, last_seen_ns)
+        frames = plan_world_frames(state, batch)
 
         def everything() -> tuple[object, ...]:
             held = flight(), *(job.render() for job in jobs)
-            return *held, find_in_worlds(state, batch, last_seen_ns)  # log radiance -> events, in many worlds
+            return *held, find_in_worlds(state, frames)  # log radiance -> events, in many worlds
 
         with timed(state.wall_s, "flight and render"):
-            state.graphs.run((flight_key, worlds_key, *map(launch_key, jobs)), everything)
-        turn_parities(state, batch)
+            seen_key = tuple((each.offsets_ns, each.parity) for each in frames)
+            state.graphs.run((flight_key, seen_key, *map(launch_key, jobs)), everything)
         scan(state, batch, jobs)  # log radiance -> events, in a world whose packets go to the host
     if state.on_host:
         state.in_flight.append(batch)

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,valid-type"
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,valid-type,assignment"
 """The states of all vehicles at the boundaries of batches, on the device until they are read."""
 
 import math
@@ -222,7 +222,7 @@ class Trace:
         world_count, rotor_count = worlds.vehicles.rotor_speed.shape
         self.device = worlds.clock_ns.device
         shape = (capacity, world_count)
-        self.arrays: Any = TraceArrays()
+        self.arrays = TraceArrays()
         self.arrays.states = wp.zeros((*shape, 13 + rotor_count), dtype=wp.float64, device=self.device)
         self.arrays.status = wp.zeros(shape, dtype=wp.int32, device=self.device)
         self.arrays.clearance = wp.zeros(shape, dtype=wp.float32, device=self.device)
