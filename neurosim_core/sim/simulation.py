@@ -175,7 +175,7 @@ class Simulation:
         """
         for group, plan in zip(self._state.groups, self._model.groups, strict=True):
             if camera in plan.names:
-                return group.p_BC, group.q_BC, group.lens_of_world
+                return group.p_BC, group.q_BC, group.worlds.lens_of_world
         raise ValueError(f"there is no camera {camera!r}")
 
     def light(self, name: str) -> Any:

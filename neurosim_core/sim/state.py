@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -30,7 +30,6 @@ from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
-from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, restart
 from neurosim_core.sim.scene_table import single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max
@@ -38,6 +37,9 @@ from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.config import VehicleContext
 from neurosim_core.vehicle.host_vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from neurosim_core.sim.cameras import RenderJob
 
 _IN_FLIGHT_ON_CUDA = 5
 """With three, one batch is flown and one rendered while the host reads a third."""
@@ -82,10 +84,11 @@ class Batch:
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     jobs: Sequence[RenderJob] | None = None
-    """What groups render of it, if that was planned ahead."""
-    seen: Sequence[tuple[RenderGroupState, Instants]] = ()
-    choices: Sequence[Choice] = ()
-    """What adaptive groups render of it."""
+    """What groups render of it; None: that was not planned yet."""
+    left_out_count: int = 0
+    """Ticks that adaptive groups do not render."""
+    coarse_count: int = 0
+    """Renders after which something moves further by the next tick than it should between renders."""
 
 
 class PlannedStep(NamedTuple):
