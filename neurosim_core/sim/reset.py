@@ -81,20 +81,6 @@ def restart(
 
 
 @wp.kernel
-def normalise(
-    # In/out:
-    orientation: wp.array2d[wp.float64],
-) -> None:
-    """Give quaternions unit length."""
-    world = wp.tid()
-    total = wp.float64(0.0)
-    for part in range(4):
-        total += orientation[world, part] * orientation[world, part]
-    for part in range(4):
-        orientation[world, part] = orientation[world, part] / wp.sqrt(total)
-
-
-@wp.kernel
 def take_seeds(
     # In:
     mask: wp.array[wp.int32],
