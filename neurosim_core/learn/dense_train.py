@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,13 +23,11 @@ from torch import Tensor
 from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import find_recordings
-from neurosim_core.learn.dense import DenseNet, Head, Memory
-from neurosim_core.learn.dense_live import flight_settings, live_flights
-from neurosim_core.learn.heads import DepthHead, FlowHead, FutureHead
+from neurosim_core.learn.dense import DenseNet, Memory
+from neurosim_core.learn.dense_flights import flight_settings, live_flights
+from neurosim_core.learn.heads import HEADS, Head
 
 _log = logging.getLogger(__name__)
-HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}
-"""What can be learned, by the name of its command."""
 _SILENT_S = 120.0
 """Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
 _REMEMBERED = 0.75
@@ -201,7 +201,8 @@ def evaluate(
 
     `predict`: called with a voxel [1, bins, H, W] and the memory of the window before, or None.
     """
-    sums, memory, flight = head.errors(), None, None
+    sums: Tensor | None = None
+    memory, flight = None, None
     due: list[tuple[Tensor, Tensor]] = []
     """What was predicted and is not yet compared, with what was seen."""
     with torch.no_grad():
@@ -214,8 +215,11 @@ def evaluate(
                 due.append((predicted.cpu(), voxel[None]))
                 if len(due) > head.ahead:
                     before, seen = due.pop(0)
-                    sums.add(before, target[None], seen)
-    return sums.result()
+                    measured = head.measure(before, target[None], seen)
+                    sums = measured if sums is None else sums + measured
+    if sums is None:
+        raise ValueError("no window has anything to compare with")
+    return head.errors(sums)
 
 
 def train_dense(
@@ -313,71 +317,74 @@ def _source(
     pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
 ) -> Iterator[Callable[[int], None]]:
     """Fill a pool for the first step; yield what to call before each step, with its number."""
-    head, options = config.head, _options(config)
-    if worlds:
-        from neurosim_core.learn.dense_worlds import world_windows
-
-        fly_device = config.fly_device or config.device
-        settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        windows = world_windows(
-            settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
-            renders=config.renders, threshold_spread=config.threshold_spread,
-        )  # fmt: skip
-        with contextlib.closing(windows) as flown:
-            while len(pool) < min(config.batch, worlds):
-                pool.add(next(flown))
-
-            def due(step: int) -> bool:
-                return pool.window_count * config.reuse < step * config.batch * config.sequence
-
-            def fly_on(step: int) -> None:
-                while due(step):
-                    pool.add(next(flown))
-
-            if fly_device == config.device:
-                yield fly_on
-                return
-            with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
-
-                def wait(step: int) -> None:
-                    while due(step) and goes_on():
-                        time.sleep(1e-3)
-
-                yield wait
-        return
-    if data is not None:
-        length = config.sequence + head.ahead
-        for batch in Stream(data, batch=64 * length, sequence=length, **options):
-            pool.add(windows_of(batch, head, config.bins))
-        yield lambda _: None
-        return
-    settings = flight_settings(config.size_px, 0, field=head.field)
+    head, fly_device = config.head, config.fly_device or config.device
+    needed, reuse = config.batch, math.inf  # sequences of the first step; how often windows may be seen
     with contextlib.ExitStack() as stack:
-        if ray is None:
-            names = stack.enter_context(live_flights(live, settings, seed=config.seed))
-            source: Any = LiveSource(names, timeout_s=_SILENT_S)
+        if worlds:
+            from neurosim_core.learn.dense_worlds import world_windows
+
+            settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
+            windows: Iterator[Windows] = stack.enter_context(
+                contextlib.closing(
+                    world_windows(
+                        settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
+                        renders=config.renders, threshold_spread=config.threshold_spread,
+                    )
+                )
+            )  # fmt: skip
+            needed, reuse = min(needed, worlds), config.reuse
         else:
-            source = RaySource(settings, simulators=live, address=ray, first=config.seed)
-        batches = iter(Stream(source, batch=1, **options))
-        filling = _meanwhile(lambda: pool.add(windows_of(next(batches), head, config.bins)))
-        goes_on = stack.enter_context(filling)
-        while len(pool) < config.batch and goes_on():
-            time.sleep(0.05)
-        yield lambda _: None
+            stream = _stream(stack, config, data, live, ray)
+            windows = (windows_of(batch, head, config.bins) for batch in stream)
+            if data is not None:
+                needed = sys.maxsize
+
+        def add() -> bool:
+            window = next(windows, None)
+            if window is not None:
+                pool.add(window)
+            return window is not None
+
+        comes = add
+        if live or fly_device != config.device:
+            comes = stack.enter_context(_meanwhile(add))
+        while len(pool) < needed and comes():
+            pass
+
+        def more(step: int) -> None:
+            while pool.window_count * reuse < step * config.batch * config.sequence and comes():
+                pass
+
+        yield more
+
+
+def _stream(
+    stack: contextlib.ExitStack, config: DenseConfig, data: Path | None, live: int, ray: str | None
+) -> Stream:
+    """Return windows of recordings in sequences, or of processes that fly; these end with the stack."""
+    if data is not None:
+        length = config.sequence + config.head.ahead
+        return Stream(data, batch=64 * length, sequence=length, **_options(config))
+    settings = flight_settings(config.size_px, 0, field=config.head.field)
+    if ray is not None:
+        source: Any = RaySource(settings, simulators=live, address=ray, first=config.seed)
+    else:
+        names = stack.enter_context(live_flights(live, settings, seed=config.seed))
+        source = LiveSource(names, timeout_s=_SILENT_S)
+    return Stream(source, batch=1, **_options(config))
 
 
 @contextlib.contextmanager
-def _meanwhile(step: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Do a step again and again in a thread, until it raises StopIteration or the block ends.
+def _meanwhile(step: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    """Do a step again and again in a thread, as long as it returns true and the block has not ended.
 
-    Yield what says whether this goes on; that raises what the step raised.
+    Yield what waits a moment and says whether this goes on; it raises what the step raised.
     """
     stop = threading.Event()
 
     def work() -> None:
-        with contextlib.suppress(StopIteration):
-            while not stop.is_set():
-                step()
+        while not stop.is_set() and step():
+            pass
 
     with ThreadPoolExecutor(1) as executor:
         working = executor.submit(work)
@@ -386,6 +393,7 @@ def _meanwhile(step: Callable[[], None]) -> Iterator[Callable[[], bool]]:
             if working.done():
                 working.result()
                 return False
+            time.sleep(1e-3)
             return True
 
         try:
