@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
+from neurosim_core.data.sources import packets_of
 from neurosim_core.flight import saved_flight
-from neurosim_core.learn.env import CAMERA, Env
+from neurosim_core.learn.env import Env
 from neurosim_core.learn.evaluate import EPISODE_SEED, Actor
 from neurosim_core.learn.task import Task
-from neurosim_core.packets import Events, Image, Odometry, Packet
+from neurosim_core.packets import Packet
 
 _HEIGHT_PX = 220
 """Of the picture; its view is that of the event camera."""
@@ -53,14 +53,6 @@ def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED
 
 def _write(env: Env, write: Callable[[Packet], None]) -> None:
     """Write what the sensors of the first world yielded."""
-    seen = env.observation
-    stamp_ns = int(seen.clock_ns.numpy()[0])
-    header: dict[str, Any] = {"stamp_ns": stamp_ns, "sequence": round(1e-9 * stamp_ns * env.task.rate_hz)}
-    write(Image(**header, sensor="rgb", data=np.array(seen.images["rgb"].numpy()[0]), encoding="rgb8"))
-    state = {name: rows.numpy()[-1, 0] for name, rows in seen.samples["odometry"].arrays.items()}
-    write(Odometry(**header, sensor="odometry", **state))
-    events = seen.events[CAMERA]
-    columns = events.numpy(0)
-    t, x, y, polarity = (column[np.argsort(columns[0], kind="stable")] for column in columns)
-    size = {"width": events.width, "height": events.height}
-    write(Events(**header, sensor=CAMERA, t=t, x=x, y=y, polarity=polarity, **size))
+    (packets,) = packets_of(env.sim, env.observation, [0], env.sim.model.config.sensors)
+    for packet in packets:
+        write(packet)
