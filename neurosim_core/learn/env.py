@@ -10,13 +10,12 @@ from typing import Any, Literal, TypeVar
 import torch
 import warp as wp
 
-from neurosim_core.learn.actions import COMMANDS, hover_command
 from neurosim_core.learn.cameras import CameraDraws, draw_lenses
 from neurosim_core.learn.episodes import COLUMNS, PARAMETERS, Episodes, make_routes
 from neurosim_core.learn.randomisation import NO_RANDOMISATION, Randomisation
 from neurosim_core.learn.snapshot import put_state, state_of
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
-from neurosim_core.learn.task import Observations, Task, View
+from neurosim_core.learn.task import COMMANDS, Observations, Task, View, hover_command
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation

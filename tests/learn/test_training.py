@@ -23,8 +23,14 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate_policy, student_actor, teacher_actor  # noqa: E402
-from neurosim_core.learn.film import film_episode, film_sensors  # noqa: E402
+from neurosim_core.learn.evaluate import (  # noqa: E402
+    EPISODE_SEED,
+    evaluate_policy,
+    film_episode,
+    film_sensors,
+    student_actor,
+    teacher_actor,
+)
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.randomisation import NO_RANDOMISATION  # noqa: E402
