@@ -170,11 +170,6 @@ class Training:
         assert isinstance(policy, EventPolicy)
         return policy
 
-    @property
-    def models(self) -> Sequence[Model]:
-        """Of the scenes it trains in."""
-        return self.env.sim.models
-
     def resume(self) -> None:
         """Go on from the checkpoint of the folder."""
         file = self.folder / "checkpoint.pt"
