@@ -60,7 +60,7 @@ class DenseConfig:
     """How long to train [min]; waiting for the first windows is not counted."""
     steps: int | None = None
     """How many steps to train, however long they take; None: as `minutes` says."""
-    room: int = 20_000
+    capacity: int = 20_000
     """Windows that are kept to be seen again; of more, the oldest go."""
     reuse: float = 4.0
     """Worlds fly on when their windows have been seen so often, on average."""
@@ -114,7 +114,7 @@ def windows_of(batch: Batch, head: Head, bins: int) -> Windows:
     return Windows(batch.source, batch.start_ns.tolist(), batch.stamp_ns.tolist(), voxel, target)
 
 
-class WindowPool:
+class ReplayBuffer:
     """Windows to be seen again, in sequences that follow on each other; filled from any source.
 
     `mirrored`: factor of each channel of a target in a mirrored picture. `device`: where they are kept; None:
@@ -122,9 +122,9 @@ class WindowPool:
     """
 
     def __init__(
-        self, *, length: int, room: int, mirrored: Sequence[float] = (1.0,), device: str | None = None
+        self, *, length: int, capacity: int, mirrored: Sequence[float] = (1.0,), device: str | None = None
     ) -> None:
-        self._length, self._most, self._device = length, max(1, room // length), device
+        self._length, self._most, self._device = length, max(1, capacity // length), device
         self._sign = torch.tensor(mirrored)[:, None, None]
         self._sequences: list[tuple[Tensor, Tensor]] = []
         self._begun: dict[str, list[tuple[int, Tensor, Tensor]]] = {}
@@ -257,20 +257,20 @@ def train_dense(
         net.take_backbone(Path(config.backbone))
     if live or torch.device(config.device).type == "cuda":
         torch.set_num_threads(1)  # more wait for each other where others work, and only put batches together
-    pool = WindowPool(
+    buffer = ReplayBuffer(
         length=config.sequence + head.ahead,
-        room=config.room,
+        capacity=config.capacity,
         mirrored=head.mirrored,
         device=config.device if worlds else None,
     )
     _log.info("waiting for the first windows")
-    with _source(pool, config, data, live, worlds, ray) as more:
-        fit = _fit(net.to(config.device), pool, config, more)
+    with _source(buffer, config, data, live, worlds, ray) as more:
+        fit = _fit(net.to(config.device), buffer, config, more)
     folder.mkdir(parents=True, exist_ok=True)
     card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
     weights = {name: value.cpu() for name, value in net.state_dict().items()}
     torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
-    constant = head.constant(pool.targets()).cpu()[None]
+    constant = head.constant(buffer.targets()).cpu()[None]
 
     def predict_mean(voxel: Tensor, _memory: Any) -> tuple[Tensor, Any]:
         return torch.nn.functional.interpolate(constant, voxel.shape[-2:]), None
@@ -288,7 +288,7 @@ def train_dense(
         "steps": fit.steps,
         "share of the time without data": fit.waited_share,
         "gpus": fit.gpus,
-        "training windows": pool.window_count,
+        "training windows": buffer.window_count,
         "test windows": sum(len(windows.source) for windows in tested),
         "errors": {name: error._asdict() for name, error in errors.items()},
     }
@@ -314,9 +314,9 @@ def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
 
 @contextlib.contextmanager
 def _source(
-    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
+    buffer: ReplayBuffer, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
 ) -> Iterator[Callable[[int], None]]:
-    """Fill a pool for the first step; yield what to call before each step, with its number."""
+    """Fill a buffer for the first step; yield what to call before each step, with its number."""
     head, fly_device = config.head, config.fly_device or config.device
     needed, reuse = config.batch, math.inf  # sequences of the first step; how often windows may be seen
     with contextlib.ExitStack() as stack:
@@ -342,17 +342,17 @@ def _source(
         def add() -> bool:
             window = next(windows, None)
             if window is not None:
-                pool.add(window)
+                buffer.add(window)
             return window is not None
 
         comes = add
         if live or fly_device != config.device:
-            comes = stack.enter_context(_meanwhile(add))
-        while len(pool) < needed and comes():
+            comes = stack.enter_context(_in_background(add))
+        while len(buffer) < needed and comes():
             pass
 
         def more(step: int) -> None:
-            while pool.window_count * reuse < step * config.batch * config.sequence and comes():
+            while buffer.window_count * reuse < step * config.batch * config.sequence and comes():
                 pass
 
         yield more
@@ -375,7 +375,7 @@ def _stream(
 
 
 @contextlib.contextmanager
-def _meanwhile(step: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+def _in_background(step: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
     """Do a step again and again in a thread, as long as it returns true and the block has not ended.
 
     Yield what waits a moment and says whether this goes on; it raises what the step raised.
@@ -431,9 +431,9 @@ def _some_of(memory: Memory | None, random: np.random.Generator) -> Memory | Non
     return tuple(level.detach() * kept[:, None, None, None] for level in memory)
 
 
-def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
+def _fit(net: DenseNet, buffer: ReplayBuffer, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
     """Train for the time that there is."""
-    if len(pool) == 0:
+    if len(buffer) == 0:
         raise ValueError(
             f"there are no {config.sequence + config.head.ahead} consecutive windows to learn from"
         )
@@ -454,7 +454,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         asked_s = time.monotonic()
         more(steps)
         waited_s += time.monotonic() - asked_s
-        voxel, target = (part.to(config.device).float() for part in pool.draw(config.batch, random))
+        voxel, target = (part.to(config.device).float() for part in buffer.draw(config.batch, random))
         memory, predicted = _some_of(memory, random), []
         for window in voxel[: config.sequence]:
             one, memory = net(window, memory)
@@ -467,7 +467,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         steps += 1
         if time.monotonic() - told_s > _TOLD_S:
             told_s = time.monotonic()
-            told = (steps, 100.0 * share, loss.item(), pool.window_count)
+            told = (steps, 100.0 * share, loss.item(), buffer.window_count)
             _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
     fit = _Fit(steps, waited_s / (time.monotonic() - begin_s), _gpus(config.device))
     _log.info(

@@ -273,7 +273,7 @@ class Env:
         observation = self.sim.step(self._delayed(self.task.command(view)), mode=self.task.mode)
         if self._surface is not None:
             self._surface.update(observation.events[CAMERA], observation.clock_ns)
-        self._look(observation)
+        self._update_view(observation)
         self.episode_length += 1
         torch.mul(self.episode_length, view.step_s, out=view.elapsed_s)
         task = self.task
@@ -351,7 +351,7 @@ class Env:
         if self._surface is not None:
             self._mask_int.copy_(self._mask)
             self._surface.forget(wp.from_torch(self._mask_int))
-        self._look(observation)
+        self._update_view(observation)
         hover = COMMANDS["attitude"](self.task, view) if self.task.mode == "attitude" else self._hover
         self._queue = torch.where(mask, hover, self._queue)
         self._lagging = torch.where(mask, hover, self._lagging)
@@ -400,9 +400,9 @@ class Env:
         length = self._queue.shape[0]
         return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
-    def _look(self, observation: Observation) -> None:
+    def _update_view(self, observation: Observation) -> None:
         self.observation = observation
-        self._episodes.look(observation)
+        self._episodes.write_rows(observation)
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)

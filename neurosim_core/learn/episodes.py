@@ -150,7 +150,7 @@ def _write(rows: wp.array2d[wp.float32], world: int, column: int, value: wp.vec3
 
 
 @wp.kernel
-def _look(
+def _write_rows(
     # Model:
     fields: wp.array[DistanceField],
     scene_of_world: wp.array[wp.int32],
@@ -364,12 +364,12 @@ class Episodes:
         ranges.drag, ranges.wind_max = wp.vec2(*drawn.drag_factor), drawn.wind_m_s
         self._launch(_vary_airframes, [self._nominal, ranges, mask, self.seeds], [airframes, self.parameters])
 
-    def look(self, observation: Observation) -> None:
+    def write_rows(self, observation: Observation) -> None:
         """Write what is known of all vehicles: `rows` and `distances`."""
         scenes, drawn, state = [self._sim.fields, self._sim.scene_of_world], self._drawn, observation.state
         noise = [drawn.gyro_bias_rad_s, drawn.gyro_noise_rad_s, drawn.gravity_noise]
         moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
-        self._launch(_look, [*scenes, *noise, self.seeds, *moving, self._goal], [self.rows])
+        self._launch(_write_rows, [*scenes, *noise, self.seeds, *moving, self._goal], [self.rows])
         if self.distances.shape[1]:
             inputs = [*scenes, self._probes, self.rows]
             self._launch(_probe, inputs, [self.distances], dim=self.distances.shape)

@@ -23,7 +23,7 @@ from neurosim_core.learn import dense_train, dense_worlds  # noqa: E402
 from neurosim_core.learn.dense import DenseNet  # noqa: E402
 from neurosim_core.learn.dense_train import (  # noqa: E402
     DenseConfig,
-    WindowPool,
+    ReplayBuffer,
     evaluate,
     held_out_windows,
     load_dense,
@@ -131,13 +131,13 @@ def window(number, source, value):
 
 
 def test_a_pool_has_sequences_of_one_flight_without_gaps():
-    pool = WindowPool(length=2, room=6)
+    buffer = ReplayBuffer(length=2, capacity=6)
     mixed = [window(0, "a", 100), window(0, "b", 200), window(1, "a", 101), window(1, "b", 201)]
     gap = [window(2, "a", 102), window(4, "a", 104), window(5, "a", 105)]
     for sample in (*mixed, *gap):
-        pool.add(windows_of(collate([sample]), HEADS["depth"], 1))
-    assert (len(pool), pool.window_count) == (3, 7)
-    voxel, depth = pool.draw(64, np.random.default_rng(0))
+        buffer.add(windows_of(collate([sample]), HEADS["depth"], 1))
+    assert (len(buffer), buffer.window_count) == (3, 7)
+    voxel, depth = buffer.draw(64, np.random.default_rng(0))
     assert voxel.shape == (2, 64, 1, 8, 8)
     corners = {tuple(sorted((row[0].item(), row[-1].item()))) for row in depth[0, :, 0, 0]}
     assert corners == {(100, 107), (200, 207), (104, 111)}
@@ -145,17 +145,17 @@ def test_a_pool_has_sequences_of_one_flight_without_gaps():
     mirrored = depth[0, :, 0, 0, 0] > depth[0, :, 0, 0, -1]
     assert 10 < mirrored.sum() < 54
     for number in range(6, 14):  # the oldest go
-        pool.add(windows_of(collate([window(number, "a", number)]), HEADS["depth"], 1))
-    assert len(pool) == 3
-    assert pool.draw(64, np.random.default_rng(0))[1].max() <= 20
+        buffer.add(windows_of(collate([window(number, "a", number)]), HEADS["depth"], 1))
+    assert len(buffer) == 3
+    assert buffer.draw(64, np.random.default_rng(0))[1].max() <= 20
 
 
 def test_a_mirrored_flow_goes_the_other_way():
-    pool = WindowPool(length=1, room=1, mirrored=HEADS["flow"].mirrored)
+    buffer = ReplayBuffer(length=1, capacity=1, mirrored=HEADS["flow"].mirrored)
     sample = window(0, "a", 0)
     flow = np.stack([np.full((8, 8), 2.0), np.full((8, 8), 3.0)], -1).astype(np.float32)
-    pool.add(windows_of(collate([replace(sample, flow=flow)]), HEADS["flow"], 1))
-    _, drawn = pool.draw(64, np.random.default_rng(0))
+    buffer.add(windows_of(collate([replace(sample, flow=flow)]), HEADS["flow"], 1))
+    _, drawn = buffer.draw(64, np.random.default_rng(0))
     assert {tuple(pair) for pair in drawn[0, :, :, 0, 0].tolist()} == {(2.0, 3.0), (-2.0, 3.0)}
 
 

@@ -336,7 +336,7 @@ def test_a_policy_sees_voxels_of_both_signs():
     policy = EventPolicy(channels=5, height=8, width=8, vector_size=3)
     voxels, vector = torch.full((2, 5, 8, 8), 3.0), torch.zeros(2, 3)
     voxels[1] = -3.0  # as many events, but darker
-    seen = policy.see(voxels, vector)
+    seen = policy.encode(voxels, vector)
     assert seen.isfinite().all()
     assert not torch.allclose(seen[0], seen[1])
 
