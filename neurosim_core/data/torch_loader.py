@@ -61,7 +61,7 @@ class Loader:
         self._position = Position(0, 0)
         self._places: list[Position] = []
         """The batches of the present epoch."""
-        self._pins = pin_memory or (device is not None and torch.cuda.is_available())
+        self._pins = (pin_memory or device is not None) and torch.cuda.is_available()
         more: dict[str, Any] = {}
         if workers:
             if not self.stream.is_recorded:

@@ -414,11 +414,13 @@ class Env:
             self.view.bodies.copy_(torch.cat([moved, velocity + fallen], dim=2))
 
     def _make_view(self) -> View:
-        rows = wp.to_torch(self._episodes.rows)
+        rows, distances = wp.to_torch(self._episodes.rows), self._episodes.distances
         worlds = self.num_envs
         return View(
             **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
-            probes=wp.to_torch(self._episodes.distances),
+            probes=wp.to_torch(distances)
+            if distances.size
+            else torch.zeros(distances.shape, device=self.device),
             scenes=[model.config.scene for model in self.sim.models],
             scene=wp.to_torch(self.sim.scene_of_world).long(),
             surface=None if self._surface is None else wp.to_torch(self._surface.array),
