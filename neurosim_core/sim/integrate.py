@@ -229,7 +229,15 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]
-        state.last = _odometry(row, reached[-1])
+        state.last = Odometry(
+            stamp_ns=reached[-1],
+            sensor="odometry",
+            position=row[POSITION],
+            orientation=row[ORIENTATION],
+            velocity=row[VELOCITY],
+            body_rate=row[BODY_RATE],
+            rotor_speed=row[ROTOR_SPEED],
+        )
     return packets
 
 
@@ -249,19 +257,6 @@ def _failure(state: State) -> DynamicsError:
     except DynamicsError as error:
         return error
     raise AssertionError("the status of a vehicle that is held does not change")
-
-
-def _odometry(row: Any, stamp_ns: int) -> Odometry:
-    """Return a row of a trace as the packet that `observe` gives."""
-    return Odometry(
-        stamp_ns=stamp_ns,
-        sensor="odometry",
-        position=row[POSITION],
-        orientation=row[ORIENTATION],
-        velocity=row[VELOCITY],
-        body_rate=row[BODY_RATE],
-        rotor_speed=row[ROTOR_SPEED],
-    )
 
 
 def _read_samplers(state: State, batch: Batch) -> list[Packet]:

@@ -250,9 +250,8 @@ def make_state(
         world_arrays,
         capacity=slot_count,
         history_length=_history_length(model, slot_count + worlds.slot_count),
+        on_host=on_host,
     )
-    if on_host:
-        trace.bring_to_host()
     state = State(
         world_count=count,
         on_host=on_host,

@@ -213,12 +213,15 @@ class Trace:
         worlds: The vehicles.
         capacity: Number of slots.
         history_length: How many boundaries are kept for cameras, at least as many as there are slots.
+        on_host: Slots are brought to the host, too: see `fetch`.
 
     Attributes:
         arrays: The slots on the device (`TraceArrays`).
     """
 
-    def __init__(self, surfaces: Any, worlds: Any, *, capacity: int, history_length: int) -> None:
+    def __init__(
+        self, surfaces: Any, worlds: Any, *, capacity: int, history_length: int, on_host: bool = True
+    ) -> None:
         world_count, rotor_count = worlds.vehicles.rotor_speed.shape
         self.device = worlds.clock_ns.device
         shape = (capacity, world_count)
@@ -232,8 +235,10 @@ class Trace:
         self._context = TraceContext()
         self._context.surfaces, self._context.worlds = surfaces, worlds
         self._context.rows = self.arrays
-        self._copies: list[HostCopy] = []
+        self._copies = [HostCopy(getattr(self.arrays, name)) for name in TraceRows._fields if on_host]
         self._rows_on_host = TraceArrays()
+        for name, copy in zip(TraceRows._fields, self._copies, strict=False):
+            setattr(self._rows_on_host, name, copy.mapped())
         self._record = self._recorded(_record)
         self._flight: RecordedLaunch | None = None
         self._poses: dict[int, RecordedLaunch] = defaultdict(lambda: self._recorded(_camera_poses))
@@ -312,14 +317,8 @@ class Trace:
             block_dim=BLOCK_DIM,
         )
 
-    def bring_to_host(self) -> None:
-        """Allocate the copies on the host that `fetch` writes to."""
-        for name in TraceRows._fields:
-            self._copies.append(HostCopy(getattr(self.arrays, name)))
-            setattr(self._rows_on_host, name, self._copies[-1].mapped())
-
     def fetch(self, first: int, count: int) -> None:
-        """Launch the copy of some slots to the host, after `bring_to_host`; one kernel copies all."""
+        """Launch the copy of some slots to the host; one kernel copies all."""
         if self.device.is_cuda and self._copies:
             wp.launch(
                 _copy_rows,

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, Rotors, make_wrench, vec10d
-from neurosim_core.vehicle.chart import rotation_series
+from neurosim_core.vehicle.chart import rotation_series, turned_back
 from neurosim_core.vehicle.ground import Ground, contact_wrench, lifted
-from neurosim_core.vehicle.wind import Wind, WindFunctions, make_wind_functions
+from neurosim_core.vehicle.wind import Wind, make_wind_at
 
 
 @wp.struct
@@ -92,7 +92,7 @@ class Equations(NamedTuple):
     sums_at: Any
     """(sums, t) -> the sums over the rotors, of Omega^2 and of Omega, at t [s] in the interval."""
     wind_at: Any
-    """See `WindFunctions.at`."""
+    """See `wind.make_wind_at`."""
 
 
 def make_equations(terms: frozenset[str]) -> Equations:
@@ -103,7 +103,7 @@ def make_equations(terms: frozenset[str]) -> Equations:
     ground_contact = "ground" in terms
     ground_effect = "ground_effect" in terms
     wrench = make_wrench(terms)
-    winds: WindFunctions = make_wind_functions(terms)
+    changing_wind = air_terms and not terms.isdisjoint(("gusts", "turbulence"))
 
     @wp.func
     def solve_inertia(airframe: Airframe, torque: wp.vec3d) -> wp.vec3d:
@@ -156,13 +156,10 @@ def make_equations(terms: frozenset[str]) -> Equations:
         velocity = velocity_0
         up = up_0
         if wp.static(air_terms):
-            turn = wp.cross(u, air_0)
-            air = air_0 - series[0] * turn + series[1] * wp.cross(u, turn)
+            air = turned_back(u, series, air_0)
         if wp.static(ground_contact):
-            swept = wp.cross(u, velocity_0)
-            velocity = velocity_0 - series[0] * swept + series[1] * wp.cross(u, swept)
-            tilt = wp.cross(u, up_0)
-            up = up_0 - series[0] * tilt + series[1] * wp.cross(u, tilt)
+            velocity = turned_back(u, series, velocity_0)
+            up = turned_back(u, series, up_0)
         force, spin = forces(airframe, ground, quadratic, linear, air, velocity, up, height, w)
         swing = wp.cross(u, force)
         force_0 = force + series[0] * swing + series[1] * wp.cross(u, swing)
@@ -189,8 +186,8 @@ def make_equations(terms: frozenset[str]) -> Equations:
     return Equations(
         motor_lag=motor_lag,
         air_terms=air_terms,
-        wind=air_terms and (winds.changes or "wind" in terms),
-        changing_wind=air_terms and winds.changes,
+        wind=changing_wind or (air_terms and "wind" in terms),
+        changing_wind=changing_wind,
         turbulence="turbulence" in terms,
         ground=ground_contact,
         ground_effect=ground_effect,
@@ -200,5 +197,5 @@ def make_equations(terms: frozenset[str]) -> Equations:
         rates=rates,
         lift=lift,
         sums_at=sums_at,
-        wind_at=winds.at,
+        wind_at=make_wind_at(terms),
     )
