@@ -139,6 +139,8 @@ class RenderGroupState:
     its stream is not there yet for another, whose stream does not wait for it."""
     rule: DisplacementRule | None
     """Chooses the ticks that are rendered; None: all are."""
+    only_launches: bool
+    """See `RendererConfig.only_launches`."""
     make_room: MakeRoom | None
     """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
 
@@ -278,6 +280,7 @@ def _make_group(
         instants=wp.array(np.arange(first.stamps.shape[0], dtype=np.int32), dtype=int, device=device),
         motions=plan.motions,
         rule=rule,
+        only_launches=model.config.renderer.only_launches,
         make_room=make_room,
     )
 

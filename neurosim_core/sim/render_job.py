@@ -97,7 +97,7 @@ class RenderJob(NamedTuple):
     group: RenderGroupState
     instants: Instants
     key: Hashable | None
-    """Same key, same launches; None: they do not come again."""
+    """Same key, same launches; None: they do not come again, or more than launches is done."""
     render: Callable[[], Any]
     """Launches the rendering and, unless that is done apart, the copy of the pictures; returns what must be
     kept for a graph of it."""
@@ -130,7 +130,7 @@ def plan_render(
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = tuple(slots), tuple(image_slots)
-    key: Hashable | None = (id(group), buffer_index, posed, placed)
+    key: Hashable | None = (id(group), buffer_index, posed, placed) if group.only_launches else None
     if group.world_count > 1:  # shared walks look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
     buffers, chosen = group.buffers[buffer_index], None
