@@ -92,9 +92,6 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
             extra,
         )
 
-    def close_extras(self, **_: Any) -> None:
-        """Nothing to close: memory is freed with the object."""
-
     def _arrays(self, observations: Observations) -> Arrays:
         """Return copies on the host."""
         return {

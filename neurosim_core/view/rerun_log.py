@@ -38,7 +38,6 @@ from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
 from neurosim_core.view.event_views import EventViews
 from neurosim_core.view.pictures import picture_of
-from neurosim_core.view.rerun_batches import RateLimit, Table
 from neurosim_core.view.rerun_layout import (
     PICTURES,
     Panel,
@@ -49,7 +48,7 @@ from neurosim_core.view.rerun_layout import (
     picture_panel,
     sensor_panels,
 )
-from neurosim_core.view.rerun_sdk import TIMELINE, RerunStream, import_rerun
+from neurosim_core.view.rerun_sdk import TIMELINE, RateLimit, RerunStream, Table, import_rerun
 from neurosim_core.view.rerun_shapes import (
     SceneShapes,
     body_entity,
@@ -152,7 +151,10 @@ class RerunLogger:
             recording.log(body(name), self._rr.TransformAxes3D(_AXES_M), static=True)
             for sensor in sensors:
                 self._log_description(name, sensor)
-        self._log_meshes()
+        if scene is not None:
+            self._bodies = scene.bodies
+            for entity, mesh in scene.meshes:
+                recording.log(entity, mesh, static=True)
         self._send_blueprint()
 
     def log(self, packet: Packet, *, vehicle: str | None = None) -> None:
@@ -245,12 +247,6 @@ class RerunLogger:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _log_meshes(self) -> None:
-        if self._scene is not None:
-            self._bodies = self._scene.bodies
-            for entity, mesh in self._scene.meshes:
-                self._recording.log(entity, mesh, static=True)
 
     def _show_sensor(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
         """Give the packets of a sensor their places in the layout, when the first comes."""

@@ -1,12 +1,16 @@
-"""Rerun itself: imported where it is used, and recordings that keep apart."""
+"""Rerun itself: imported where it is used, recordings that keep apart, and how often it is called."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from neurosim_core.install import need
 
@@ -15,6 +19,7 @@ TIMELINE = "sim_time"
 _QUIET = "warn,re_log_encoding::rrd::file_sink=error"
 """What Rerun says: no warning of files without a footer, which are meant."""
 _PIPE_BYTES = 1 << 20
+_BATCH_ROWS = 1024
 
 
 def import_rerun() -> Any:
@@ -105,3 +110,101 @@ def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool =
     if name:
         recording.send_recording_name(name)
     return RerunStream(recording, file)
+
+
+def check_new_file(path: Path) -> None:
+    """Check that a Rerun file of this name can be written without replacing anything."""
+    if path.is_dir():
+        raise OSError(f"cannot write {path}: it is a folder")
+    if path.suffix != ".rrd":
+        raise ValueError(f"a file of Rerun ends in .rrd, got {path}")
+    if not path.parent.is_dir():
+        raise OSError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.exists():
+        raise FileExistsError(f"{path} is there already: name another file")
+
+
+class RerunFiles:
+    """Recordings go to files: each to the next of NAME.rrd, NAME-2.rrd, ... that does not exist."""
+
+    compress = True
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        """Refuse at once what cannot be written."""
+        check_new_file(path)
+        self._say = say
+        numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
+        self._next = (other for other in itertools.chain([path], numbered) if not other.exists())
+        self._path = path
+
+    def open(self, name: str) -> RerunStream:
+        """Open the next file."""
+        self._path = next(self._next)
+        return open_rerun(self._path, name=name, footer=False)
+
+    def check(self) -> bool:
+        """Return True: files do not go away."""
+        return True
+
+    def close_recording(self, logger: Any) -> None:
+        """Close a file, and say so."""
+        logger.close()
+        self._say(f"wrote {self._path}")
+
+
+class RateLimit:
+    """Lets so many pass that their mean rate is as wanted, whatever rate they come at."""
+
+    def __init__(self, period_ns: int, *, burst_ns: int = 0) -> None:
+        """Let the first one pass.
+
+        `period_ns`: mean time between those that pass, at least [ns]. `burst_ns`: how far ahead of the mean
+        rate they may be, when they come at once [ns].
+        """
+        self._period_ns = period_ns
+        self._burst_ns = burst_ns
+        self._due_ns: dict[str, int] = {}
+
+    def passes(self, key: str, now_ns: int) -> bool:
+        """Return whether one of a kind may pass now."""
+        earliest_ns = now_ns - self._burst_ns
+        due_ns = self._due_ns.get(key, earliest_ns)
+        if now_ns < due_ns - self._period_ns:  # time has begun again
+            due_ns = now_ns
+        if now_ns < due_ns:
+            return False
+        self._due_ns[key] = max(due_ns + self._period_ns, earliest_ns)
+        return True
+
+
+class Table:
+    """Rows of one entity that are sent together."""
+
+    def __init__(self, entity: str, send: Callable[..., None], *, span_ns: int | None) -> None:
+        """Start empty.
+
+        `send`: called with the entity, the stamps [ns], and an array of rows for each column, by its name.
+        `span_ns`: longest simulated time that rows wait [ns]; None: until there are 1024, or `send`.
+        """
+        self._entity = entity
+        self._send = send
+        self._span_ns = span_ns
+        self._stamp_ns: list[int] = []
+        self._rows: list[dict[str, Any]] = []
+
+    def append(self, stamp_ns: int, **values: Any) -> None:
+        """Add a row: a value or an array for each column."""
+        if self._stamp_ns and stamp_ns < self._stamp_ns[-1]:  # after a reset
+            self.send()
+        self._stamp_ns.append(stamp_ns)
+        self._rows.append({name: np.array(value, np.float64).reshape(-1) for name, value in values.items()})
+        span_ns = stamp_ns - self._stamp_ns[0]
+        if len(self._rows) >= _BATCH_ROWS or (self._span_ns is not None and span_ns >= self._span_ns):
+            self.send()
+
+    def send(self) -> None:
+        """Send the rows that wait."""
+        if self._rows:
+            columns = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
+            self._send(self._entity, np.array(self._stamp_ns, dtype=np.int64), **columns)
+            self._stamp_ns, self._rows = [], []
