@@ -39,8 +39,6 @@ StepResult = tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[
 
 def find_task(name: str) -> Task:
     """Return a task by its name in the registry."""
-    import neurosim_core.learn.tasks  # noqa: F401  (registers)
-
     task: Task = find("task", name)()
     return task
 

@@ -52,7 +52,7 @@ class RenderJob:
     active: Any
     """0 where a world is not rendered, device array of int32, shape [world]; None: all are."""
     pattern: Hashable | None
-    """Same pattern, same launches; None: they do not come again."""
+    """Same pattern, same launches; None: they do not come again, or more than launches is done."""
     rooms: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
     """Memory of the caller's that pictures are copied to, by camera and stamp."""
 
@@ -163,7 +163,7 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = slots, tuple(image_slots)
-    pattern: Hashable | None = (id(group), buffer_index, posed, placed)
+    pattern: Hashable | None = (id(group), buffer_index, posed, placed) if group.only_launches else None
     if group.world_count > 1:  # frustum candidate lists look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
     buffers = group.buffers[buffer_index]

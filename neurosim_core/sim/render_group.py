@@ -141,6 +141,8 @@ class RenderGroupState:
     its stream is not there yet for another, whose stream does not wait for it."""
     rule: DisplacementRule | None
     """Chooses the ticks that are rendered; None: all are."""
+    only_launches: bool
+    """See `RendererConfig.only_launches`."""
     make_room: MakeRoom | None
     """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
 
@@ -226,6 +228,7 @@ def _make_group(
         instants=wp.array(np.arange(row_count, dtype=np.int32), dtype=int, device=device),
         motions=motions,
         rule=_make_rule(plan, scene, p_BC, q_BC, motions),
+        only_launches=model.config.renderer.only_launches,
         make_room=make_room,
     )
 

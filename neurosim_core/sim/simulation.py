@@ -448,7 +448,9 @@ def _one_vehicle(
 ) -> SimulationConfig:
     chosen = config if isinstance(config, SimulationConfig) else load_config(config)
     if len(chosen.vehicles) > 1:
-        raise ValueError(f"a world holds one vehicle, got {', '.join(chosen.vehicles)}")
+        raise ValueError(
+            f"a world holds one vehicle, got {', '.join(chosen.vehicles)}: `neurosim serve` flies several"
+        )
     chosen = chosen.of(next(iter(chosen.vehicles)))
     return chosen if device is None else chosen.model_copy(update={"device": device})
 

@@ -276,8 +276,7 @@ def make_state(
             if on_host
         },
         seeds=seeds,
-        overlaps=on_host
-        and (in_flight > 1 or make_room is not None or not _is_cuda(model) or bool(model.schedule.sparse)),
+        overlaps=on_host and (in_flight > 1 or make_room is not None or not _is_one_graph(model)),
         batch_done=[Fence(device) for _ in range(in_flight)],
         render_backlog=render_backlog,
         borrow_pictures=borrow_pictures,
@@ -303,8 +302,13 @@ def _in_flight(model: Model, asked: int | None, *, on_host: bool) -> int:
         return 1
     if asked is not None:
         return asked
-    overlap = on_host and _is_cuda(model) and model.config.renderer.kind != "pyrender"
+    overlap = on_host and _is_cuda(model) and model.config.renderer.only_launches
     return _IN_FLIGHT_ON_CUDA if overlap else 1
+
+
+def _is_one_graph(model: Model) -> bool:
+    """Return whether all launches of a batch can be one CUDA graph, if nothing else is in flight."""
+    return _is_cuda(model) and not model.schedule.sparse and model.config.renderer.only_launches
 
 
 def _is_cuda(model: Model) -> bool:
