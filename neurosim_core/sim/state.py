@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -25,12 +25,11 @@ from neurosim_core.sensors.base import (
     StateSensorConfig,
 )
 from neurosim_core.sensors.sampler_checks import make_sampler
-from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sim.inputs import CommandBuffer, Start, begin_of_paths, restart
 from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
-from neurosim_core.sim.reset import Start, begin_of_paths, restart
 from neurosim_core.sim.scene_table import single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
@@ -91,15 +90,6 @@ class Batch:
     """Renders after which something moves further by the next tick than it should between renders."""
 
 
-class PlannedStep(NamedTuple):
-    """A control period that was planned."""
-
-    batch: Batch
-    """The first of it."""
-    end_ns: int
-    """Where it ends [ns]."""
-
-
 @dataclass(kw_only=True, eq=False)
 class State:
     """What changes during a run."""
@@ -111,7 +101,7 @@ class State:
     worlds: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.WorldArrays`)."""
     start: Any
-    """Where vehicles begin, one row for each world (`integrate.Start`)."""
+    """Where vehicles begin, one row for each world (`inputs.Start`)."""
     path_controller: PathController | None
     """None: the path prescribes the motion."""
     trace: Trace
@@ -164,8 +154,8 @@ class State:
     command_mode: CommandMode | None = None
     """Mode of the setpoint that the next batch begins with."""
     in_flight: deque[Batch] = field(default_factory=deque)
-    planned: PlannedStep | None = None
-    """The next control period, if it was planned while the device was at work."""
+    planned: Batch | None = None
+    """The first of the next control period, if it was planned while the device was at work."""
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""
