@@ -20,7 +20,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
-    acquire_room,
+    acquire_picture_buffers,
     disable_frame_sensors,
     is_due,
     launch_cameras,
@@ -154,15 +154,15 @@ def prepare_step(model: Model, state: State) -> None:
     plan_ahead(model, state, state.planned)
 
 
-def acquire_rooms(state: State) -> None:
-    """Ask for room for the pictures of a control period that was prepared: `begin_step` is sooner then."""
+def acquire_next_picture_buffers(state: State) -> None:
+    """Ask for buffers for the pictures of a control period that was prepared: `begin_step` is sooner then."""
     if state.planned is not None:
         for job in state.planned.jobs or ():
-            acquire_room(job)
+            acquire_picture_buffers(job)
 
 
 def settle(state: State) -> None:
-    """Wait until the device has written all pictures that were handed out (`make_state`, `make_room`)."""
+    """Wait until the device has written all pictures that were handed out (see `allocate_picture`)."""
     for done in state.batch_done:
         done.wait()
 
