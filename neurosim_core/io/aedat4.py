@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,9 @@ class Aedat4Sink:
         stream = {"compression": "LZ4", "originalOutputName": "events", "typeIdentifier": "EVTS"}
         attributes = {name: attribute("string", value) for name, value in stream.items()}
         tree = [node("outInfo", place, {}, [node("0", f"{place}0/", attributes, [info])])]
-        self._encoder: Any = faery.aedat.Encoder(path, tree, faery.aedat.LZ4_DEFAULT)
-        self._encoder.__enter__()
+        with _disk_errors():
+            self._encoder: Any = faery.aedat.Encoder(path, tree, faery.aedat.LZ4_DEFAULT)
+            self._encoder.__enter__()
 
     def write(self, events: EventArrays) -> None:
         """See `EventSink.write`."""
@@ -101,13 +103,24 @@ class Aedat4Sink:
             records = np.empty(len(block.t), self._dtype)
             for name, column in zip(records.dtype.names or (), block, strict=True):
                 records[name] = column
-            self._encoder.write(0, records)
+            with _disk_errors():
+                self._encoder.write(0, records)
 
     def close(self) -> None:
         """Complete the file. Closing twice is allowed."""
         if self._encoder is not None:
             encoder, self._encoder = self._encoder, None
-            encoder.__exit__(None, None, None)
+            with _disk_errors():
+                encoder.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Turn what faery raises on a full disk into an OSError."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(str(error)) from None
 
 
 def _whole(path: Path, blocks: Iterator[Any]) -> Iterator[Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, join_events
+from neurosim_core.record.disk import naming_file
 
 BLOCK_EVENTS = 1_000_000
 """Events that are read, and held in memory, at a time."""
@@ -168,8 +169,10 @@ class EventWriter:
     """
 
     def __init__(self, path: Path, sink: EventSink, *, width: int, height: int) -> None:
-        self._sink, self._checker = sink, BlockChecker(path, width=width, height=height)
-        self.write_packet: Callable[[Packet], None] | None = getattr(sink, "write_packet", None)
+        self._path, self._sink = path, sink
+        self._checker = BlockChecker(path, width=width, height=height)
+        keep: Callable[[Packet], None] | None = getattr(sink, "write_packet", None)
+        self.write_packet = None if keep is None else naming_file(path)(keep)
 
     def write(self, events: EventArrays) -> None:
         """Append events, sorted by time.
@@ -180,11 +183,13 @@ class EventWriter:
         """
         checked = self._checker.check(events)
         if len(checked.t):
-            self._sink.write(checked)
+            with naming_file(self._path):
+                self._sink.write(checked)
 
     def close(self) -> None:
         """Complete the file. Closing twice is allowed."""
-        self._sink.close()
+        with naming_file(self._path):
+            self._sink.close()
 
 
 class BlockChecker:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from neurosim_core.io.event_file import UNITS_US, EventFileError, EventReader, EventWriter
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+from neurosim_core.record.disk import naming_file
 from neurosim_core.record.hdf5 import FORMAT
 
 
@@ -171,7 +172,8 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     known = FORMATS[name]
     if not known.sink:
         raise EventFileError(f"{path}: {name} is only read; write .h5")
-    sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
+    with naming_file(path):
+        sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
     return EventWriter(path, sink, width=width, height=height)
 
 

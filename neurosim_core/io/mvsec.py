@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, NoEventsError, events_of
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
+from neurosim_core.record.disk import Disk
 from neurosim_core.record.hdf5 import import_h5py
 
 _GROUP = "davis/left"
@@ -111,11 +112,8 @@ class MvsecSink:
     """Writes a file of MVSEC: of each kind of packets those of the first sensor that sends them."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        self._path = path
-        try:
-            self._file: Any = import_h5py().File(path, "w")
-        except OSError as error:
-            raise OSError(f"cannot write {path}: {error}") from error
+        self._disk = Disk(path)  # on a full disk HDF5's own file would end the process
+        self._file: Any = import_h5py().File(self._disk, "w")
         self._group = self._file.create_group(_GROUP)
         self._sensors: dict[str, str] = {}
         self._append("events", np.zeros((0, 4)))
@@ -138,9 +136,15 @@ class MvsecSink:
 
     def close(self) -> None:
         """Complete the file. Closing twice is allowed."""
-        if self._file and "image_raw_ts" in self._group:
+        if not self._file:
+            return
+        if "image_raw_ts" in self._group:
             self._append("image_raw_event_inds", self._last_events(self._group["image_raw_ts"][:]))
         self._file.close()
+        try:
+            self._disk.seal()
+        finally:
+            self._disk.close()
 
     def _last_events(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the number of the last event before each of some times; -1 if there is none."""
@@ -166,6 +170,7 @@ class MvsecSink:
         array.resize(len(array) + len(rows), axis=0)
         if len(rows):
             array[-len(rows) :] = rows
+        self._disk.seal()
 
 
 def _row(packet: Packet) -> tuple[str, NDArray[Any] | None]:

@@ -7,6 +7,7 @@ wanted.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -96,11 +97,9 @@ class BagSink:
 
     def __init__(self, path: Path, *, width: int, height: int, storage: str = "mcap") -> None:
         bags = _bridge()
-        self._errors = bags.ConvertError, bags.BackendError
-        try:
+        self._bags = bags
+        with self._errors():
             self._bag = bags.BagWriter(path, storage=storage)
-        except bags.BackendError as error:
-            raise OSError(str(error)) from None
         self._packets = PacketCutter(self.write_packet, width=width, height=height, sensor=_EVENTS)
         self._closed = False
 
@@ -118,10 +117,8 @@ class BagSink:
             message = to_message(packet, frame_id=body if is_body else f"{_VEHICLE}/{packet.sensor}")
         except TypeError:  # no message can carry it
             return
-        try:
+        with self._errors():
             self._bag.write(f"/{_VEHICLE}/{packet.sensor}", message, frame_id=f"{_VEHICLE}/{packet.sensor}")
-        except self._errors as error:
-            raise EventFileError(str(error)) from None
 
     def close(self) -> None:
         """Complete the bag. Closing twice is allowed."""
@@ -129,7 +126,18 @@ class BagSink:
             return
         self._closed = True
         self._packets.end()
-        self._bag.close()
+        with self._errors():
+            self._bag.close()
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turn the errors of the bridge into those of a sink."""
+        try:
+            yield
+        except self._bags.ConvertError as error:
+            raise EventFileError(str(error)) from None
+        except self._bags.BackendError as error:
+            raise OSError(str(error)) from None
 
 
 def _bridge() -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neurosim_core.install import need
+from neurosim_core.record.disk import naming_file
 
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
@@ -66,7 +67,8 @@ class _FileWriter:
 
     def check(self) -> None:
         if self._error is not None:
-            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
+            with naming_file(self._path):
+                raise self._error
 
     def join(self) -> None:
         self._thread.join()
