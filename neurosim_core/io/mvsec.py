@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, NoEventsError, events_of
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, EventSource, NoEventsError, events_of
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.disk import Disk
@@ -29,12 +29,11 @@ _ROWS = {"depth": "depth_image_raw", "pose": "pose", "image": "image_raw", "imu"
 """Name of each sensor and of its array; `ARRAY_ts` has its times."""
 
 
-class MvsecSource:
+class MvsecSource(EventSource):
     """Reads a file of MVSEC."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.notes: list[str] = []
+        super().__init__(path)
         truth = path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
         self._files = [open_hdf5(path)]
         try:
@@ -135,9 +134,7 @@ class MvsecSink:
         self._append(f"{_ROWS[name]}_ts", np.array([packet.stamp_ns * 1e-9]))
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if not self._file:
-            return
+        """Complete the file."""
         if "image_raw_ts" in self._group:
             self._append("image_raw_event_inds", self._last_events(self._group["image_raw_ts"][:]))
         self._file.close()

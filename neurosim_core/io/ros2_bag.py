@@ -30,13 +30,13 @@ def open_mcap(path: Path, *, sensor: str = "") -> EventSource:
     return BagSource(path, sensor=sensor) if is_bag else LogSource(path, sensor=sensor)
 
 
-class BagSource:
+class BagSource(EventSource):
     """Reads a bag: events of one camera, and pictures, inertial measurements and odometry."""
 
     def __init__(self, path: Path, *, sensor: str = "") -> None:
+        super().__init__(path)
         bags = _bridge()
-        self._path, self._error = path, bags.BagError
-        self.notes: list[str] = []
+        self._error = bags.BagError
         try:
             self._bag = bags.BagReader(path)
         except bags.BagError as error:
@@ -44,7 +44,7 @@ class BagSource:
         try:
             self._choose(sensor, bags.EVENT_TYPES)
             found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
-            self.size: tuple[int, int] | None = next(found, (1, 1))
+            self.size = next(found, (1, 1))
         except BaseException:
             self._bag.close()
             raise
@@ -101,7 +101,6 @@ class BagSink:
         with self._errors():
             self._bag = bags.BagWriter(path, storage=storage)
         self._packets = PacketCutter(self.write_packet, width=width, height=height, sensor=_EVENTS)
-        self._closed = False
 
     def write(self, events: EventArrays) -> None:
         """See `EventSink.write`."""
@@ -121,10 +120,7 @@ class BagSink:
             self._bag.write(f"/{_VEHICLE}/{packet.sensor}", message, frame_id=f"{_VEHICLE}/{packet.sensor}")
 
     def close(self) -> None:
-        """Complete the bag. Closing twice is allowed."""
-        if self._closed:
-            return
-        self._closed = True
+        """Complete the bag."""
         self._packets.end()
         with self._errors():
             self._bag.close()
