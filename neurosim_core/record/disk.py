@@ -16,7 +16,7 @@ def naming_file(path: str | Path) -> Iterator[None]:
     except OSError as error:
         if str(path) in str(error.strerror or error):
             raise
-        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
+        raise type(error)(f"cannot write {path}: {error.strerror or error}") from error
 
 
 class Disk:
