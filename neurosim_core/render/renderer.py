@@ -86,6 +86,9 @@ class RendererConfig(Settings):
 
     scene_type: ClassVar[type]
     """Class of what `upload` returns."""
+    only_launches: ClassVar[bool] = False
+    """Whether `Renderer.render` only launches work on the device, and waits for nothing. Otherwise no CUDA
+    graph records it, and one batch is rendered after the other."""
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Prepare a scene, for all cameras; see `upload_scene`."""
@@ -113,6 +116,7 @@ class WarpRendererConfig(RendererConfig):
 
     kind: Literal["warp"] = "warp"
     scene_type = SceneArrays
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Bring a scene to a device."""
@@ -151,6 +155,7 @@ class SyntheticRendererConfig(RendererConfig):
 
     kind: Literal["synthetic"] = "synthetic"
     scene_type = SyntheticScene
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Return what all test cards of a run share."""

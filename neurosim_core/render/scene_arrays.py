@@ -25,6 +25,7 @@ from neurosim_core.scene.bodies import Body
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import unique_name
+from neurosim_core.scene.triangles import corner_columns, double_areas
 
 _logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -275,9 +276,7 @@ def _upload_wholes(
 
 def areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:
     """Return the area of each face [m^2], shape [F]."""
-    tips = mesh.vertices.take(mesh.faces, axis=0).astype(np.float64)
-    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-    return 0.5 * np.asarray(np.linalg.norm(normal, axis=1))
+    return 0.5 * double_areas(corner_columns(mesh.vertices.astype(np.float64), mesh.faces))
 
 
 def _texel_density(

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.scene.components import connected_components
-from neurosim_core.scene.normals import edge_keys
+from neurosim_core.scene.normals import edge_keys, weld
+from neurosim_core.scene.triangles import corner_columns, dot, face_vectors
 
 if TYPE_CHECKING:
     from neurosim_core.scene.scene import Scene
@@ -25,16 +26,9 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         The face beyond the edge opposite each corner, -1: none, shape [3 F]. The surface of each face, shape
         [F]: a surface is plane, has one material, and its texture coordinates are continuous.
     """
-    material, vertices = scene.face_material, np.ascontiguousarray(scene.vertices, dtype=np.float32)
-    mesh = scene
+    mesh, material = scene, scene.face_material
     count = len(mesh.faces)
-    tips = mesh.vertices.take(mesh.faces, axis=0)
-    bits = (vertices + np.float32(0.0)).view(np.int32).astype(np.int64)  # + 0 makes -0 equal to 0
-    plan, up = bits[:, 0] << 32 | (bits[:, 1] & 0xFFFFFFFF), bits[:, 2]
-    order = np.lexsort((up, plan))
-    place = np.zeros(len(vertices), dtype=np.int64)
-    place[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(up[order]) != 0))
-    corner = place.take(mesh.faces)
+    corner = weld(mesh.vertices).take(mesh.faces)
     first, last = np.roll(corner, -1, axis=1).reshape(-1), np.roll(corner, 1, axis=1).reshape(-1)
     key = edge_keys(first, last)
     order = np.argsort(key, kind="stable")
@@ -43,8 +37,8 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     neighbor = np.full(3 * count, -1, dtype=np.int32)
     neighbor[other], neighbor[one] = one // 3, other // 3
 
-    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    normal = face_vectors(corner_columns(mesh.vertices, mesh.faces)).astype(np.float64)
+    normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-30)
     uv = mesh.uv.take(mesh.faces, axis=0)  # of the ends of each edge, the one of the lower number first:
     ends = np.roll(uv, -1, axis=1).reshape(-1, 2), np.roll(uv, 1, axis=1).reshape(-1, 2)
     turned = (first > last)[:, None]
@@ -52,7 +46,7 @@ def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     for end in (np.where(turned, *ends[::-1]), np.where(turned, *ends)):
         u, v = (end.take(one, axis=0) == end.take(other, axis=0)).T
         joined &= u & v
-    sides = (normal.take(edges // 3, axis=0) for edges in (one, other))
-    joined &= np.einsum("ec,ec->e", *sides) > _PLANE_COSINE
+    sides = (normal.take(edges // 3, axis=1) for edges in (one, other))
+    joined &= dot(*sides) > _PLANE_COSINE
     _, surface = connected_components(count, one[joined] // 3, other[joined] // 3)
     return neighbor, surface.astype(np.int32)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.scene.components import connected_components
+from neurosim_core.scene.triangles import cross, dot
 
+_BLOCK = 8192
+"""Faces at a time: what is computed of them stays in the cache of a core."""
 CREASE_RAD = 0.7
 """Edges whose faces differ by more than this stay sharp [rad]; 40 degrees."""
 
@@ -14,6 +19,17 @@ CREASE_RAD = 0.7
 def edge_keys(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return a number for each edge, whichever end is named first, of the numbers of its ends, below 2^31."""
     return np.minimum(one, other) << 32 | np.maximum(one, other)
+
+
+def weld(positions: NDArray[Any], group: NDArray[np.int64] | int = 0) -> NDArray[np.int64]:
+    """Return a number for each place [V, 3], to float32, and group of vertices, shape [V]."""
+    bits = (positions + np.float32(0.0)).astype(np.float32).view(np.int32).astype(np.int64)  # + 0: no -0
+    x, y, z = bits.T
+    plan, rest = x << 32 | (y & 0xFFFFFFFF), z << 31 | group
+    order = np.lexsort((rest, plan))
+    point = np.zeros(len(positions), dtype=np.int64)
+    point[order[1:]] = np.cumsum((np.diff(plan[order]) != 0) | (np.diff(rest[order]) != 0))
+    return point
 
 
 def smooth_normals(
@@ -32,42 +48,35 @@ def smooth_normals(
     """
     if len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    keys = np.empty((4, len(positions)), dtype=np.int64)
-    keys[:3] = np.ascontiguousarray(positions.T + 0.0).view(np.int64)  # + 0.0 makes -0.0 equal to 0.0
-    keys[3] = group
-    order = np.lexsort(keys)
-    new = np.ones(len(positions), dtype=np.int64)
-    new[1:] = (np.diff(keys[:, order], axis=1) != 0).any(axis=0)
-    point = np.empty(len(positions), dtype=np.int64)
-    point[order] = np.cumsum(new) - 1
-
-    corner = positions.take(faces, axis=0)
-    edge = np.roll(corner, -1, axis=1) - corner
-    face_normal = np.cross(edge[:, 0], edge[:, 1])
-    face_normal /= np.linalg.norm(face_normal, axis=1, keepdims=True)
-    direction = edge / np.linalg.norm(edge, axis=2, keepdims=True)
-    cosine = -np.einsum("fcx,fcx->fc", direction, np.roll(direction, 1, axis=1))
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    point = weld(positions, group)
+    face_normal, angle = np.empty((2, 3, len(faces)))
+    columns = np.ascontiguousarray(positions.T)
+    for begin in range(0, len(faces), _BLOCK):
+        block = slice(begin, begin + _BLOCK)
+        corner = columns.take(faces[block].T, axis=1)
+        edge = np.roll(corner, -1, axis=1) - corner
+        normal = cross(edge[:, 0], edge[:, 1])
+        face_normal[:, block] = normal / np.sqrt(dot(normal, normal))
+        direction = edge / np.sqrt(dot(edge, edge))
+        angle[:, block] = np.arccos(np.clip(-dot(direction, np.roll(direction, 1, axis=1)), -1.0, 1.0))
 
     # half-edges c -> c + 1 of each face; the two of one edge become neighbours when sorted by their ends
-    tail = np.arange(faces.size)
-    head = tail + 1 - 3 * (tail % 3 == 2)
+    head = np.arange(1, faces.size + 1)
+    head[2::3] -= 3
     at = point.take(faces).reshape(-1)
     edge_key = edge_keys(at, at[head])
     sorted_edges = np.argsort(edge_key, kind="stable")
-    first, second = sorted_edges[:-1], sorted_edges[1:]
-    gentle = edge_key[first] == edge_key[second]
-    sides = (face_normal.take(corners // 3, axis=0) for corners in (first, second))
-    gentle &= np.einsum("ex,ex->e", *sides) > np.cos(CREASE_RAD)
+    ordered = edge_key.take(sorted_edges)
+    shared = np.flatnonzero(ordered[1:] == ordered[:-1])
+    first, second = sorted_edges.take(shared), sorted_edges.take(shared + 1)
+    one, other = (face_normal.take(corners // 3, axis=1) for corners in (first, second))
+    gentle = dot(one, other) > np.cos(CREASE_RAD)
     first, second = first[gentle], second[gentle]
     same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
     joined_a = np.concatenate([first, head[first]])
     joined_b = np.concatenate([np.where(same, second, head[second]), np.where(same, head[second], second)])
     count, label = connected_components(faces.size, joined_a, joined_b)
-    weighted = (angle[:, :, None] * face_normal[:, None, :]).reshape(-1, 3)
-    total = np.empty((count, 3))
-    for axis in range(3):
-        total[:, axis] = np.bincount(label, weights=weighted[:, axis], minlength=count)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    total /= np.where(length > 0.0, length, 1.0)
-    return total, label.reshape(-1, 3)
+    weights = ((angle * axis).T.reshape(-1) for axis in face_normal)
+    total = np.stack([np.bincount(label, weights=weight, minlength=count) for weight in weights])
+    length = np.sqrt(dot(total, total))
+    return (total / np.where(length > 0.0, length, 1.0)).T, label.reshape(-1, 3)
