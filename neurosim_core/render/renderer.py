@@ -92,6 +92,9 @@ class RendererConfig(Settings):
     """Makes a renderer for one lens. It takes what `upload` returned, the lens, and by name `outputs`,
     `instant_count`, `image_count`, `worlds` and `times` of `make_renderer`, and raises a ValueError where it
     cannot do what is asked for."""
+    only_launches: ClassVar[bool] = False
+    """Whether `Renderer.render` only launches work on the device, and waits for nothing. Otherwise no CUDA
+    graph records it, and one batch is rendered after the other."""
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Prepare a scene, for all cameras; see `upload_scene`."""
@@ -105,6 +108,7 @@ class WarpRendererConfig(RendererConfig):
     kind: Literal["warp"] = "warp"
     scene_type = SceneArrays
     make = WarpRenderer
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Bring a scene to a device."""
@@ -131,6 +135,7 @@ class SyntheticRendererConfig(RendererConfig):
     kind: Literal["synthetic"] = "synthetic"
     scene_type = SyntheticScene
     make = SyntheticRenderer
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Return what all test cards of a run share."""
