@@ -17,7 +17,7 @@ from neurosim_core.render import launch, warp_renderer
 from neurosim_core.sensors import event_worlds
 from neurosim_core.sim import Simulation, StartState
 from neurosim_core.sim import simulation as worlds_module
-from neurosim_core.vehicle.status import STATUS_TERMS
+from neurosim_core.vehicle.arrays import STATUS_TERMS
 
 
 @pytest.fixture(scope="module")
