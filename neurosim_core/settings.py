@@ -11,6 +11,7 @@ from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_
 
 from neurosim_core.docstrings import field_docs
 from neurosim_core.registry import find, kinds
+from neurosim_core.settings_file import merge
 
 
 class Settings(BaseModel):
@@ -100,11 +101,5 @@ def fill_from_preset(given: Any, presets: Mapping[str, Mapping[str, Any]]) -> An
     name = given["preset"]
     if name not in presets:
         raise ValueError(f"unknown preset {name!r}, known: {', '.join(presets)}")
-    filled = dict(presets[name])
-    for key, value in given.items():
-        old = filled.get(key)
-        filled[key] = value
-        if isinstance(old, Mapping) and isinstance(value, Mapping):
-            same = value.get("kind", old.get("kind")) == old.get("kind")
-            filled[key] = {**old, **value} if same else value
-    return filled
+    kind = {"kind": given["kind"]} if "kind" in given else {}
+    return merge({**presets[name], **kind}, given)
