@@ -244,7 +244,7 @@ def _model(config: ImuConfig, *, gravity_m_s2: float, name: str) -> Any:
     share = math.sqrt(math.log(ratio) / math.pi)
     model = _Model()
     model.position = wp.vec3d(*config.mount.position_m)
-    model.q_SB = wp.quatd(*config.mount.rotation().inv().as_quat())
+    model.q_SB = wp.quat_inverse(wp.quatd(*config.mount.quaternion()))
     model.gravity = gravity_m_s2
     model.white = six(config.accelerometer_noise_density, config.gyroscope_noise_density, math.sqrt(rate_hz))
     model.walk = six(config.accelerometer_random_walk, config.gyroscope_random_walk, 1.0 / math.sqrt(rate_hz))
