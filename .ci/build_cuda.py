@@ -22,11 +22,10 @@ import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, Controller, mode_kernel
 from neurosim_core.render.antialias import antialiasing_kernels
-from neurosim_core.render.candidate_data import BLOCK
-from neurosim_core.render.frustum_search import frustum_search_kernel
+from neurosim_core.render.candidate_lists import frustum_search_kernel
+from neurosim_core.render.kernel_data import BLOCK, RenderTerms
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
-from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement_kernels import rule_kernels
 from neurosim_core.sensors.event_kernels import make_noisy_scan
 from neurosim_core.sensors.event_noise_model import TERMS

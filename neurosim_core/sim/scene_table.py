@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.render.config import CandidateListConfig
-from neurosim_core.render.render_terms import RenderTerms
+from neurosim_core.render.kernel_data import RenderTerms, SceneData
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.freespace import DistanceField
 from neurosim_core.sim.model import Model, find_device, make_model, refit
 
