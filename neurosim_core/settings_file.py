@@ -1,4 +1,4 @@
-"""Settings files as they are written: YAML, and keys that win over those of a file. Nothing is checked."""
+"""YAML files as they are written: tables, and settings with keys that win over them. Nothing is checked."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # PyYAML may be built without libyaml
 
 
 class ConfigError(ValueError):
@@ -45,6 +47,13 @@ def read_file(path: Path) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise ConfigError(f"{path} must hold a mapping of keys to values, got a {type(raw).__name__}")
     return raw
+
+
+@functools.cache
+def read_table(module_file: str, name: str) -> dict[str, Any]:
+    """Return the table `name`.yaml beside a module, whose `__file__` is given."""
+    table: dict[str, Any] = yaml.load(Path(module_file).with_name(f"{name}.yaml").read_bytes(), _LOADER)
+    return table
 
 
 def nest(key: str, value: Any) -> dict[str, Any]:
@@ -86,10 +95,7 @@ def beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
             group = group.get(key) if isinstance(group, Mapping) else None
         file = group.get("file") if isinstance(group, Mapping) else None
         if isinstance(file, str) and not Path(file).expanduser().is_absolute():
-            patch: dict[str, Any] = {"file": str(folder / file)}
-            for key in reversed(place):
-                patch = {key: patch}
-            raw = merge(raw, patch)
+            raw = merge(raw, nest(".".join((*place, "file")), str(folder / file)))
     return raw
 
 
@@ -100,11 +106,8 @@ def unchecked_settings(source: Path | None, overrides: Mapping[str, Any]) -> dic
         ConfigError: The file cannot be read, or is not YAML.
     """
     raw = {} if source is None else read_file(source)
-    for key, value in overrides.items():
-        raw = merge(raw, nest(key, value))
-    if source is not None:
-        raw = beside(raw, source.resolve().parent)
-    return raw
+    raw = functools.reduce(merge, (nest(key, value) for key, value in overrides.items()), raw)
+    return raw if source is None else beside(raw, source.resolve().parent)
 
 
 def _in_one_line(error: yaml.YAMLError) -> str:

@@ -24,7 +24,8 @@ from pydantic import Field
 from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.render.renderer import Renderer, RendererConfig, refuse_worlds
+from neurosim_core.render.ray_times import refuse_several
+from neurosim_core.render.renderer import Renderer, RendererConfig
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.srgb import linear_to_srgb8, srgb_to_linear
@@ -236,7 +237,7 @@ class RemoteRendererConfig(RendererConfig):
     @staticmethod
     def make(scene: RemoteScene, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
         """Return a renderer for one lens."""
-        refuse_worlds("remote", shape)
+        refuse_several("remote", shape)
         if not isinstance(lens, PinholeConfig):
             kind = getattr(lens, "kind", type(lens).__name__)
             raise ValueError(f"the renderer 'remote' renders pinholes, not a lens of kind {kind}")

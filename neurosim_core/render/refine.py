@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from neurosim_core.scene.scene import RefinedMesh, Scene
 from neurosim_core.scene.triangles import corner_columns, dot
 
-__all__ = ["RefinedMesh", "refine", "refine_within"]
-
 log = logging.getLogger(__name__)
 
 ADDED_COUNT_MAX = 4_000_000

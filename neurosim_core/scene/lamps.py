@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.components import connected_components
 from neurosim_core.scene.scene import Light, LinearRgb, extent
 from neurosim_core.scene.source import SceneError, Source, rgb
+from neurosim_core.scene.topology import connected_components
 from neurosim_core.scene.triangles import dot, double_areas
 
 LEVEL = 0.3

@@ -16,7 +16,6 @@ from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import lights_of
-from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
 from neurosim_core.scene.source import (
     Axis,
@@ -26,6 +25,7 @@ from neurosim_core.scene.source import (
     rgb,
 )
 from neurosim_core.scene.srgb import linear_to_srgb8
+from neurosim_core.scene.topology import smooth_normals
 from neurosim_core.scene.triangles import corner_columns, cross, dot, face_vectors
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.connections import connect_faces
 from neurosim_core.scene.texels import packed_levels
-from neurosim_core.scene.triangles import corner_columns, dot, face_vectors
+from neurosim_core.scene.topology import connect_faces
+from neurosim_core.scene.triangles import corner_columns, dot, double_areas, face_vectors
 
 LinearRgb = tuple[float, float, float]
 """Linear-light red, green, blue (Rec. 709 primaries)."""
@@ -106,6 +106,11 @@ class RefinedMesh:
     """Vertex indices, shape [F, 3]."""
     origin: NDArray[np.int32]
     """Face of the scene that each face is a part of, shape [F]."""
+
+    @cached_property
+    def areas_m2(self) -> NDArray[np.float64]:
+        """Area of each face [m^2], shape [F]."""
+        return 0.5 * double_areas(corner_columns(self.vertices.astype(np.float64), self.faces))
 
     @cached_property
     def corner_normals(self) -> NDArray[np.float32]:

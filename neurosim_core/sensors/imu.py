@@ -30,7 +30,7 @@ from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
 from neurosim_core.sensors.state_sampler import NonNegative, Sampling, StateSampler
 from neurosim_core.settings import fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...

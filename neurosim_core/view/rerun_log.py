@@ -106,7 +106,7 @@ class RerunLogger:
         """Log what does not change, and the layout of the viewer.
 
         Args:
-            stream: Where to log: `open_rerun`.
+            stream: Where to log.
             vehicles: Descriptions of the sensors of each vehicle; packets of other sensors are shown without
                 frustum.
             scene: The scene to show.
@@ -408,7 +408,9 @@ class RerunLogger:
                 rate_m_s = 1e3 * len(events.t) / length_ns
                 self._plot(f"plots/{vehicle}/{packet.sensor}/rate", end_ns, rate_m_s, ("events",))
                 if not self._live:
-                    self._recording.log(cloud_entity(vehicle, packet.sensor), views.points(events, end_ns))
+                    points, colors = views.points(events, end_ns)
+                    cloud = self._rr.Points3D(points, colors=colors)
+                    self._recording.log(cloud_entity(vehicle, packet.sensor), cloud)
 
     def _log_contact(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         self._set_time(packet.stamp_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import sys
@@ -35,81 +36,66 @@ def import_rerun() -> Any:
 
 
 class RerunStream:
-    """A recording of Rerun's, and the file that it goes to if it goes to one.
+    """A recording of Rerun's, independent of others in this process, and the file that it goes to, if any.
+
+    A thread writes to the file what Rerun writes into a pipe: on a full disk Rerun's own writing hangs.
 
     Attributes:
         recording: Where to log.
     """
 
-    def __init__(self, recording: Any, file: _FileWriter | None = None) -> None:
-        self.recording = recording
-        self._file = file
+    def __init__(self, path: str | Path | None = None, *, name: str = "", footer: bool = True) -> None:
+        """Open it.
+
+        `path`: write it to this .rrd file; None: the caller connects it (`connect_grpc`, ...). `name`: what
+        the viewer calls it; empty: by the time of its beginning. `footer`: end the file with a table of its
+        chunks, which makes it quick to open. It is collected in memory, so what may go on for hours does
+        without.
+        """
+        self.recording = import_rerun().RecordingStream("neurosim")
+        self.recording.set_log_time_enabled(False)  # wall-clock time has no place in a simulation's recording
+        self.recording.set_log_tick_enabled(False)
+        self._path = path
+        self._error: OSError | None = None
+        self._writer: threading.Thread | None = None
+        if path is not None:
+            try:
+                self._open_file(path, footer)
+            except (OSError, RuntimeError) as error:
+                raise OSError(f"cannot write {path}: {error}") from error
+        if name:
+            self.recording.send_recording_name(name)
 
     def check(self) -> None:
         """See whether all that has left so far could be written; wait for nothing."""
-        if self._file is not None:
-            self._file.check()
+        if self._error is not None:
+            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
 
     def close(self) -> None:
         """Disconnect from the file or viewer."""
         self.recording.disconnect()
-        if self._file is not None:
-            self._file.join()
+        if self._writer is not None:
+            self._writer.join()
             self.check()
 
+    def _open_file(self, path: str | Path, footer: bool) -> None:
+        file = open(path, "wb", buffering=0)  # noqa: SIM115 (closed by the thread)
+        read_end, write_end = os.pipe()
+        self._writer = threading.Thread(target=self._write, args=(file, read_end), daemon=True)
+        self._writer.start()
+        try:
+            self.recording.save(f"/dev/fd/{write_end}", write_footer=footer)
+        finally:
+            os.close(write_end)  # Rerun has its own; the pipe ends when that is closed
 
-class _FileWriter:
-    """Writes to a file what Rerun writes into a pipe: on a full disk Rerun's own writing hangs."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._error: OSError | None = None
-        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 (closed by the thread)
-        self._read_end, self.write_end = os.pipe()
-        self._thread = threading.Thread(target=self._run, name="Rerun file", daemon=True)
-        self._thread.start()
-
-    def check(self) -> None:
-        if self._error is not None:
-            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
-
-    def join(self) -> None:
-        self._thread.join()
-
-    def _run(self) -> None:
-        with self._file, open(self._read_end, "rb", buffering=0) as pipe:
+    def _write(self, file: io.FileIO, read_end: int) -> None:
+        with file, open(read_end, "rb", buffering=0) as pipe:
             while data := pipe.read(_PIPE_BYTES):
                 while data and self._error is None:  # after an error, what comes is let go
                     try:
-                        data = data[self._file.write(data) :]
+                        data = data[file.write(data) :]
                     except OSError as error:
                         self._error = error
-
-
-def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool = True) -> RerunStream:
-    """Open a recording of its own, independent of others in this process.
-
-    `path`: write it to this .rrd file; None: the caller connects it (`connect_grpc`, ...). `name`: what the
-    viewer calls it; empty: by the time of its beginning. `footer`: end the file with a table of its chunks,
-    which makes it quick to open. It is collected in memory, so what may go on for hours does without.
-    """
-    rr = import_rerun()
-    recording = rr.RecordingStream("neurosim")
-    recording.set_log_time_enabled(False)  # wall-clock time has no place in a simulation's recording
-    recording.set_log_tick_enabled(False)
-    file = None
-    if path is not None:
-        try:
-            file = _FileWriter(Path(path))
-            recording.save(f"/dev/fd/{file.write_end}", write_footer=footer)
-        except (OSError, RuntimeError) as error:
-            raise OSError(f"cannot write {path}: {error}") from error
-        finally:
-            if file is not None:
-                os.close(file.write_end)  # Rerun has its own; the pipe ends when that is closed
-    if name:
-        recording.send_recording_name(name)
-    return RerunStream(recording, file)
 
 
 def check_new_file(path: Path) -> None:
@@ -140,7 +126,7 @@ class RerunFiles:
     def open(self, name: str) -> RerunStream:
         """Open the next file."""
         self._path = next(self._next)
-        return open_rerun(self._path, name=name, footer=False)
+        return RerunStream(self._path, name=name, footer=False)
 
     def check(self) -> bool:
         """Return True: files do not go away."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import Packet
 from neurosim_core.scene.bodies import Body, BodyConfig
-from neurosim_core.scene.body_shapes import Solid
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.srgb import linear_to_srgb8
 from neurosim_core.view.pictures import color_picture, picture_of
@@ -150,7 +149,7 @@ def body_entity(name: str) -> str:
     return f"world/bodies/{name}"
 
 
-def _mesh(source: Scene | Solid, faces: NDArray[np.int32], material: Material) -> Any:
+def _mesh(source: Scene, faces: NDArray[np.int32], material: Material) -> Any:
     used, triangles = np.unique(faces, return_inverse=True)
     texture = _texture(material)
     albedo = np.array(material.base_color) + np.array(material.emission)

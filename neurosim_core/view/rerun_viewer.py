@@ -23,7 +23,7 @@ from typing import Any
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import end_with_parent, stop_at_signals
-from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream, import_rerun
 
 HOST = "127.0.0.1"
 _START_S = 20.0
@@ -93,7 +93,7 @@ class RerunViewer:
 
     def open(self, name: str) -> RerunStream:
         """Open a recording in the viewer, which shows it at once."""
-        stream = open_rerun(name=name)
+        stream = RerunStream(name=name)
         stream.recording.connect_grpc(self.data_url)
         return stream
 
