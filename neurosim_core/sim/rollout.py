@@ -189,12 +189,14 @@ def warm_up(model: Model) -> None:
 
 
 def warm_flight(model: Model, *_: object) -> None:
-    """Compile and load the kernels of motion and control: fly one control period without cameras.
+    """Compile and load the kernels of a flight: look once, and fly one control period.
 
-    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device.
+    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device. No
+    launches come twice, which would be recorded as a graph while other threads launch.
     """
     state = make_state(model, in_flight=1)
     start(model, state)
+    state.wanted = frozenset()
     advance(model, state, batch_end_ns(model.schedule, 0, _period_end_ns(model, state)))
 
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
-from neurosim_core.trajectory import Path, TourConfig, make_path
+from neurosim_core.trajectory import Path, TourConfig, check_thrust, make_path
 from neurosim_core.trajectory.certify import prove_clearance, segment_clearance
 from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds
 from neurosim_core.trajectory.minsnap import minimum_snap
@@ -218,14 +218,18 @@ def test_segments_keep_the_clearance_that_points_allow():
 
 
 def test_make_path_chooses_by_kind(rooms):
-    airframe = preset("hummingbird")
-    assert make_path(HoverConfig(), rooms, airframe, duration_s=4.0).length_m == 0.0
+    assert make_path(HoverConfig(), rooms, duration_s=4.0).length_m == 0.0
     line = LineConfig(start_m=(1.0, 1.0, 1.0), end_m=(2.0, 1.0, 1.0))
-    assert make_path(line, rooms, airframe, duration_s=4.0).length_m == pytest.approx(1.0)
-    assert make_path(TourConfig(), rooms, airframe, duration_s=1.0).end_ns >= 10**9
-    strong = TourConfig(limits=FlightLimits(thrust_to_weight_max=50.0))
+    assert make_path(line, rooms, duration_s=4.0).length_m == pytest.approx(1.0)
+    assert make_path(TourConfig(), rooms, duration_s=1.0).end_ns >= 10**9
+
+
+def test_a_path_may_ask_for_no_more_thrust_than_the_vehicle_has():
+    airframe = preset("hummingbird")
+    check_thrust(TourConfig(), airframe)
+    check_thrust(HoverConfig(), airframe)
     with pytest.raises(PlanningError, match="thrust_to_weight_max = 50 is more than the vehicle has"):
-        make_path(strong, rooms, airframe, duration_s=1.0)
+        check_thrust(TourConfig(limits=FlightLimits(thrust_to_weight_max=50.0)), airframe)
 
 
 def test_configuration_refuses_nonsense():
