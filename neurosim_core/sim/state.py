@@ -24,7 +24,7 @@ from neurosim_core.sensors.base import (
     SamplerContext,
     StateSensorConfig,
 )
-from neurosim_core.sensors.sampler_checks import make_sampler
+from neurosim_core.sensors.state_sampler import make_sampler
 from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
