@@ -232,8 +232,6 @@ def _make_group(
             frames[name] = sensor.make(
                 FrameContext(
                     name=name,
-                    width=group.lens.width,
-                    height=group.lens.height,
                     lens=group.lens,
                     device=device,
                     in_flight=in_flight,
