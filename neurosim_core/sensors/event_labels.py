@@ -29,7 +29,7 @@ from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
 from neurosim_core.runtime.cuda import BufferPool, PooledBuffer, size_class
 from neurosim_core.scene.bodies import Motion, body_orientation, body_position, velocity_on_body
-from neurosim_core.scene.labels import label_scenes
+from neurosim_core.scene.labels import label_scenes, warn_of_patterns
 from neurosim_core.sensors.base import FrameContext
 from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
 from neurosim_core.vehicle.history import History, motion_at
@@ -222,8 +222,9 @@ class EventLabels:
         if scene.bodies is not None:
             bodies = scene.bodies
             model.motions, model.body_mesh = context.motions, bodies.mesh
-            model.body_sphere, model.body_face = bodies.sphere, bodies.first_face
+            model.body_sphere, model.body_face = bodies.data.sphere, bodies.data.first_face
         if {"instance", "semantic"} & self._geometry:
+            warn_of_patterns(context.name, [scene], classes)
             known = label_scenes([scene], classes)
             numbers = np.array([number for _, number in known.instances[0]], np.int32)
             model.class_of = wp.array(numbers, dtype=int, device=device)
