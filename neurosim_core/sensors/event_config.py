@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 from neurosim_core.registry import register
 from neurosim_core.sensors.event_noise_model import TERMS, NoiseTermConfig, parse_terms
 from neurosim_core.settings import Settings, fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, Field(ge=0.0, le=1e6)]

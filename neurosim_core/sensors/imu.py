@@ -30,7 +30,7 @@ from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
 from neurosim_core.sensors.state_sampler import NonNegative, Sampling, StateSampler
 from neurosim_core.settings import fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
@@ -239,7 +239,7 @@ def _model(config: ImuConfig, *, gravity_m_s2: float, name: str) -> Any:
     share = math.sqrt(math.log(ratio) / math.pi)
     model = _Model()
     model.position = wp.vec3d(*config.mount.position_m)
-    model.q_SB = wp.quatd(*config.mount.rotation().inv().as_quat())
+    model.q_SB = wp.quat_inverse(wp.quatd(*config.mount.quaternion()))
     model.gravity = gravity_m_s2
     model.white = six(config.accelerometer_noise_density, config.gyroscope_noise_density, math.sqrt(rate_hz))
     model.walk = six(config.accelerometer_random_walk, config.gyroscope_random_walk, 1.0 / math.sqrt(rate_hz))
