@@ -247,8 +247,6 @@ def _make_frames(
         name: sensor.make(
             FrameContext(
                 name=name,
-                width=lens.width,
-                height=lens.height,
                 lens=lens,
                 device=group.device,
                 in_flight=in_flight,

@@ -24,7 +24,7 @@ from neurosim_core.sensors.base import (
     SamplerContext,
     StateSensorConfig,
 )
-from neurosim_core.sensors.sampler_checks import make_sampler
+from neurosim_core.sensors.state_sampler import make_sampler
 from neurosim_core.sim.inputs import CommandBuffer, Start, begin_of_paths, restart
 from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
