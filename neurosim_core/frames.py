@@ -151,9 +151,6 @@ def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.floa
         return np.ascontiguousarray(rows).reshape(1, width)  # a command, in every control period
     if rows.shape not in ((width,), (1, width), (count, width)):
         raise ValueError(f"{name} must have shape [{count}, {width}] or [{width}], got {list(rows.shape)}")
-    few = rows.size <= _FEW
-    if not (all(map(math.isfinite, rows.ravel().tolist())) if few else np.isfinite(rows).all()):
+    if not np.isfinite(rows).all():
         raise ValueError(f"{name} must be finite, got {rows.tolist()}")
-    if rows.size == count * width:
-        return np.ascontiguousarray(rows.reshape(count, width))
     return np.ascontiguousarray(np.broadcast_to(rows, (count, width)))

@@ -165,7 +165,7 @@ _GROUND_SLACK_M = 0.01  # how far a floor may be above the plane meant by it
 
 
 @wp.func
-def room_around(
+def clearance_around(
     field: DistanceField, radius_m: float, exact_below: float, ground_height_m: wp.float64, p: wp.vec3d
 ) -> float:
     """Return how much room a sphere has around it [m], negative: it touches.

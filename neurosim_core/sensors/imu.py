@@ -121,11 +121,6 @@ def _normal6(seed: wp.uint64, stream: wp.uint32, step: wp.int64, element: wp.int
 @functools.cache
 def make_kernel(terms: frozenset[str]) -> Any:
     """Return the kernel that computes only the given errors, some of `TERMS`."""
-    white = "white" in terms
-    walk = "walk" in terms
-    instability = "instability" in terms
-    saturation = "saturation" in terms
-    quantisation = "quantisation" in terms
 
     @kernel_variant(__name__, *sorted(terms))
     def measure(
@@ -154,13 +149,13 @@ def make_kernel(terms: frozenset[str]) -> Any:
 
         seed = at.seeds[world]
         k = at.sample[world]
-        if wp.static(walk):
+        if wp.static("walk" in terms):
             bias = vec6d()
             if k > wp.int64(0):
                 bias = walk_bias[world] + wp.cw_mul(model.walk, _normal6(seed, model.walk_stream, k, 0))
             walk_bias[world] = bias
             reading += bias
-        if wp.static(instability):
+        if wp.static("instability" in terms):
             process_count = processes.shape[1]  # no constant: unrolled, it compiles four times as long
             for process in range(process_count):
                 drive = wp.cw_mul(model.instability, _normal6(seed, model.instability_stream, k, process))
@@ -171,12 +166,12 @@ def make_kernel(terms: frozenset[str]) -> Any:
                     value += wp.sqrt(wp.float64(1.0) - decay * decay) * drive
                 processes[world, process] = value
                 reading += value
-        if wp.static(white):
+        if wp.static("white" in terms):
             reading += wp.cw_mul(model.white, _normal6(seed, model.white_stream, k, 0))
         for axis in range(6):
-            if wp.static(saturation):
+            if wp.static("saturation" in terms):
                 reading[axis] = wp.clamp(reading[axis], -model.limit[axis], model.limit[axis])
-            if wp.static(quantisation):
+            if wp.static("quantisation" in terms):
                 step = model.resolution[axis]
                 if step > wp.float64(0.0):
                     reading[axis] = step * wp.rint(reading[axis] / step)

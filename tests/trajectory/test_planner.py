@@ -119,7 +119,7 @@ def test_tours_are_clear_long_enough_and_within_limits(rooms, seed):
     path = plan_tour(rooms, config, duration_s=4.0)
     assert path.end_ns >= 4 * 10**9
     assert least_clearance(path, rooms) >= 0.3
-    assert prove_clearance(path, rooms, 0.3).clearance_m >= 0.3
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.3).all()
     assert flight_bounds(path).within(config.limits)
     stamps = np.linspace(0, path.end_ns, 500).astype(np.int64)
     p = path.evaluate(stamps).position
@@ -181,10 +181,8 @@ def test_a_proof_fails_where_a_path_comes_too_close(rooms):
     middle = corner + 0.35 * np.array([-1.0, 1.0]) / np.sqrt(2.0)
     a, b = middle - 0.8 * direction, middle + 0.8 * direction
     path = minimum_snap([[*a, 1.2], [*b, 1.2]], [0, 10**9])
-    assert prove_clearance(path, rooms, 0.3499).holds.all()
-    assert not prove_clearance(path, rooms, 0.3501).holds.any()
-    proof = prove_clearance(path, rooms, 0.3)
-    assert 0.3 <= proof.clearance_m <= 0.35 + 1e-6
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.3499).all()
+    assert not prove_clearance(path.coefficients[:, :3], rooms, 0.3501).any()
 
 
 def test_a_proof_sees_the_curve_and_not_its_chords(rooms):
@@ -193,15 +191,15 @@ def test_a_proof_sees_the_curve_and_not_its_chords(rooms):
     height = [0.5 + 3.0 * tip**2, -6.0 * tip, 3.0]
     coefficients = [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], height, [0.0, 0.0, 0.0]]
     path = Path(np.array([0, 10**9]), np.array([coefficients]))
-    assert prove_clearance(path, rooms, 0.4999).holds.all()
-    assert not prove_clearance(path, rooms, 0.5003).holds.any()
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.4999).all()
+    assert not prove_clearance(path.coefficients[:, :3], rooms, 0.5003).any()
 
 
 def test_a_proof_sees_what_samples_miss():
     """A wire between two samples: both ends have room, the line between them does not."""
     space = as_space(ROOMS, box((4.0, 2.5, 0.0), (4.002, 2.502, 2.5)))
     path = minimum_snap([[3.6, 2.501, 1.2], [4.4, 2.501, 1.2]], [0, 10**9])
-    assert not prove_clearance(path, space, 0.05).holds.any()
+    assert not prove_clearance(path.coefficients[:, :3], space, 0.05).any()
 
 
 def test_segments_keep_the_clearance_that_points_allow():
