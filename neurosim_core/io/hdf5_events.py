@@ -58,21 +58,21 @@ class Hdf5Source(EventSource):
 
     def __init__(self, path: Path, *, sensor: str = "", unit_us: float | None = None) -> None:
         super().__init__(path)
-        self._unit_us = unit_us
+        self._sensor, self._unit_us = sensor, unit_us
         self._file = open_hdf5(path)
-        try:
-            with damage_of(path):
-                self._open(sensor)
-                is_own = self._file.attrs.get("format") == FORMAT
-                if is_own and unit_us is not None:
-                    raise EventFileError(f"{path}: times of a recording of Neurosim are microseconds")
-                self.knows_unit = is_own or unit_us is not None
-                attributes = self._group.attrs
-                is_told = "width" in attributes and "height" in attributes
-                self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
-        except BaseException:
-            self._file.close()
-            raise
+
+    def begin(self) -> None:
+        """Find the events."""
+        with damage_of(self._path):
+            is_own = self._file.attrs.get("format") == FORMAT
+            self._group = self._group_of(self._sensor) if is_own else self._file
+            self._find_events()
+            if is_own and self._unit_us is not None:
+                raise EventFileError(f"{self._path}: times of a recording of Neurosim are microseconds")
+            self.knows_unit = is_own or self._unit_us is not None
+            attributes = self._group.attrs
+            is_told = "width" in attributes and "height" in attributes
+            self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
 
     def packets(self) -> Iterator[Packet]:
         """Yield what a recording has besides events, in the order of time; of files of DSEC nothing."""
@@ -87,19 +87,19 @@ class Hdf5Source(EventSource):
         """Close the file."""
         self._file.close()
 
-    def _open(self, sensor: str) -> None:
-        file, self._group = self._file, self._file
-        if file.attrs.get("format") == FORMAT:
-            cameras = [name for name, group in file["sensors"].items() if "events" in group]
-            if sensor not in ("", *cameras) or not cameras:
-                kind = EventFileError if cameras else NoEventsError
-                raise kind(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
-            described = sorted(
-                cameras, key=lambda name: int(file[f"sensors/{name}"].attrs.get("index", 1 << 30))
-            )
-            self._group = file[f"sensors/{sensor or described[0]}"]
-            if not bool(file.attrs["clean"]):
-                self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
+    def _group_of(self, sensor: str) -> Any:
+        """Return the group of an event camera in a recording."""
+        sensors = self._file["sensors"]
+        cameras = [name for name, group in sensors.items() if "events" in group]
+        if sensor not in ("", *cameras) or not cameras:
+            kind = EventFileError if cameras else NoEventsError
+            raise kind(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
+        if not bool(self._file.attrs["clean"]):
+            self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
+        first = min(cameras, key=lambda name: int(sensors[name].attrs.get("index", 1 << 30)))
+        return sensors[sensor or first]
+
+    def _find_events(self) -> None:
         known = (self._group[place] for place in _PLACES if place in self._group)
         fits = ((found, names) for found in known for names in _NAMES if {*names} <= _parts_of(found))
         self._events: Any
@@ -149,13 +149,7 @@ class RecordingSink:
 
     def __init__(self, path: Path, *, width: int, height: int, sensor: str = "events") -> None:
         self._path = path
-        described = SensorDescription(
-            name=sensor,
-            kind="event_camera",
-            rate_hz=1e6 / PACKET_US,
-            position=np.zeros(3),
-            orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-        )
+        described = SensorDescription(name=sensor, kind="event_camera", rate_hz=1e6 / PACKET_US)
         header = RecordingHeader(
             config_yaml="conversion: {}\n", seed=0, version=__version__, sensors=(described,)
         )
