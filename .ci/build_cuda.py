@@ -22,23 +22,22 @@ import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, Controller, mode_kernel
 from neurosim_core.render.antialias import antialiasing_kernels
-from neurosim_core.render.candidate_data import BLOCK
-from neurosim_core.render.frustum_search import frustum_search_kernel
+from neurosim_core.render.candidate_lists import frustum_search_kernel
+from neurosim_core.render.kernel_data import BLOCK, RenderTerms
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
-from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement_kernels import rule_kernels
 from neurosim_core.sensors.event_kernels import make_noisy_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
-from neurosim_core.sim.trace import note_state
+from neurosim_core.sim.trace import record_state
 from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS
-from neurosim_core.vehicle.integrator import make_advance, make_flight
+from neurosim_core.vehicle.integrator import make_flight
 
 ARCHITECTURES = (80, 90)
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
@@ -113,11 +112,11 @@ def make_kernels() -> None:
     make_begin(signal_terms(TERMS))
     for errors in ((), IMU_TERMS):
         make_imu(frozenset(errors))
-    make_flight(frozenset(VEHICLE_TERMS), note_state)
+    make_flight(frozenset(VEHICLE_TERMS), record_state)
     mode_kernel("path", frozenset(AIR_TERMS))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
-        make_advance(frozenset(vehicle.terms))
+        vehicle.advance(1_000_000)
         for mode in MODES:
             paths = hover(HoverConfig(), position=[0.0, 0.0, 1.0]) if mode == "path" else None
             Controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)

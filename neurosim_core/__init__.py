@@ -58,6 +58,7 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core.render.camera import PinholeConfig as PinholeConfig
     from neurosim_core.render.conformance import check_renderer as check_renderer
     from neurosim_core.render.renderer import (
+        RendererConfig as RendererConfig,
         make_renderer as make_renderer,
         upload_scene as upload_scene,
     )

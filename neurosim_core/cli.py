@@ -369,7 +369,7 @@ def _call(arguments: argparse.Namespace) -> int:
 
 
 def _top(arguments: argparse.Namespace) -> int:
-    from neurosim_core.live.top import top
+    from neurosim_core.live.call import top
 
     return top(once=arguments.once, timeout_s=arguments.timeout)
 

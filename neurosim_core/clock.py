@@ -62,6 +62,13 @@ class Rate:
         """Return whether every tick of another clock is one of this."""
         return (Fraction(str(self.rate_hz)) / Fraction(str(other.rate_hz))).denominator == 1
 
+    def ticks_within(self, other: Rate) -> int:
+        """Return the most ticks in a period of another clock, its begin left out."""
+        if self.contains(other):
+            return int(Fraction(str(self.rate_hz)) / Fraction(str(other.rate_hz)))
+        longest_ns = math.ceil(Fraction(*other._period))
+        return math.ceil(longest_ns / Fraction(*self._period))
+
     def has_tick(self, stamp_ns: int) -> bool:
         """Return whether a tick is at this stamp."""
         return self.stamp_ns(self.first_tick(stamp_ns)) == stamp_ns

@@ -118,7 +118,8 @@ class SimulationConfig(Settings):
     bodies; paths are not planned around them, and running into one is no collision."""
     renderer: AnyRenderer = WarpRendererConfig()
     """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only.
-    `synthetic`: a test card that costs next to nothing, to measure everything else."""
+    `synthetic`: a test card that costs next to nothing, to measure everything else. {kind: remote, topic:
+    ...}: a renderer in another process."""
     render: RenderConfig = RenderConfig()
     """How the scene is lit and rendered."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()

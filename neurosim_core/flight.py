@@ -169,7 +169,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     from neurosim_core.io import is_event_file
     from neurosim_core.io.transfer import as_recording
     from neurosim_core.view.rerun_log import RerunLogger
-    from neurosim_core.view.rerun_sdk import open_rerun
+    from neurosim_core.view.rerun_sdk import RerunStream
     from neurosim_core.view.rerun_shapes import scene_shapes
 
     recorded = flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
@@ -195,7 +195,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
             config = load_config(settings)
             vehicle = next(iter(config.vehicles))
             scene = scene_shapes(config.scene.load(), make_bodies(config.bodies))
-        recording = open_rerun(save or made)
+        recording = RerunStream(save or made)
         try:
             with RerunLogger(recording, vehicles={vehicle: header.sensors}, scene=scene) as logger:
                 logger.log_path(header.path_position)

@@ -269,12 +269,7 @@ def join_events(parts: Sequence[EventArrays]) -> EventArrays:
     """Return the events of all parts, one after the other, as new arrays."""
     if not parts:
         return NO_EVENTS
-    return EventArrays(
-        np.concatenate([part.t for part in parts]),
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.polarity for part in parts]),
-    )
+    return EventArrays(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

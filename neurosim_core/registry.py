@@ -26,11 +26,15 @@ SEAMS = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise"
 """What can be registered."""
 
 _OWN = {
+    "vehicle": {"multirotor": "vehicle.config"},
+    "controller": {"se3": "control.config"},
     "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
-    "renderer": {"remote": "live.remote_renderer"},
-    "sink": {"cortex": "live.sink"},
+    "renderer": {"warp": "render.renderer", "remote": "live.remote_renderer"},
+    "sink": {"hdf5": "sinks", "cortex": "live.sink"},
+    "noise": {"leak": "sensors.event_config"},
+    "task": {"hover": "learn.tasks"},
 }
-"""Modules of kinds that are imported when they are asked for; those of sensors are named for their kind."""
+"""Modules by one of the kinds that they register; those of sensors are named for their kind."""
 
 Registered = TypeVar("Registered", bound=type)
 
@@ -54,7 +58,8 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
 
     def add(cls: Registered) -> Registered:
         if not cls.__module__.startswith("neurosim_core."):
-            load_plugins()  # a kind of our own is taken, whoever comes first
+            _import_own(seam)  # a kind of our own is taken, whoever comes first
+            load_plugins()
         known = table.get(kind)
         if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(
@@ -83,6 +88,7 @@ def kinds(seam: str) -> Mapping[str, type]:
         ValueError: There is no such seam.
     """
     table = registered(seam)
+    _import_own(seam)
     load_plugins()
     return table
 
@@ -106,6 +112,7 @@ def find(seam: str, kind: str) -> type:
     if kind not in table and kind in (own := _own_modules(seam)):
         importlib.import_module(own[kind])
     if kind not in table:
+        _import_own(seam)
         load_plugins()
     if kind not in table:
         raise ValueError(f"unknown {seam} kind {kind!r}, known: {sorted(table)}")
@@ -115,8 +122,9 @@ def find(seam: str, kind: str) -> type:
 def load_plugins() -> None:
     """Import every module of ours that registers a kind, and those that entry points name, once in a process.
 
-    A foreign module that cannot be imported is left out with a warning: one broken package must not take the
-    others down. What it has registered before it failed is forgotten.
+    Tasks are left out: they need PyTorch. A foreign module that cannot be imported is left out with a
+    warning: one broken package must not take the others down. What it has registered before it failed is
+    forgotten.
     """
     global _loaded
     if _loaded:
@@ -124,8 +132,9 @@ def load_plugins() -> None:
     _loaded = True
     from importlib.metadata import entry_points  # which is slow to import, and few runs need
 
-    for module in (module for seam in SEAMS for module in _own_modules(seam).values()):
-        importlib.import_module(module)
+    for seam in SEAMS:
+        if seam != "task":
+            _import_own(seam)
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         before = {seam: dict(table) for seam, table in _tables.items()}
         try:
@@ -140,6 +149,11 @@ def load_plugins() -> None:
                 for kind in broken:
                     del table[kind]
             _logger.warning("the plug-in %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
+
+
+def _import_own(seam: str) -> None:
+    for module in _own_modules(seam).values():
+        importlib.import_module(module)
 
 
 def _own_modules(seam: str) -> dict[str, str]:

@@ -18,6 +18,7 @@ from pydantic_core import (
 
 from neurosim_core.docstrings import field_docs
 from neurosim_core.registry import find, kinds
+from neurosim_core.settings_file import merge
 
 _NO_NUMBER = PydanticCustomError("no_number", "must be a number")
 
@@ -138,11 +139,5 @@ def fill_from_preset(given: Any, presets: Mapping[str, Mapping[str, Any]]) -> An
     name = given["preset"]
     if name not in presets:
         raise ValueError(f"unknown preset {name!r}, known: {', '.join(presets)}")
-    filled = dict(presets[name])
-    for key, value in given.items():
-        old = filled.get(key)
-        filled[key] = value
-        if isinstance(old, Mapping) and isinstance(value, Mapping):
-            same = value.get("kind", old.get("kind")) == old.get("kind")
-            filled[key] = {**old, **value} if same else value
-    return filled
+    kind = {"kind": given["kind"]} if "kind" in given else {}
+    return merge({**presets[name], **kind}, given)

@@ -86,10 +86,7 @@ def beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
             group = group.get(key) if isinstance(group, Mapping) else None
         file = group.get("file") if isinstance(group, Mapping) else None
         if isinstance(file, str) and not Path(file).expanduser().is_absolute():
-            patch: dict[str, Any] = {"file": str(folder / file)}
-            for key in reversed(place):
-                patch = {key: patch}
-            raw = merge(raw, patch)
+            raw = merge(raw, nest(".".join((*place, "file")), str(folder / file)))
     return raw
 
 
@@ -100,11 +97,8 @@ def unchecked_settings(source: Path | None, overrides: Mapping[str, Any]) -> dic
         ConfigError: The file cannot be read, or is not YAML.
     """
     raw = {} if source is None else read_file(source)
-    for key, value in overrides.items():
-        raw = merge(raw, nest(key, value))
-    if source is not None:
-        raw = beside(raw, source.resolve().parent)
-    return raw
+    raw = functools.reduce(merge, (nest(key, value) for key, value in overrides.items()), raw)
+    return raw if source is None else beside(raw, source.resolve().parent)
 
 
 def _in_one_line(error: yaml.YAMLError) -> str:

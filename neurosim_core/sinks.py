@@ -306,7 +306,7 @@ class Sinks:
         self._open: dict[str, Sink] = {}
         self._checked_s = -math.inf  # so before the first packet is written
         with contextlib.ExitStack() as opened:
-            opened.callback(self._abandon)
+            opened.callback(self.abandon)
             for name, each in settings.items():
                 if each.library is not None and not each.is_installed():
                     say(f"{self._title(name)} is left out: {install_hint(each.library[1])}")
@@ -340,10 +340,10 @@ class Sinks:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._abandon()
+        self.abandon()
 
-    def _abandon(self) -> None:
-        """Close what is open, after an error that will be told."""
+    def abandon(self) -> None:
+        """Close what is open as incomplete, after an error that will be told."""
         for sink in self._open.values():
             with contextlib.suppress(Exception):  # each of them, whatever another one raises
                 sink.close(complete=False)

@@ -17,6 +17,28 @@ def test_every_public_name_is_there(name):
     assert getattr(ns, name) is not None
 
 
+@pytest.mark.parametrize("package", [ns.scene, ns.sensors], ids=["scene", "sensors"])
+def test_what_a_plug_in_starts_from_is_there(package):
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+
+
+@pytest.mark.parametrize(
+    ("seam", "known"),
+    [
+        ("vehicle", ["multirotor"]),
+        ("controller", ["se3"]),
+        ("scene", ["apartment", "hall", "mesh"]),
+        ("renderer", ["pyrender", "remote", "synthetic", "warp"]),
+        ("sink", ["cortex", "event_file", "hdf5", "overview", "rerun"]),
+    ],
+)
+def test_a_seam_lists_our_kinds_before_anything_else_is_used(seam, known):
+    code = f"import neurosim_core as ns; print(sorted(ns.registry.kinds({seam!r})))"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.strip() == str(known)
+
+
 def test_examples_and_documents_need_no_other_import():
     """One exception: parameters under RotorPy's names."""
     root = Path(__file__).parents[1]

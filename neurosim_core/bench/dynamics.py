@@ -14,22 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.bench.dynamics_flights import (
+from neurosim_core.bench.dynamics_oracle import (
     EXTREMES,
     FLIGHTS,
     HOLD_NS,
+    INSTALL_ROTORPY,
     MOTORS_S,
     Array,
     Flight,
-    short_flight,
-)
-from neurosim_core.bench.dynamics_oracle import (
-    INSTALL_ROTORPY,
     Reference,
     compare,
     fly_rotorpy,
     make_reference,
     rotorpy_version,
+    short_flight,
 )
 from neurosim_core.bench.engine import DynamicsError, Multirotor
 from neurosim_core.bench.options import Options

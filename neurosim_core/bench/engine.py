@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from neurosim_core.control import PathFollower
 from neurosim_core.frames import Mount
 from neurosim_core.live.probe import ProbeError, StreamProbe, answer_images
 from neurosim_core.overrides import set_options
-from neurosim_core.packets import EventArrays, Events, Odometry
+from neurosim_core.packets import EventArrays, Events, Odometry, join_events
 from neurosim_core.record import Recording
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
@@ -198,12 +198,6 @@ class View:
         for begin in range(0, len(poses[0]), self.count):
             rows = slice(begin, min(begin + self.count, len(poses[0])))
             yield rows, self.render((poses[0][rows], poses[1][rows]))
-
-
-def join_events(parts: Sequence[Any]) -> EventArrays:
-    """Return the events of several packets one after the other."""
-    empty: Any = [np.empty(0, dtype=np.int64)] * 4
-    return EventArrays(*(np.concatenate(columns) for columns in zip(*(parts or [empty]), strict=True)))
 
 
 def event_settings(

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import TypeAdapter
+from pydantic_core import to_json
 
 Row: TypeAlias = dict[str, Any]
 """Values of a table by heading, which says the unit."""
@@ -111,18 +111,8 @@ class Chapter:
 
 def chapter_to_json(chapter: Chapter) -> str:
     """Return a chapter as JSON; numbers that are not finite become null."""
-    return json.dumps(_plain(asdict(chapter)), indent=1, ensure_ascii=False, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    """Return nested values as JSON has them."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    plain = to_json(chapter, indent=1, inf_nan_mode="null", fallback=lambda number: number.item())
+    return plain.decode("utf-8")
 
 
 def table_to_csv(table: Table) -> str:

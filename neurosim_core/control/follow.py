@@ -22,7 +22,7 @@ from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
 from neurosim_core.vehicle.airframe import MultirotorConfig
-from neurosim_core.vehicle.arrays import allocate_arrays
+from neurosim_core.vehicle.arrays import MultirotorArrays, allocate_arrays
 
 FollowMode = Literal["motor_speeds", "velocity", "position"]
 """What a follower commands: the rotors themselves, or setpoints for whatever flies the vehicle."""
@@ -74,7 +74,7 @@ class PathFollower:
         self._cursor = PathCursor(path)
         # the state of the vehicle as a controller reads it, and views of the same memory to write it
         self._feedback = allocate_arrays(1, airframe.rotor_count, wp.get_device("cpu"))
-        self._host = {name: array.numpy() for name, array in vars(self._feedback).items()}
+        self._host = {name: getattr(self._feedback, name).numpy() for name in MultirotorArrays.vars}
         self._controller: PathController | None = None
         self._all = wp.ones(1, dtype=wp.int32, device="cpu")
         if mode == "motor_speeds":

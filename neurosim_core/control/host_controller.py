@@ -12,7 +12,7 @@ from neurosim_core.control.modes import Controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.trajectory.path import PathCursor
-from neurosim_core.vehicle.multirotor import MultirotorState
+from neurosim_core.vehicle.arrays import MultirotorState
 
 
 class HostController:

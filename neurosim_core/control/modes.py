@@ -42,10 +42,11 @@ from neurosim_core.control.se3 import (
     velocity_wrench,
 )
 from neurosim_core.frames import as_rows
+from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
-from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, Rotors, make_wrench, vec10d
 from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
-from neurosim_core.vehicle.arrays import BLOCK_DIM
+from neurosim_core.vehicle.arrays import BLOCK_DIM, MultirotorArrays
 from neurosim_core.vehicle.command_ranges import command_ranges
 
 logger = logging.getLogger(__name__)
@@ -53,18 +54,6 @@ wp.set_module_options({"enable_backward": False})
 
 CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position", "path"]
 """Names of the command modes."""
-
-
-@wp.struct
-class Feedback:
-    """The arrays of a batch of vehicles that a controller reads, one element a vehicle."""
-
-    position: wp.array[wp.vec3d]  # p_WB [m]
-    velocity: wp.array[wp.vec3d]  # v_WB in W [m/s]
-    orientation: wp.array[wp.quatd]  # q_WB, xyzw
-    body_rate: wp.array[wp.vec3d]  # w_WB in B [rad/s]
-    rotor_speed: wp.array2d[wp.float64]  # [rad/s], shape [N, R]
-    stamp_ns: wp.array[wp.int64]  # Time since the start of the episode [ns]
 
 
 @wp.struct
@@ -175,26 +164,25 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
         # Model:
         parameters: Se3Parameters,
         airframe: Airframe,
-        linear_weight: wp.array[vec10d],
+        rotors: Rotors,
         matrix: wp.array2d[wp.float64],
         path: PathArrays,
         # In:
-        feedback: Feedback,
         setpoint: wp.array2d[wp.float64],
-        # Out:
-        rotor_speed_command_out: wp.array2d[wp.float64],
+        # In/out:
+        vehicles: MultirotorArrays,
     ):
         vehicle = wp.tid()
         if wp.static(allocates):
             state = VehicleState()
-            state.position = feedback.position[vehicle]
-            state.velocity = feedback.velocity[vehicle]
-            state.orientation = feedback.orientation[vehicle]
-            state.body_rate = feedback.body_rate[vehicle]
+            state.position = vehicles.position[vehicle]
+            state.velocity = vehicles.velocity[vehicle]
+            state.orientation = vehicles.orientation[vehicle]
+            state.body_rate = vehicles.body_rate[vehicle]
             if wp.static(compensates):
                 linear = vec10d()
                 for rotor in range(matrix.shape[0]):
-                    linear += feedback.rotor_speed[vehicle, rotor] * linear_weight[rotor]
+                    linear += vehicles.rotor_speed[vehicle, rotor] * rotors.linear_weight[rotor]
                 air_B = wp.quat_rotate_inv(state.orientation, state.velocity)
                 force, torque = air_wrench(airframe, wp.vec4d(), linear, air_B, state.body_rate)
                 state.air_acceleration = wp.quat_rotate(state.orientation, force) / parameters.mass_kg
@@ -203,7 +191,7 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
             order.path = path
             order.setpoint = setpoint
             order.vehicle = vehicle
-            order.stamp_ns = feedback.stamp_ns[vehicle]
+            order.stamp_ns = vehicles.stamp_ns[vehicle]
             wrench = wrench_of(parameters, order, state)
             allocate(
                 matrix,
@@ -211,12 +199,12 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
                 wrench.thrust_N,
                 wrench.torque,
                 vehicle,
-                feedback.rotor_speed,
-                rotor_speed_command_out,
+                vehicles.rotor_speed,
+                vehicles.rotor_speed_command,
             )
         else:
             for rotor in range(matrix.shape[0]):
-                rotor_speed_command_out[vehicle, rotor] = clip(
+                vehicles.rotor_speed_command[vehicle, rotor] = clip(
                     setpoint[vehicle, rotor],
                     parameters.motors.speed_min_rad_s,
                     parameters.motors.speed_max_rad_s,
@@ -285,16 +273,16 @@ class Controller:
         self.setpoint = wp.zeros((count, len(self.layout)), dtype=wp.float64, device=self.device)
         matrix = allocation_matrix(vehicle)
         terms = frozenset(vehicle.terms()).intersection(AIR_TERMS if gains.feed_forward_air else ())
-        self._kernel = mode_kernel(mode, terms)
-        airframe = make_airframe(vehicle, self.device)
+        self._command = RecordedLaunch(mode_kernel(mode, terms), self.device, block_dim=BLOCK_DIM)
+        airframe, rotors = make_airframe(vehicle, self.device)
         self._model = [
             make_parameters(vehicle, gains, matrix),
-            airframe.airframe,
-            airframe.linear_weight,
+            airframe,
+            rotors,
             wp.array(matrix, dtype=wp.float64, device=self.device),
             upload_paths(given, self.device) if given else PathArrays(),
         ]
-        self._bound: tuple[Any, Any] = (None, None)
+        self._checked: Any = None
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
@@ -303,15 +291,20 @@ class Controller:
         a graph. A setpoint that is not finite gives commands that are not, and the vehicle reports them.
 
         Args:
-            arrays: The device arrays of a `Multirotor` (`vehicle.arrays`), or any object with the same
-                attributes.
+            arrays: The device arrays of a `Multirotor` (`vehicle.arrays`).
 
         Raises:
             ValueError: If the arrays are of another number of vehicles or rotors, or on another device.
         """
-        if self._bound[0] is not arrays:
-            self._bound = (arrays, self._record(arrays))
-        self._bound[1].launch()
+        shape = (self.count, self.rotor_count)
+        if arrays is not self._checked:
+            if arrays.rotor_speed.shape != shape or arrays.rotor_speed.device != self.device:
+                raise ValueError(
+                    f"the controller is for {shape[0]} vehicles of {shape[1]} rotors on {self.device}, got "
+                    f"arrays of {arrays.rotor_speed.shape} on {arrays.rotor_speed.device}"
+                )
+            self._checked = arrays
+        self._command.launch(self.count, [*self._model, self.setpoint, arrays])
 
     def begin(self, mask: Any) -> None:
         """Nothing is remembered."""
@@ -350,24 +343,3 @@ class Controller:
                 logger.warning("mode %s, vehicle %d: %s; it is clamped", self.mode, beyond[0], reason)
             self.clamped_count += len(beyond)
         return rows
-
-    def _record(self, arrays: Any) -> Any:
-        """Prepare the launch on some arrays."""
-        shape = (self.count, self.rotor_count)
-        if arrays.rotor_speed.shape != shape or arrays.rotor_speed.device != self.device:
-            raise ValueError(
-                f"the controller is for {shape[0]} vehicles of {shape[1]} rotors on {self.device}, got "
-                f"arrays of {arrays.rotor_speed.shape} on {arrays.rotor_speed.device}"
-            )
-        feedback = Feedback()
-        for name in ("position", "velocity", "orientation", "body_rate", "rotor_speed", "stamp_ns"):
-            setattr(feedback, name, getattr(arrays, name))
-        return wp.launch(
-            self._kernel,
-            dim=self.count,
-            inputs=[*self._model, feedback, self.setpoint],
-            outputs=[arrays.rotor_speed_command],
-            device=self.device,
-            block_dim=BLOCK_DIM,
-            record_cmd=True,
-        )

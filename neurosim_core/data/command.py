@@ -82,7 +82,10 @@ def _make(arguments: argparse.Namespace) -> int:
         console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
         return 130
     # Who flies changes no byte, and so is no part of the command.
-    write_card(plan, command=shlex.join(["neurosim", *_without(("--workers", "--ray"), sys.argv[1:])]))
+    who = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    who.add_argument("--workers")
+    who.add_argument("--ray", nargs="?")
+    write_card(plan, command=shlex.join(["neurosim", *who.parse_known_args(sys.argv[1:])[1]]))
     write_checksums(plan)
     if shards is not None:
         from neurosim_core.data import Dataset, write_shards
@@ -103,20 +106,6 @@ def _flights(plan: DatasetPlan, arguments: argparse.Namespace, stopped: Callable
 
     workers = max(1, arguments.workers)
     return make_flights_on_ray(plan, address=arguments.ray, workers=workers, stopped=stopped)
-
-
-def _without(options: tuple[str, ...], words: list[str]) -> list[str]:
-    """Return a command line without some options and their values."""
-    kept, skip = [], False
-    for word in words:
-        if (
-            not skip
-            and not word.startswith(tuple(f"{option}=" for option in options))
-            and word not in options
-        ):
-            kept.append(word)
-        skip = not skip and word in options
-    return kept
 
 
 def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.data.batch import FIELDS, Sample
-from neurosim_core.data.windows import AT_STAMP, ENCODINGS, WindowConfig, choose_sensors
+from neurosim_core.data.windows import AT_STAMP, WindowConfig, choose_sensors, field_of, no_ground_truth
 from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
 from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
@@ -185,16 +185,6 @@ class RecordedFlight:
         return self._group_of
 
 
-def no_ground_truth(source: str, field: str, config: WindowConfig) -> str:
-    """Return what to say where windows never end at a packet of a field."""
-    stride_s = 1e-9 * config.stride_ns
-    return (
-        f"{source}: no packet of {field} is stamped at the end of a window, a multiple of {stride_s:g} s: "
-        f"choose window_s or stride_s as multiples of its period, or leave {field} out of fields"
-    )
-
-
 def _field(group: Any) -> str | None:
     kind = PacketSchema.from_json(group.attrs["schema"]).name
-    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
-    return named or ENCODINGS.get(str(group.attrs.get("encoding", "")))
+    return field_of(kind, str(group.attrs.get("encoding", "")))

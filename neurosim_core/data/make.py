@@ -16,6 +16,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -160,8 +161,8 @@ def make_flights(
         return
     count = min(workers, max(1, len(missing)))
     stretches = [(plan, numbers) for numbers in stretches_of(plan, workers)]
-    cores = core_count() // count
-    with multiprocessing.get_context("spawn").Pool(count, _begin_worker, (os.getpid(), cores)) as pool:
+    cores = core_count() // count  # more threads than cores would wait for each other
+    with multiprocessing.get_context("spawn").Pool(count, begin_worker, (cores,)) as pool:
         known = {process.pid for process in pool._pool}  # type: ignore[attr-defined]
         result = pool.map_async(_fly_stretch, stretches, chunksize=1)
         while missing:
@@ -184,21 +185,27 @@ def stretches_of(plan: DatasetPlan, workers: int) -> list[list[int]]:
     return [missing[begin : begin + size] for begin in range(0, len(missing), size)]
 
 
-_parent = 0
 _scene: tuple[str, Model] | None = None
 """The last scene of this worker, by its settings: the next flight may be in it."""
 
 
-def _begin_worker(parent: int, cores: int) -> None:
+def begin_worker(cores: int) -> None:
+    """Prepare a process that this one has spawned: it uses so many cores, and ends with this one."""
     import signal
 
     from neurosim_core.warp_start import start_warp
 
-    global _parent
-    _parent = parent
-    limit_cores(cores)  # more threads than cores would wait for each other
+    limit_cores(cores)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     start_warp()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _fly_stretch(task: tuple[DatasetPlan, list[int]]) -> None:
@@ -216,8 +223,6 @@ def fly(plan: DatasetPlan, number: int) -> int:
     with RecordingWriter(part, header_of(model), flush_interval_s=float("inf")) as out:
         try:
             for packet in run_model(model, make_state(model)):
-                if _parent and os.getppid() != _parent:  # it was killed
-                    os._exit(1)
                 out.write(packet)
                 stats.add(packet)
         except DynamicsError as error:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.data.batch import Sample
-from neurosim_core.data.flights import no_ground_truth
-from neurosim_core.data.windows import AT_STAMP, PacketWindows, WindowConfig, choose_sensors
-from neurosim_core.packets import Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.data.windows import PacketWindows, WindowConfig, choose_sensors
+from neurosim_core.packets import Events, Packet
+from neurosim_core.sim.observation import Observation
 from neurosim_core.sim.simulation import Simulation
 
 _KINDS = {
@@ -23,8 +22,6 @@ _KINDS = {
     "imu": "imu",
     "odometry": "pose",
 }
-_IN_VAIN = 20
-"""After so many windows without ground truth, and none with it, an error says why."""
 
 
 class SampleSource(Protocol):
@@ -56,19 +53,6 @@ def fields_of(config: SimulationConfig) -> dict[str, str | None]:
     return {name: _KINDS.get(sensor.kind) for name, sensor in config.sensors.items()}
 
 
-def checked(
-    samples: Iterator[Sample], windows: PacketWindows, config: WindowConfig, source: str
-) -> Iterator[Sample]:
-    """Yield samples; raise ValueError if windows are cut, but none has its ground truth."""
-    found = False
-    for sample in samples:
-        found = True
-        yield sample
-    if not found and windows.skipped_count >= _IN_VAIN:
-        names = [name for name in AT_STAMP if config.takes(name)]
-        raise ValueError(no_ground_truth(source, " or ".join(names), config))
-
-
 class RunSource:
     """A configuration that is flown in this process, as `neurosim run` does.
 
@@ -84,14 +68,11 @@ class RunSource:
         """See `SampleSource.samples`."""
         from neurosim_core.sim.rollout import run
 
-        name = "run"
-        windows = PacketWindows(
-            config, choose_sensors(fields_of(self._config), config, source=name), source=name
-        )
-        cut = itertools.chain.from_iterable(
-            itertools.chain((windows.add(packet) for packet in run(self._config)), [windows.end()])
-        )
-        yield from checked(cut, windows, config, name)
+        sensors = choose_sensors(fields_of(self._config), config, source="run")
+        windows = PacketWindows(config, sensors, source="run")
+        for packet in run(self._config):
+            yield from windows.add(packet)
+        yield from windows.end()
         self.skipped_count = windows.skipped_count
 
 
@@ -114,13 +95,12 @@ class WorldsSource:
         cutters = [PacketWindows(config, sensors, source=f"world {n}") for n in range(worlds.count)]
         seeds = None if self._calls == 0 else np.array(worlds.seeds) + worlds.count
         self._calls += 1
-        now_ns, sequences = 0, dict.fromkeys(sensors.values(), 0)
-        observation = worlds.reset(seed=seeds)
+        observation, now_ns = worlds.reset(seed=seeds), 0
         while True:
-            packets = _packets(worlds, observation, sensors, now_ns, sequences)
+            packets = packets_of(worlds, observation, range(worlds.count), sensors.values())
             for cutter, own in zip(cutters, packets, strict=True):
                 for packet in own:
-                    yield from checked(cutter.add(packet), cutter, config, "worlds")
+                    yield from cutter.add(packet)
             if now_ns >= worlds.model.duration_ns:
                 break
             observation = worlds.rollout(1)
@@ -130,40 +110,35 @@ class WorldsSource:
         self.skipped_count = sum(cutter.skipped_count for cutter in cutters)
 
 
-def _packets(
-    worlds: Simulation, observation: Any, sensors: Mapping[str, str], now_ns: int, sequences: dict[str, int]
+def packets_of(
+    simulation: Simulation, observation: Observation, worlds: Sequence[int], sensors: Iterable[str]
 ) -> list[list[Packet]]:
-    """Return the packets of a step, world by world."""
-    begin_ns = now_ns - worlds.duration_ns
-    packets: list[list[Packet]] = [[] for _ in range(worlds.count)]
-    for field, sensor in sensors.items():
-        if field in ("imu", "pose") and sensor in observation.samples:
-            taken = observation.samples[sensor]
-            arrays = {name: array.numpy() for name, array in taken.arrays.items()}
-            kind: Any = ImuSample if field == "imu" else Odometry
-            for row, offset_ns in enumerate(taken.offsets_ns):
-                for world, own in enumerate(packets):
-                    values = {name: array[row, world] for name, array in arrays.items()}
-                    own.append(kind(stamp_ns=begin_ns + offset_ns, sensor=sensor, **values))
-        elif field in ("depth", "flow", "rgb") and sensor in observation.fresh:
-            pictures = observation.images[sensor].numpy()
-            encoding: Any = {"depth": "32FC1", "flow": "32FC2", "rgb": "rgb8"}[field]
-            if field == "flow":
-                pictures = pictures[..., :2]  # the mask is behind it
-            for world, own in enumerate(packets):
-                data = pictures[world].copy()
-                own.append(Image(stamp_ns=now_ns, sensor=sensor, data=data, encoding=encoding))
-        elif field == "events" and now_ns > 0:
-            frames = observation.frames[sensor]
-            dropped = frames.dropped.numpy()
-            for world, own in enumerate(packets):
-                t, x, y, polarity = frames.numpy(world)
+    """Return what some sensors yielded in a step, or at a reset, as packets of some worlds."""
+    step_ns = simulation.duration_ns  # 0 at a reset
+    stamps_ns = observation.clock_ns.numpy()[list(worlds)].tolist()
+    packets: list[list[Packet]] = [[] for _ in worlds]
+    for name in sensors:
+        sensor: Any = simulation.model.config.sensors[name]
+        events, taken = observation.events.get(name), observation.samples.get(name)
+        picture = observation.images[name].numpy() if name in observation.fresh else None
+        arrays = {} if taken is None else {field: array.numpy() for field, array in taken.arrays.items()}
+        dropped = [] if events is None else events.dropped.numpy().tolist()
+        for own, world, stamp_ns in zip(packets, worlds, stamps_ns, strict=True):
+            begin_ns = stamp_ns - step_ns
+            header: dict[str, Any] = {"sensor": name, "sequence": stamp_ns // max(step_ns, 1)}
+            if picture is not None:
+                own.append(sensor.packet(picture[world].copy(), stamp_ns=stamp_ns, **header))
+            for row, offset_ns in enumerate(() if taken is None else taken.offsets_ns):
+                values = {field: array[row, world] for field, array in arrays.items()}
+                own.append(sensor.packet_type(stamp_ns=begin_ns + offset_ns, **header, **values))
+            if events is not None and stamp_ns > 0:
+                columns = events.numpy(world)
+                order = np.argsort(columns[0], kind="stable")  # those of a `Simulation(sorted=False)` are not
+                t, x, y, polarity = (column[order] for column in columns)
                 own.append(
                     Events(
-                        stamp_ns=now_ns, start_ns=begin_ns, sequence=sequences[sensor], sensor=sensor,
-                        t=t, x=x, y=y, polarity=polarity, width=frames.width, height=frames.height,
-                        dropped_count=int(dropped[world]),
+                        stamp_ns=stamp_ns, start_ns=begin_ns, t=t, x=x, y=y, polarity=polarity, **header,
+                        width=events.width, height=events.height, dropped_count=dropped[world],
                     )
                 )  # fmt: skip
-            sequences[sensor] += 1
     return packets

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.data.arguments import names_arguments
 from neurosim_core.data.batch import Batch, Sample, collate
 from neurosim_core.data.flights import RecordedFlight
 from neurosim_core.data.shards import ShardFlight
@@ -50,7 +49,6 @@ class Dataset:
         FileNotFoundError: There is no such file.
     """
 
-    @names_arguments
     def __init__(
         self,
         source: str | Path | Sequence[str | Path],
@@ -64,11 +62,7 @@ class Dataset:
         from neurosim_core.io.transfer import as_recording
 
         config = WindowConfig(
-            window_s=window_s,
-            stride_s=stride_s,
-            ends=ends,
-            fields=None if fields is None else tuple(fields),
-            sensors=sensors or {},
+            window_s=window_s, stride_s=stride_s, ends=ends, fields=fields, sensors=sensors or {}
         )
         self.flights: list[RecordedFlight | ShardFlight] = []
         for path in find_recordings(source):
@@ -169,7 +163,6 @@ class Stream:
         ValueError: An argument is out of range, or goes with recordings only.
     """
 
-    @names_arguments
     def __init__(
         self,
         source: Any,
@@ -200,19 +193,20 @@ class Stream:
             "stride_s": stride_s,
             "ends": ends,
             "fields": fields,
-            "sensors": sensors,
+            "sensors": sensors or {},
         }
         self._source = _sequential(source)
         self._data: Dataset | None = None
         if self._source is None:
             self._data = Dataset(source, **options)
         else:
-            options["fields"] = None if fields is None else tuple(fields)
-            self._config = WindowConfig(**{**options, "sensors": sensors or {}})
+            self._config = WindowConfig(**options)
             if shuffle or ranks > 1 or sequence > 1 or ends is not None:
                 raise ValueError("shuffle, ranks, sequence and ends go with recordings, not with simulators")
         self._position = Position(0, 0)
         self._resume = False
+        self._order: tuple[int, NDArray[np.int64]] | None = None
+        """The epoch that was read last, and its plan."""
 
     @property
     def is_recorded(self) -> bool:
@@ -232,7 +226,16 @@ class Stream:
         return -(-len(self._plan(0)) // (self._batch // self._sequence))
 
     def __iter__(self) -> Iterator[Any]:
-        return self.batches()
+        epoch, begin = self._position.epoch, self._position.batch if self._resume else 0
+        self._resume = False
+        if self._data is None:
+            batches = self._simulated()
+        else:
+            batches = (self.read(epoch, number) for number in range(begin, len(self)))
+        for number, batch in enumerate(batches, begin):
+            self._position = Position(epoch, number + 1)
+            yield batch
+        self._position = Position(epoch + 1, 0)
 
     def __getitem__(self, index: Any) -> Any:
         """Raise TypeError: PyTorch's DataLoader, for one, asks for windows by number."""
@@ -240,16 +243,17 @@ class Stream:
             "a Stream is iterated; for PyTorch take ns.data.Loader, or a DataLoader of ns.data.Dataset"
         )
 
-    def batches(self, *, worker: int = 0, workers: int = 1) -> Iterator[Any]:
-        """Yield the batches of an epoch, or every `workers`-th from number `worker` on."""
-        begin = self._position.batch if self._resume else 0
-        self._resume = False
-        epoch = self._position.epoch
-        for number, samples in self._samples(epoch, begin + worker, workers):
-            self._position = Position(epoch, number + 1)
-            batch = collate(samples)
-            yield batch if self._transform is None else self._transform(batch)
-        self._position = Position(epoch + 1, 0)
+    def read(self, epoch: int, number: int) -> Any:
+        """Return a batch of an epoch; recordings only."""
+        assert self._data is not None
+        if self._order is None or self._order[0] != epoch:
+            self._order = epoch, self._plan(epoch)
+        count, samples = self._batch // self._sequence, []
+        firsts = self._order[1][number * count : (number + 1) * count]
+        breaks = np.flatnonzero(np.diff(firsts) != self._sequence) + 1
+        for run in np.split(firsts, breaks):  # those that follow on each other are read at once
+            samples += self._data.read(int(run[0]), len(run) * self._sequence)
+        return self._make_batch(samples)
 
     def state_dict(self) -> dict[str, int]:
         """Return where the stream is, for `load_state_dict`."""
@@ -262,29 +266,15 @@ class Stream:
         self._position = Position(int(state["epoch"]), int(state["batch"]))
         self._resume = True
 
-    def _samples(self, epoch: int, begin: int, step: int) -> Iterator[tuple[int, list[Sample]]]:
-        if self._data is None:
-            if step > 1:
-                raise ValueError("a simulator cannot be shared by workers: give each its own, or use none")
-            assert self._source is not None
-            samples = self._source.samples(self._config)
-            number = 0
-            while taken := list(islice(samples, self._batch)):
-                yield number, taken
-                number += 1
-            return
-        plan, count = self._plan(epoch), self._batch // self._sequence
-        for number in range(begin, -(-len(plan) // count), step):
-            yield number, self._read(plan[number * count : (number + 1) * count])
+    def _simulated(self) -> Iterator[Any]:
+        assert self._source is not None
+        samples = self._source.samples(self._config)
+        while taken := list(islice(samples, self._batch)):
+            yield self._make_batch(taken)
 
-    def _read(self, firsts: NDArray[np.int64]) -> list[Sample]:
-        """Return the windows of some sequences; those that follow on each other are read at once."""
-        assert self._data is not None
-        samples: list[Sample] = []
-        breaks = np.flatnonzero(np.diff(firsts) != self._sequence) + 1
-        for run in np.split(firsts, breaks):
-            samples += self._data.read(int(run[0]), len(run) * self._sequence)
-        return samples
+    def _make_batch(self, samples: list[Sample]) -> Any:
+        batch = collate(samples)
+        return batch if self._transform is None else self._transform(batch)
 
     def _plan(self, epoch: int) -> NDArray[np.int64]:
         """Return the first window of each sequence of this rank, in the order of an epoch."""

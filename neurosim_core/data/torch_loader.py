@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
 
-from neurosim_core.data.arguments import refuse_unknown
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import Position, Stream
 from neurosim_core.install import need
+
+
+class _Batches:
+    """The batches of a stream by epoch and number, as workers are asked for them."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+
+    def __getitem__(self, place: Position) -> Any:
+        return as_tensors(self._stream.read(*place))
 
 
 class Loader:
@@ -48,12 +56,12 @@ class Loader:
         **options: Any,
     ) -> None:
         torch = _import_torch()
-        known = [name for name in inspect.signature(Stream).parameters if name not in ("source", "transform")]
-        refuse_unknown("Loader", options, ["workers", *known])
         self.stream = Stream(source, transform=transform, **options)
         self._device = device
         self._position = Position(0, 0)
-        self._shared = torch.zeros(2, dtype=torch.int64).share_memory_()
+        self._places: list[Position] = []
+        """The batches of the present epoch."""
+        self._pins = (pin_memory or device is not None) and torch.cuda.is_available()
         more: dict[str, Any] = {}
         if workers:
             if not self.stream.is_recorded:
@@ -63,10 +71,11 @@ class Loader:
                 _require_sendable(transform)
             more = {"multiprocessing_context": method, "persistent_workers": True}
         self._loader = torch.utils.data.DataLoader(
-            sys.modules[__name__]._StreamDataset(self.stream, self._shared),
+            _Batches(self.stream),
             batch_size=None,
+            sampler=self._places,
             num_workers=workers,
-            pin_memory=pin_memory or (device is not None and torch.cuda.is_available()),
+            pin_memory=self._pins,
             **more,
         )
 
@@ -80,16 +89,25 @@ class Loader:
 
     def __iter__(self) -> Iterator[Any]:
         begin = self._position
-        self._shared[0], self._shared[1] = begin
+        batches: Iterable[Any] = self._simulated()
+        if self.stream.is_recorded:
+            self._places[:] = (Position(begin.epoch, number) for number in range(begin.batch, len(self)))
+            batches = self._loader
         held: list[Any] = []
-        for number, batch in enumerate(self._loader, begin.batch):
-            held.append(batch if self._device is None else _move(batch, self._device))
+        for number, batch in enumerate(batches, begin.batch):
+            if self._device is not None:
+                batch = _each_tensor(lambda tensor: tensor.to(self._device, non_blocking=True), batch)
+            held.append(batch)
             if len(held) > (self._device is not None):
                 self._position = Position(begin.epoch, number + 1 - (len(held) - 1))
                 yield held.pop(0)
         for batch in held:
             yield batch
         self._position = Position(begin.epoch + 1, 0)
+
+    def _simulated(self) -> Iterator[Any]:
+        for batch in map(as_tensors, self.stream):
+            yield _each_tensor(lambda tensor: tensor.pin_memory(), batch) if self._pins else batch
 
     def state_dict(self) -> dict[str, int]:
         """Return where the loader is, for `load_state_dict`: behind the batch that was yielded last."""
@@ -110,10 +128,10 @@ def as_tensors(value: Any) -> Any:
     return _map(as_tensors, value)
 
 
-def _move(value: Any, device: Any) -> Any:
-    if hasattr(value, "to"):
-        return value.to(device, non_blocking=True)
-    return _map(lambda item: _move(item, device), value)
+def _each_tensor(change: Callable[[Any], Any], value: Any) -> Any:
+    if hasattr(value, "pin_memory"):
+        return change(value)
+    return _map(lambda item: _each_tensor(change, item), value)
 
 
 def _map(change: Callable[[Any], Any], value: Any) -> Any:
@@ -138,27 +156,3 @@ def _require_sendable(transform: Any) -> None:
 
 def _import_torch() -> Any:
     return need("loaders need PyTorch", "learn", "torch", "torch.utils.data")
-
-
-def __getattr__(name: str) -> Any:
-    """Make the class of data sets on first use: its base is PyTorch's, which is loaded only then."""
-    if name != "_StreamDataset":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    torch = _import_torch()
-
-    def init(self: Any, stream: Stream, shared: Any) -> None:
-        self.stream, self.shared = stream, shared
-
-    def iterate(self: Any) -> Iterator[Any]:
-        info = torch.utils.data.get_worker_info()
-        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        epoch, batch = self.shared.tolist()
-        if self.stream.is_recorded:
-            self.stream.load_state_dict({"epoch": epoch, "batch": batch})
-        for one in self.stream.batches(worker=worker, workers=workers):
-            yield as_tensors(one)
-
-    body = {"__init__": init, "__iter__": iterate, "__module__": __name__}
-    made = type("_StreamDataset", (torch.utils.data.IterableDataset,), body)
-    globals()[name] = made
-    return made

@@ -9,7 +9,7 @@ and counted.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,10 +25,12 @@ from neurosim_core.packets import (
     join_events,
 )
 
-ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
+_ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
 _US_NS = 1000
 AT_STAMP = ("depth", "flow", "rgb", "pose")
 """Fields that need a packet at exactly the end of a window."""
+_IN_VAIN = 20
+"""After so many windows without ground truth, and none with it, an error says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,7 @@ class WindowConfig:
     """From one window to the next [s]; None: they follow on each other."""
     ends: str | None = None
     """Field at whose packets windows end, whatever their times; None: at multiples of the stride."""
-    fields: tuple[str, ...] | None = None
+    fields: Sequence[str] | None = None
     """What to take of `FIELDS`; None: all that a source has."""
     sensors: Mapping[str, str] = field(default_factory=dict)
     """Name of the sensor for a field; by default the first that fits."""
@@ -77,15 +79,10 @@ class WindowConfig:
         return self.fields is None or name in self.fields
 
 
-def field_of(packet: Packet) -> str | None:
-    """Return the field that a packet gives."""
-    if isinstance(packet, Events):
-        return "events"
-    if isinstance(packet, ImuSample):
-        return "imu"
-    if isinstance(packet, Odometry):
-        return "pose"
-    return ENCODINGS.get(getattr(packet, "encoding", ""))
+def field_of(kind: str, encoding: str) -> str | None:
+    """Return the field that packets of a class give, whose pictures have an encoding."""
+    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    return named or _ENCODINGS.get(encoding)
 
 
 def value_of(packet: Packet) -> Any:
@@ -118,11 +115,12 @@ class PacketWindows:
         self._end_ns: int | None = None
         self._sequence: int | None = None
         self._size = (0, 0)
+        self._found = False
         self.skipped_count = 0
 
     def add(self, packet: Packet) -> Iterator[Sample]:
         """Take a packet, and yield the windows that are complete with it."""
-        name = field_of(packet)
+        name = field_of(type(packet).__name__, getattr(packet, "encoding", ""))
         if name is None or self._watched.get(name) != packet.sensor:
             return
         if isinstance(packet, Events):
@@ -133,8 +131,15 @@ class PacketWindows:
         yield from self._complete(ended=False)
 
     def end(self) -> Iterator[Sample]:
-        """Yield the windows that are left at the end of the flight."""
+        """Yield the windows that are left at the end of the flight.
+
+        Raises:
+            ValueError: Windows were cut, but none has its ground truth.
+        """
         yield from self._complete(ended=True)
+        if not self._found and self.skipped_count >= _IN_VAIN:
+            names = [name for name in AT_STAMP if self._config.takes(name)]
+            raise ValueError(no_ground_truth(self._source, " or ".join(names), self._config))
 
     def _add_events(self, packet: Events) -> None:
         if self._end_ns is None:
@@ -161,6 +166,7 @@ class PacketWindows:
             if sample is None:
                 self.skipped_count += 1
             else:
+                self._found = True
                 yield sample
 
     def _cut(self, end_ns: int) -> Sample | None:
@@ -226,3 +232,12 @@ def choose_sensors(found: Mapping[str, str | None], config: WindowConfig, *, sou
         what = f"sensor {wanted!r} for {name}" if wanted else f"sensor for {name}"
         raise ValueError(f"{source} has no {what}; its sensors are {', '.join(found) or 'none'}")
     return chosen
+
+
+def no_ground_truth(source: str, field: str, config: WindowConfig) -> str:
+    """Return what to say where windows never end at a packet of a field."""
+    stride_s = 1e-9 * config.stride_ns
+    return (
+        f"{source}: no packet of {field} is stamped at the end of a window, a multiple of {stride_s:g} s: "
+        f"choose window_s or stride_s as multiples of its period, or leave {field} out of fields"
+    )

@@ -98,11 +98,6 @@ class SensorFit:
     notes: list[str] = field(default_factory=list)
     """What could not be told, and why."""
 
-    @property
-    def pixel(self) -> EventCameraConfig:
-        """Return the settings as they are used."""
-        return make_pixel(self.settings)
-
 
 def make_pixel(settings: Mapping[str, Any]) -> EventCameraConfig:
     """Return pixels of dotted settings."""

@@ -61,17 +61,24 @@ def draw_lenses(settings: Mapping[str, Any], drawn: Randomisation) -> tuple[list
     return lenses, table.astype(np.float32)
 
 
+@wp.struct
+class _Nominal:
+    """The camera and the light as the settings say, and the bounds of what is drawn about them."""
+
+    p_BC: wp.vec3d
+    q_BC: wp.quatd
+    dark_floor: wp.array[wp.float32]
+    exposure: wp.array[wp.float32]
+    mount_m: wp.float32
+    mount_rad: wp.float32
+    log_light: wp.vec2
+    lens_count: wp.int32
+
+
 @wp.kernel
 def _vary(
     # Model:
-    p_BC: wp.vec3d,
-    q_BC: wp.quatd,
-    dark_floor: wp.array[wp.float32],
-    exposure: wp.array[wp.float32],
-    mount_m: wp.float32,
-    mount_rad: wp.float32,
-    log_light: wp.vec2,
-    lens_count: int,
+    nominal: _Nominal,
     # In:
     mask: wp.array[wp.bool],
     seeds: wp.array[wp.uint64],
@@ -88,20 +95,20 @@ def _vary(
         return
     u = uniform4(random_bits(seeds[world], EPISODE, wp.int64(7), 0))
     v = uniform4(random_bits(seeds[world], EPISODE, wp.int64(7), 1))
-    moved = mount_m * signed(u)
-    turned = mount_rad * signed(v)
-    light = wp.exp(within(log_light, u[3]))
+    moved = nominal.mount_m * signed(u)
+    turned = nominal.mount_rad * signed(v)
+    light = wp.exp(within(nominal.log_light, u[3]))
     d = wp.vec3d(wp.float64(moved[0]), wp.float64(moved[1]), wp.float64(moved[2]))
     r = wp.vec3d(wp.float64(turned[0]), wp.float64(turned[1]), wp.float64(turned[2]))
-    p_BC_out[world] = p_BC + d
-    q_BC_out[world] = q_BC
-    if mount_rad > 0.0:
-        q_BC_out[world] = wp.quat_from_axis_angle(wp.normalize(r), wp.length(r)) * q_BC
-    if lens_count > 0:
-        lens_out[world] = wp.min(int(v[3] * float(lens_count)), lens_count - 1)
+    p_BC_out[world] = nominal.p_BC + d
+    q_BC_out[world] = nominal.q_BC
+    if nominal.mount_rad > 0.0:
+        q_BC_out[world] = wp.quat_from_axis_angle(wp.normalize(r), wp.length(r)) * nominal.q_BC
+    if nominal.lens_count > 0:
+        lens_out[world] = wp.min(int(v[3] * float(nominal.lens_count)), nominal.lens_count - 1)
     if dark_floor_out.shape[0] > 0:
-        dark_floor_out[world] = dark_floor[world] / light
-        exposure_out[world] = exposure[world] * light
+        dark_floor_out[world] = nominal.dark_floor[world] / light
+        exposure_out[world] = nominal.exposure[world] * light
     for axis in range(3):
         parameters_out[world, axis] = moved[axis]
         parameters_out[world, 3 + axis] = turned[axis]
@@ -126,10 +133,12 @@ class CameraDraws:
             self._light = [sim.light(name) for name in ("dark_floor", "exposure")]
         self._as_tensors = [wp.to_torch(array) for array in self._light if array.shape[0]]
         self._lens_table = torch.as_tensor(lens_table, device=wp.device_to_torch(sim.device))
-        nominal = [wp.clone(array) for array in self._light]
-        bounds = drawn.mount_m, drawn.mount_rad, wp.vec2(*np.log(drawn.light_factor))
-        lens_count = len(lens_table) if len(lens_table) > 1 else 0
-        self._inputs = [wp.vec3d(*p_BC), wp.quatd(*q_BC), *nominal, *bounds, lens_count]
+        self._nominal = nominal = _Nominal()
+        nominal.p_BC, nominal.q_BC = wp.vec3d(*p_BC), wp.quatd(*q_BC)
+        nominal.dark_floor, nominal.exposure = (wp.clone(array) for array in self._light)
+        nominal.mount_m, nominal.mount_rad = drawn.mount_m, drawn.mount_rad
+        nominal.log_light = wp.vec2(*np.log(drawn.light_factor))
+        nominal.lens_count = len(lens_table) if len(lens_table) > 1 else 0
         self._rows: Any = wp.zeros((sim.count, 7), dtype=float, device=sim.device)
 
     def vary(self, mask: Any, seeds: Any) -> None:
@@ -137,7 +146,7 @@ class CameraDraws:
         wp.launch(
             _vary,
             dim=len(seeds),
-            inputs=[*self._inputs, mask, seeds],
+            inputs=[self._nominal, mask, seeds],
             outputs=[*self._mount, *self._light, self._rows],
             device=self._device,
         )

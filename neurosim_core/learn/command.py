@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,90 +29,63 @@ def _add_learn(commands: _Commands) -> None:
         metavar="TASK",
         help="hover, throw-recover, dodge, avoid, gates; depth, flow, pretrain; `eval` or `rate`",
     )
-    learn.add_argument(
-        "run",
-        nargs="?",
-        type=Path,
-        metavar="RUN",
-        help="eval: folder of a run, or depth.pt, ...; rate: a task",
+    uses: dict[str, Collection[str]] = {}
+    """By name of an option: what makes use of it, of `_COMMANDS`."""
+
+    def add(name: str, of: str, said: str, group: Any = learn, **settings: Any) -> None:
+        uses[group.add_argument(name, help=said, **settings).dest] = of.split()
+
+    number: dict[str, Any] = {"type": int, "metavar": "N"}
+    folder: dict[str, Any] = {"type": Path, "metavar": "DIR"}
+    run = "eval: folder of a run, or depth.pt, ...; rate: a task"
+    add("run", "dagger ppo eval transfer network rate", run, nargs="?", type=Path, metavar="RUN")
+    add("--out", "dagger ppo dense", "where to leave the run (default: runs/TASK)", **folder)
+    device = "auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
+    add("--device", "dagger ppo dense eval transfer rate", device)
+    worlds = "worlds of the student, of `eval`, or to learn depth or flow from"
+    add("--worlds", "dagger ppo dense eval transfer rate", worlds, **number)
+    add("--pixels", "dagger ppo rate", "width and height of the camera (default: as the task says)", **number)
+    surface = "how the student sees events (default: as the task says)"
+    add("--surface", "dagger ppo", surface, choices=("leaky", "time", "counts", "voxels"))
+    add("--seed", "dagger ppo dense", "of everything (default: 0)", type=int, default=0)
+    add("--seeds", "dagger ppo", "train with N seeds from --seed on; with --ray", default=1, **number)
+    add("--workers", "dagger ppo", "processes that train one policy; with --ray", default=1, **number)
+    ray = (
+        "a Ray cluster (local, host:port; auto, the default: one that runs here): one training for each "
+        "of --seeds; depth, flow: the flights of --live"
     )
-    learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
-    learn.add_argument(
-        "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
+    add("--ray", "dagger ppo dense", ray, nargs="?", const="auto", metavar="ADDRESS")
+    add("--wandb", "dagger ppo", "send what TensorBoard gets to Weights & Biases", action="store_true")
+    algorithm = (
+        "dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher "
+        "(rate: how fast that is, too)"
     )
-    learn.add_argument(
-        "--worlds",
-        type=int,
-        metavar="N",
-        help="worlds of the student, of `eval`, or to learn depth or flow from",
+    add("--algorithm", "dagger ppo rate", algorithm, choices=("dagger", "ppo"), default="dagger")
+    add("--teacher-iterations", "dagger", "of PPO", **number)
+    add("--student-iterations", "dagger ppo", "of the student", **number)
+    add("--resume", "dagger ppo", "go on from the checkpoint in --out", action="store_true")
+    scenes = "eval: where to fly: seen, unseen (default), or the file of a scene"
+    add("--scenes", "eval transfer", scenes, default="unseen")
+    add("--speed", "eval", "eval: at which all episodes begin [m/s]", type=float, metavar="M_S")
+    add("--blind", "eval", "eval: without events as well", action="store_true")
+    transfer = "eval: with noise, other lenses, thresholds and dynamics than it was trained with"
+    add("--transfer", "transfer", transfer, action="store_true")
+    randomise = (
+        "what episodes of training draw: as the task says for training (default on a GPU), "
+        "as its tests do, or nothing"
     )
-    learn.add_argument(
-        "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
-    )
-    learn.add_argument(
-        "--surface",
-        choices=("leaky", "time", "counts", "voxels"),
-        help="how the student sees events (default: as the task says)",
-    )
-    learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
-    learn.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="train with N seeds from --seed on; with --ray"
-    )
-    learn.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="processes that train one policy; with --ray"
-    )
-    learn.add_argument(
-        "--ray",
-        nargs="?",
-        const="auto",
-        metavar="ADDRESS",
-        help="a Ray cluster (local, host:port; auto, the default: one that runs here): one training for each "
-        "of --seeds; depth, flow: the flights of --live",
-    )
-    learn.add_argument("--wandb", action="store_true", help="send what TensorBoard gets to Weights & Biases")
-    learn.add_argument(
-        "--algorithm",
-        choices=("dagger", "ppo"),
-        default="dagger",
-        help="dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher "
-        "(rate: how fast that is, too)",
-    )
-    learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
-    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the student")
-    learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
-    learn.add_argument(
-        "--scenes",
-        default="unseen",
-        help="eval: where to fly: seen, unseen (default), or the file of a scene",
-    )
-    learn.add_argument("--speed", type=float, metavar="M_S", help="eval: at which all episodes begin [m/s]")
-    learn.add_argument("--blind", action="store_true", help="eval: without events as well")
-    learn.add_argument(
-        "--transfer",
-        action="store_true",
-        help="eval: with noise, other lenses, thresholds and dynamics than it was trained with",
-    )
-    learn.add_argument(
-        "--randomise",
-        choices=("training", "tests", "none"),
-        help="what episodes of training draw: as the task says for training (default on a GPU), "
-        "as its tests do, or nothing",
-    )
+    add("--randomise", "dagger ppo", randomise, choices=("training", "tests", "none"))
     dense = learn.add_argument_group("depth, flow, pretrain")
-    dense.add_argument("--data", type=Path, metavar="DIR", help="a data set to learn from")
-    dense.add_argument("--live", type=int, default=0, metavar="N", help="or processes that fly meanwhile")
-    dense.add_argument(
-        "--fly-device",
-        metavar="DEVICE",
-        help="of the worlds, which fly meanwhile: cuda:1, ... (default: --device)",
-    )
-    dense.add_argument("--test", type=Path, metavar="DIR", help="a data set to test on")
-    dense.add_argument("--minutes", type=float, default=3.0, metavar="M", help="how long (default: 3)")
-    dense.add_argument("--size", type=int, default=48, metavar="PX", help="of flights (default: 48)")
-    dense.add_argument(
-        "--backbone", metavar="FILE", help="begin with the weights of another network, such as pretrain.pt"
-    )
-    learn.set_defaults(command=partial(_learn, learn))
+    add("--data", "dense", "a data set to learn from", dense, **folder)
+    add("--live", "dense", "or processes that fly meanwhile", dense, default=0, **number)
+    fly_device = "of the worlds, which fly meanwhile: cuda:1, ... (default: --device)"
+    add("--fly-device", "dense", fly_device, dense, metavar="DEVICE")
+    add("--test", "dense network", "a data set to test on", dense, **folder)
+    add("--minutes", "dense", "how long (default: 3)", dense, type=float, default=3.0, metavar="M")
+    add("--size", "dense", "of flights (default: 48)", dense, type=int, default=48, metavar="PX")
+    backbone = "begin with the weights of another network, such as pretrain.pt"
+    add("--backbone", "dense", backbone, dense, metavar="FILE")
+    learn.set_defaults(command=partial(_learn, learn, uses))
 
 
 def _add_deploy(commands: _Commands) -> None:
@@ -165,48 +138,34 @@ def _predict(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_DENSE = {
-    "out", "device", "worlds", "seed", "ray", "data", "live", "fly_device", "test", "minutes", "size",
-    "backbone",
-}  # fmt: skip
-_USED = {
-    "eval": {"run", "device", "worlds", "scenes", "speed", "blind", "transfer", "test"},
-    "rate": {"run", "device", "worlds", "pixels", "algorithm"},
-    **dict.fromkeys(("depth", "flow", "pretrain"), _DENSE),
-}
-_TRAIN = {
-    "run", "out", "device", "worlds", "seed", "ray", "pixels", "surface", "seeds", "workers", "wandb",
-    "algorithm", "teacher_iterations", "student_iterations", "resume", "randomise",
-}  # fmt: skip
-"""Options of `neurosim learn TASK`; those of what is no task are above."""
-
-
-def _refuse_unused(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuse options that would have no effect."""
-    options = {action.dest for action in parser._actions if action.dest in vars(arguments)} - {"what"}
-    given = {name for name in options if getattr(arguments, name) != parser.get_default(name)}
-    what, run = arguments.what, arguments.run
-    unused = given - _USED.get(what, _TRAIN)
-    if what == "eval" and run is not None and run.suffix == ".pt":
-        unused = given - {"run", "test"}
-    elif what == "eval":
-        unused |= given & ({"test", "speed", "blind"} if arguments.transfer else {"test"})
-    elif arguments.algorithm == "ppo":
-        unused |= given & {"teacher_iterations"}
-    if unused:
-        names = ("RUN" if name == "run" else f"--{name.replace('_', '-')}" for name in sorted(unused))
-        raise ValueError(f"neurosim learn {what} makes no use of {', '.join(names)} here")
-
-
-def _learn(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
+def _learn(
+    parser: argparse.ArgumentParser, uses: Mapping[str, Collection[str]], arguments: argparse.Namespace
+) -> int:
     need("torch")
-    _refuse_unused(parser, arguments)
+    what = _command_of(arguments)
+    unused = [
+        name
+        for name, users in sorted(uses.items())
+        if what not in users and getattr(arguments, name) != parser.get_default(name)
+    ]
+    if unused:  # options that would have no effect
+        names = ("RUN" if name == "run" else f"--{name.replace('_', '-')}" for name in unused)
+        raise ValueError(f"neurosim learn {arguments.what} makes no use of {', '.join(names)} here")
+    return _COMMANDS[what](arguments)
+
+
+def _command_of(arguments: argparse.Namespace) -> str:
+    """Return which of `_COMMANDS` is asked for."""
     if arguments.what == "eval":
-        return _evaluate(arguments)
-    if arguments.what == "rate":
-        return _measure_rate(arguments)
+        if arguments.run is not None and arguments.run.suffix == ".pt":
+            return "network"
+        return "transfer" if arguments.transfer else "eval"
     if arguments.what in ("depth", "flow", "pretrain"):
-        return _learn_dense(arguments)
+        return "dense"
+    return "rate" if arguments.what == "rate" else str(arguments.algorithm)
+
+
+def _train(arguments: argparse.Namespace) -> int:
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
     from neurosim_core.learn.train import default_config, read_config, train
@@ -228,7 +187,7 @@ def _learn(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> in
     )
     changes = ("worlds", "pixels", "surface", "teacher_iterations", "student_iterations", "randomise")
     changed = [name.replace("_", "-") for name in changes if getattr(arguments, name) is not None]
-    changed += ["algorithm"] * (arguments.algorithm != parser.get_default("algorithm"))
+    changed += ["algorithm"] * (arguments.algorithm == "ppo")
     if arguments.resume and changed:
         raise ValueError(f"--resume goes on as the run was configured: leave out --{', --'.join(changed)}")
     folder = arguments.out or Path("runs") / arguments.what
@@ -324,29 +283,39 @@ def _learn_dense(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
+def _evaluate_network(arguments: argparse.Namespace) -> int:
+    from neurosim_core.learn.dense_train import evaluate, held_out_windows, load_dense
+
+    net, dense = load_dense(arguments.run)
+    print(evaluate(net, held_out_windows(dense, arguments.test), dense.head))
+    return 0
+
+
+def _evaluate_transfer(arguments: argparse.Namespace) -> int:
+    from neurosim_core.learn.transfer import evaluate_transfer
+
+    where = {"device": arguments.device, "worlds": arguments.worlds}
+    scenes = arguments.scenes if arguments.scenes in ("seen", "unseen") else [arguments.scenes]
+    for name, evaluation in evaluate_transfer(_run_of(arguments), scenes=scenes, **where):
+        print(f"{name}: {evaluation}", flush=True)
+    return 0
+
+
+def _run_of(arguments: argparse.Namespace) -> Path:
     if arguments.run is None:
         raise ValueError("say which run: neurosim learn eval runs/hover")
-    if arguments.run.suffix == ".pt":
-        from neurosim_core.learn.dense_train import evaluate, held_out_windows, load_dense
+    run: Path = arguments.run
+    return run
 
-        net, dense = load_dense(arguments.run)
-        print(evaluate(net, held_out_windows(dense, arguments.test), dense.head))
-        return 0
-    if arguments.transfer:
-        from neurosim_core.learn.transfer import evaluate_transfer
 
-        where = {"device": arguments.device, "worlds": arguments.worlds}
-        scenes = arguments.scenes if arguments.scenes in ("seen", "unseen") else [arguments.scenes]
-        for name, evaluation in evaluate_transfer(arguments.run, scenes=scenes, **where):
-            print(f"{name}: {evaluation}", flush=True)
-        return 0
+def _evaluate(arguments: argparse.Namespace) -> int:
     from neurosim_core.learn.train import evaluate_run
 
     speed = "" if arguments.speed is None else f"-{arguments.speed:g}m_s"
-    film = arguments.run / f"{Path(arguments.scenes).stem}{speed}.webp"
+    run = _run_of(arguments)
+    film = run / f"{Path(arguments.scenes).stem}{speed}.webp"
     for name, evaluation in evaluate_run(
-        arguments.run,
+        run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
@@ -358,6 +327,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             break
     print(f"wrote {film}: the first of the episodes")
     return 0
+
+
+_COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "dagger": _train,
+    "ppo": _train,
+    "dense": _learn_dense,
+    "eval": _evaluate,
+    "transfer": _evaluate_transfer,
+    "network": _evaluate_network,
+    "rate": _measure_rate,
+}
+"""What `neurosim learn` does: train a policy by one of two algorithms, or a dense prediction; evaluate a run,
+here or in other conditions, or a dense network; measure a rate."""
 
 
 def fly_policy(arguments: argparse.Namespace, overrides: Mapping[str, Any]) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neurosim_core.learn.descent import Descent, Replayed
+from neurosim_core.learn.descent import Descent, GraphedFunction
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import make_event_policy
 from neurosim_core.learn.ppo import count_ended, shares
@@ -144,7 +144,7 @@ class Dagger:
         self._seen = {n: torch.zeros_like(v[0, :, 0]) for n, v in self._kept.items() if n != "memory"}
         self._told = torch.zeros_like(env.group(self._now, "teacher"))
         self._action = torch.zeros((env.num_envs, 4), device=env.device)
-        self._act = Replayed(self._decide, on_cuda=env.device.type == "cuda")
+        self._act = GraphedFunction(self._decide, on_cuda=env.device.type == "cuda")
         self._rows = torch.zeros(config.batch, dtype=torch.int64, device=env.device)
         self._losses = torch.zeros(2, device=env.device)
         self._flown = 0

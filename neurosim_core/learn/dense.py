@@ -1,4 +1,4 @@
-"""Dense prediction from events: a U-Net with memory that reads voxels, and what a head for it has.
+"""Dense prediction from events: a U-Net with memory that reads voxels.
 
 References: Hidalgo-Carrio, Gehrig, Scaramuzza (2020), Learning Monocular Dense Depth from Events, for the
 recurrent U-Net; Ballas, Yao, Pal, Courville (2016), for the convolutional GRU.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -20,45 +19,6 @@ _STEP = 8
 """Heights and widths are filled up to multiples of this: the network halves them three times."""
 
 Memory = tuple[Tensor, ...]
-
-
-class Errors(Protocol):
-    """Adds up how far predictions are off."""
-
-    def add(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> None:
-        """Add pictures, shapes [B, C, H, W], and the voxels they were predicted from."""
-
-    def result(self) -> Any:
-        """Return the errors of all pictures, a NamedTuple.
-
-        Raises:
-            ValueError: There is nothing to compare with.
-        """
-
-
-class Head(Protocol):
-    """What is predicted of each pixel, and how well; targets and predictions are [..., C, H, W]."""
-
-    field: ClassVar[str]
-    """Of a batch: where the target comes from."""
-    start: ClassVar[tuple[float, ...]]
-    """Predicted before training, one number for each channel."""
-    mirrored: ClassVar[tuple[float, ...]]
-    """Factor of each channel in a mirrored picture."""
-    ahead: ClassVar[int]
-    """Of so many windows later."""
-
-    def target(self, value: Tensor) -> Tensor:
-        """Return the target of what a batch has."""
-
-    def loss(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Return what is to become small."""
-
-    def constant(self, targets: Tensor) -> Tensor:
-        """Return the best prediction of each pixel without events, of targets [n, C, H, W]."""
-
-    def errors(self) -> Errors:
-        """Return empty sums."""
 
 
 class ConvGru(nn.Module):

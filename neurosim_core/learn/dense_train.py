@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,13 +23,11 @@ from torch import Tensor
 from neurosim_core.data import LiveSource, RaySource, Stream
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import find_recordings
-from neurosim_core.learn.dense import DenseNet, Head, Memory
-from neurosim_core.learn.dense_live import flight_settings, live_flights
-from neurosim_core.learn.heads import DepthHead, FlowHead, FutureHead
+from neurosim_core.learn.dense import DenseNet, Memory
+from neurosim_core.learn.dense_flights import flight_settings, live_flights
+from neurosim_core.learn.heads import HEADS, Head
 
 _log = logging.getLogger(__name__)
-HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}
-"""What can be learned, by the name of its command."""
 _SILENT_S = 120.0
 """Live flights have ended if nothing comes for so long: the next scene takes a while [s]."""
 _REMEMBERED = 0.75
@@ -60,7 +60,7 @@ class DenseConfig:
     """How long to train [min]; waiting for the first windows is not counted."""
     steps: int | None = None
     """How many steps to train, however long they take; None: as `minutes` says."""
-    room: int = 20_000
+    capacity: int = 20_000
     """Windows that are kept to be seen again; of more, the oldest go."""
     reuse: float = 4.0
     """Worlds fly on when their windows have been seen so often, on average."""
@@ -114,7 +114,7 @@ def windows_of(batch: Batch, head: Head, bins: int) -> Windows:
     return Windows(batch.source, batch.start_ns.tolist(), batch.stamp_ns.tolist(), voxel, target)
 
 
-class WindowPool:
+class ReplayBuffer:
     """Windows to be seen again, in sequences that follow on each other; filled from any source.
 
     `mirrored`: factor of each channel of a target in a mirrored picture. `device`: where they are kept; None:
@@ -122,9 +122,9 @@ class WindowPool:
     """
 
     def __init__(
-        self, *, length: int, room: int, mirrored: Sequence[float] = (1.0,), device: str | None = None
+        self, *, length: int, capacity: int, mirrored: Sequence[float] = (1.0,), device: str | None = None
     ) -> None:
-        self._length, self._most, self._device = length, max(1, room // length), device
+        self._length, self._most, self._device = length, max(1, capacity // length), device
         self._sign = torch.tensor(mirrored)[:, None, None]
         self._sequences: list[tuple[Tensor, Tensor]] = []
         self._begun: dict[str, list[tuple[int, Tensor, Tensor]]] = {}
@@ -201,7 +201,8 @@ def evaluate(
 
     `predict`: called with a voxel [1, bins, H, W] and the memory of the window before, or None.
     """
-    sums, memory, flight = head.errors(), None, None
+    sums: Tensor | None = None
+    memory, flight = None, None
     due: list[tuple[Tensor, Tensor]] = []
     """What was predicted and is not yet compared, with what was seen."""
     with torch.no_grad():
@@ -214,8 +215,11 @@ def evaluate(
                 due.append((predicted.cpu(), voxel[None]))
                 if len(due) > head.ahead:
                     before, seen = due.pop(0)
-                    sums.add(before, target[None], seen)
-    return sums.result()
+                    measured = head.measure(before, target[None], seen)
+                    sums = measured if sums is None else sums + measured
+    if sums is None:
+        raise ValueError("no window has anything to compare with")
+    return head.errors(sums)
 
 
 def train_dense(
@@ -253,20 +257,20 @@ def train_dense(
         net.take_backbone(Path(config.backbone))
     if live or torch.device(config.device).type == "cuda":
         torch.set_num_threads(1)  # more wait for each other where others work, and only put batches together
-    pool = WindowPool(
+    buffer = ReplayBuffer(
         length=config.sequence + head.ahead,
-        room=config.room,
+        capacity=config.capacity,
         mirrored=head.mirrored,
         device=config.device if worlds else None,
     )
     _log.info("waiting for the first windows")
-    with _source(pool, config, data, live, worlds, ray) as more:
-        fit = _fit(net.to(config.device), pool, config, more)
+    with _source(buffer, config, data, live, worlds, ray) as more:
+        fit = _fit(net.to(config.device), buffer, config, more)
     folder.mkdir(parents=True, exist_ok=True)
     card = {"task": config.task, "window_s": config.window_s, "bins": net.bins, "channels": net.channels}
     weights = {name: value.cpu() for name, value in net.state_dict().items()}
     torch.save({"net": weights, **card}, folder / f"{config.task}.pt")
-    constant = head.constant(pool.targets()).cpu()[None]
+    constant = head.constant(buffer.targets()).cpu()[None]
 
     def predict_mean(voxel: Tensor, _memory: Any) -> tuple[Tensor, Any]:
         return torch.nn.functional.interpolate(constant, voxel.shape[-2:]), None
@@ -284,7 +288,7 @@ def train_dense(
         "steps": fit.steps,
         "share of the time without data": fit.waited_share,
         "gpus": fit.gpus,
-        "training windows": pool.window_count,
+        "training windows": buffer.window_count,
         "test windows": sum(len(windows.source) for windows in tested),
         "errors": {name: error._asdict() for name, error in errors.items()},
     }
@@ -310,74 +314,77 @@ def load_dense(file: Path) -> tuple[DenseNet, DenseConfig]:
 
 @contextlib.contextmanager
 def _source(
-    pool: WindowPool, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
+    buffer: ReplayBuffer, config: DenseConfig, data: Path | None, live: int, worlds: int, ray: str | None
 ) -> Iterator[Callable[[int], None]]:
-    """Fill a pool for the first step; yield what to call before each step, with its number."""
-    head, options = config.head, _options(config)
-    if worlds:
-        from neurosim_core.learn.dense_worlds import world_windows
-
-        fly_device = config.fly_device or config.device
-        settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
-        windows = world_windows(
-            settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
-            renders=config.renders, threshold_spread=config.threshold_spread,
-        )  # fmt: skip
-        with contextlib.closing(windows) as flown:
-            while len(pool) < min(config.batch, worlds):
-                pool.add(next(flown))
-
-            def due(step: int) -> bool:
-                return pool.window_count * config.reuse < step * config.batch * config.sequence
-
-            def fly_on(step: int) -> None:
-                while due(step):
-                    pool.add(next(flown))
-
-            if fly_device == config.device:
-                yield fly_on
-                return
-            with _meanwhile(lambda: pool.add(next(flown))) as goes_on:
-
-                def wait(step: int) -> None:
-                    while due(step) and goes_on():
-                        time.sleep(1e-3)
-
-                yield wait
-        return
-    if data is not None:
-        length = config.sequence + head.ahead
-        for batch in Stream(data, batch=64 * length, sequence=length, **options):
-            pool.add(windows_of(batch, head, config.bins))
-        yield lambda _: None
-        return
-    settings = flight_settings(config.size_px, 0, field=head.field)
+    """Fill a buffer for the first step; yield what to call before each step, with its number."""
+    head, fly_device = config.head, config.fly_device or config.device
+    needed, reuse = config.batch, math.inf  # sequences of the first step; how often windows may be seen
     with contextlib.ExitStack() as stack:
-        if ray is None:
-            names = stack.enter_context(live_flights(live, settings, seed=config.seed))
-            source: Any = LiveSource(names, timeout_s=_SILENT_S)
+        if worlds:
+            from neurosim_core.learn.dense_worlds import world_windows
+
+            settings = flight_settings(config.size_px, config.seed, field=head.field, device=fly_device)
+            windows: Iterator[Windows] = stack.enter_context(
+                contextlib.closing(
+                    world_windows(
+                        settings, head, worlds=worlds, bins=config.bins, window_s=config.window_s,
+                        renders=config.renders, threshold_spread=config.threshold_spread,
+                    )
+                )
+            )  # fmt: skip
+            needed, reuse = min(needed, worlds), config.reuse
         else:
-            source = RaySource(settings, simulators=live, address=ray, first=config.seed)
-        batches = iter(Stream(source, batch=1, **options))
-        filling = _meanwhile(lambda: pool.add(windows_of(next(batches), head, config.bins)))
-        goes_on = stack.enter_context(filling)
-        while len(pool) < config.batch and goes_on():
-            time.sleep(0.05)
-        yield lambda _: None
+            stream = _stream(stack, config, data, live, ray)
+            windows = (windows_of(batch, head, config.bins) for batch in stream)
+            if data is not None:
+                needed = sys.maxsize
+
+        def add() -> bool:
+            window = next(windows, None)
+            if window is not None:
+                buffer.add(window)
+            return window is not None
+
+        comes = add
+        if live or fly_device != config.device:
+            comes = stack.enter_context(_in_background(add))
+        while len(buffer) < needed and comes():
+            pass
+
+        def more(step: int) -> None:
+            while buffer.window_count * reuse < step * config.batch * config.sequence and comes():
+                pass
+
+        yield more
+
+
+def _stream(
+    stack: contextlib.ExitStack, config: DenseConfig, data: Path | None, live: int, ray: str | None
+) -> Stream:
+    """Return windows of recordings in sequences, or of processes that fly; these end with the stack."""
+    if data is not None:
+        length = config.sequence + config.head.ahead
+        return Stream(data, batch=64 * length, sequence=length, **_options(config))
+    settings = flight_settings(config.size_px, 0, field=config.head.field)
+    if ray is not None:
+        source: Any = RaySource(settings, simulators=live, address=ray, first=config.seed)
+    else:
+        names = stack.enter_context(live_flights(live, settings, seed=config.seed))
+        source = LiveSource(names, timeout_s=_SILENT_S)
+    return Stream(source, batch=1, **_options(config))
 
 
 @contextlib.contextmanager
-def _meanwhile(step: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Do a step again and again in a thread, until it raises StopIteration or the block ends.
+def _in_background(step: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    """Do a step again and again in a thread, as long as it returns true and the block has not ended.
 
-    Yield what says whether this goes on; that raises what the step raised.
+    Yield what waits a moment and says whether this goes on; it raises what the step raised.
     """
     stop = threading.Event()
 
     def work() -> None:
-        with contextlib.suppress(StopIteration):
-            while not stop.is_set():
-                step()
+        while not stop.is_set() and step():
+            pass
 
     with ThreadPoolExecutor(1) as executor:
         working = executor.submit(work)
@@ -386,6 +393,7 @@ def _meanwhile(step: Callable[[], None]) -> Iterator[Callable[[], bool]]:
             if working.done():
                 working.result()
                 return False
+            time.sleep(1e-3)
             return True
 
         try:
@@ -423,9 +431,9 @@ def _some_of(memory: Memory | None, random: np.random.Generator) -> Memory | Non
     return tuple(level.detach() * kept[:, None, None, None] for level in memory)
 
 
-def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
+def _fit(net: DenseNet, buffer: ReplayBuffer, config: DenseConfig, more: Callable[[int], None]) -> _Fit:
     """Train for the time that there is."""
-    if len(pool) == 0:
+    if len(buffer) == 0:
         raise ValueError(
             f"there are no {config.sequence + config.head.ahead} consecutive windows to learn from"
         )
@@ -446,7 +454,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         asked_s = time.monotonic()
         more(steps)
         waited_s += time.monotonic() - asked_s
-        voxel, target = (part.to(config.device).float() for part in pool.draw(config.batch, random))
+        voxel, target = (part.to(config.device).float() for part in buffer.draw(config.batch, random))
         memory, predicted = _some_of(memory, random), []
         for window in voxel[: config.sequence]:
             one, memory = net(window, memory)
@@ -459,7 +467,7 @@ def _fit(net: DenseNet, pool: WindowPool, config: DenseConfig, more: Callable[[i
         steps += 1
         if time.monotonic() - told_s > _TOLD_S:
             told_s = time.monotonic()
-            told = (steps, 100.0 * share, loss.item(), pool.window_count)
+            told = (steps, 100.0 * share, loss.item(), buffer.window_count)
             _log.info("step %d, %.0f %%: loss %.4f, %d windows", *told)
     fit = _Fit(steps, waited_s / (time.monotonic() - begin_s), _gpus(config.device))
     _log.info(

@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.learn.dense import Head
-from neurosim_core.learn.dense_plan import PathPlanner
+from neurosim_core.learn.dense_flights import PathPlanner
 from neurosim_core.learn.dense_train import Windows
+from neurosim_core.learn.heads import Head
 from neurosim_core.learn.surfaces import Counts, EventSurface, SurfaceConfig, VoxelGrid
 from neurosim_core.sim.model import Model, make_model, refit
 from neurosim_core.sim.simulation import Simulation

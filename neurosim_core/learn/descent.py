@@ -14,7 +14,7 @@ _EAGER_STEPS = 3
 """Steps before one is captured: PyTorch sets things up in them."""
 
 
-class Replayed:
+class GraphedFunction:
     """A function without arguments, which a CUDA device replays as one graph.
 
     `function`: works on tensors that are the same in each call and whose values change; it must not wait for
@@ -49,8 +49,8 @@ class Replayed:
 class Descent:
     """Minimises a loss by Adam; with several processes (`ranks`), the mean of their losses.
 
-    `loss`: returns the loss; as the function of `Replayed`. `gradient_max`: gradients with a larger norm are
-    scaled down to it.
+    `loss`: returns the loss, as a `GraphedFunction` wants it. `gradient_max`: gradients with a larger norm
+    are scaled down to it.
 
     Attributes:
         optimizer: Adam.
@@ -73,8 +73,8 @@ class Descent:
         self.optimizer = torch.optim.Adam(
             module.parameters(), lr=self._rate, capturable=self._on_cuda, fused=self._on_cuda, **settings
         )
-        self._differentiate = Replayed(self._backward, on_cuda=self._on_cuda)
-        self._improve = Replayed(self._step, on_cuda=self._on_cuda)
+        self._differentiate = GraphedFunction(self._backward, on_cuda=self._on_cuda)
+        self._improve = GraphedFunction(self._step, on_cuda=self._on_cuda)
         size = sum(parameter.numel() for parameter in module.parameters()) if ranks.count() > 1 else 0
         self._gradient = torch.zeros(size, device=device)
 

@@ -10,21 +10,12 @@ from typing import Any, Literal, TypeVar
 import torch
 import warp as wp
 
-from neurosim_core.learn.actions import COMMANDS, hover_command
 from neurosim_core.learn.cameras import CameraDraws, draw_lenses
-from neurosim_core.learn.episodes import (
-    COLUMN_COUNT,
-    COLUMNS,
-    PARAMETERS,
-    Episodes,
-    look_at_vehicles,
-    make_routes,
-    probe,
-)
+from neurosim_core.learn.episodes import COLUMNS, PARAMETERS, Episodes, make_routes
 from neurosim_core.learn.randomisation import NO_RANDOMISATION, Randomisation
 from neurosim_core.learn.snapshot import put_state, state_of
 from neurosim_core.learn.surfaces import EventSurface, SurfaceConfig
-from neurosim_core.learn.task import Observations, Task, View
+from neurosim_core.learn.task import COMMANDS, Observations, Task, View, hover_command
 from neurosim_core.registry import find
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation
@@ -48,8 +39,6 @@ StepResult = tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[
 
 def find_task(name: str) -> Task:
     """Return a task by its name in the registry."""
-    import neurosim_core.learn.tasks  # noqa: F401  (registers)
-
     task: Task = find("task", name)()
     return task
 
@@ -136,14 +125,7 @@ class Env:
             clearance_m=task.start.clearance_m,
             device=wp_device,
         )
-        self._episodes = Episodes(
-            task.start, routes, self.sim.scene_of_world, world_count=worlds, device=wp_device
-        )
-        self._distances = torch.zeros((worlds, len(task.probes)), device=self.device)
-        if task.probes:
-            self._probes: Any = wp.array(list(task.probes), dtype=wp.vec3, device=wp_device)
-            self._distances_array = wp.from_torch(self._distances)
-        self._rows: Any = wp.zeros((worlds, COLUMN_COUNT), dtype=wp.float32, device=wp_device)
+        self._episodes = Episodes(self.sim, task.start, routes, probes=task.probes, drawn=self.randomisation)
         self._surface: EventSurface | None = None
         self._thresholds: torch.Tensor | None = None
         if sees and self.randomisation.threshold_factor != (1.0, 1.0):
@@ -289,7 +271,7 @@ class Env:
         observation = self.sim.step(self._delayed(self.task.command(view)), mode=self.task.mode)
         if self._surface is not None:
             self._surface.update(observation.events[CAMERA], observation.clock_ns)
-        self._look(observation)
+        self._update_view(observation)
         self.episode_length += 1
         torch.mul(self.episode_length, view.step_s, out=view.elapsed_s)
         task = self.task
@@ -354,7 +336,7 @@ class Env:
             chosen = self._nominal_thresholds * (low + (high - low) * view.draws[:, -5:-3].double())
             self._thresholds.copy_(torch.where(mask, chosen, self._thresholds))
         if drawn.airframes_differ:
-            episodes.vary_airframes(self._mask_array, self.sim.airframes, drawn)
+            episodes.vary_airframes(self._mask_array)
         if self._cameras is not None:
             self._cameras.vary(self._mask_array, episodes.seeds)
         observation = self.sim.reset(
@@ -367,7 +349,7 @@ class Env:
         if self._surface is not None:
             self._mask_int.copy_(self._mask)
             self._surface.forget(wp.from_torch(self._mask_int))
-        self._look(observation)
+        self._update_view(observation)
         hover = COMMANDS["attitude"](self.task, view) if self.task.mode == "attitude" else self._hover
         self._queue = torch.where(mask, hover, self._queue)
         self._lagging = torch.where(mask, hover, self._lagging)
@@ -416,12 +398,9 @@ class Env:
         length = self._queue.shape[0]
         return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
-    def _look(self, observation: Observation) -> None:
+    def _update_view(self, observation: Observation) -> None:
         self.observation = observation
-        where = {"fields": self.sim.fields, "scene_of_world": self.sim.scene_of_world}
-        look_at_vehicles(self._rows, observation, self._episodes, **where, drawn=self.randomisation)
-        if self.task.probes:
-            probe(self._distances_array, self._probes, self._rows, **where)
+        self._episodes.write_rows(observation)
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)
         torch.not_equal(self._status, 0, out=self.view.crashed)
@@ -433,11 +412,13 @@ class Env:
             self.view.bodies.copy_(torch.cat([moved, velocity + fallen], dim=2))
 
     def _make_view(self) -> View:
-        rows = wp.to_torch(self._rows)
+        rows, distances = wp.to_torch(self._episodes.rows), self._episodes.distances
         worlds = self.num_envs
         return View(
             **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
-            probes=self._distances,
+            probes=wp.to_torch(distances)
+            if distances.size
+            else torch.zeros(distances.shape, device=self.device),
             scenes=[model.config.scene for model in self.sim.models],
             scene=wp.to_torch(self.sim.scene_of_world).long(),
             surface=None if self._surface is None else wp.to_torch(self._surface.array),

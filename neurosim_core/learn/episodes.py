@@ -20,6 +20,7 @@ from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.random import normal4, random_bits, stream_id, uniform4
 from neurosim_core.scene.freespace import DistanceField, FreeSpace, sample_distance
 from neurosim_core.sim.observation import Observation
+from neurosim_core.sim.simulation import Simulation
 from neurosim_core.vehicle.aerodynamics import Airframe
 
 wp.set_module_options({"enable_backward": False})
@@ -38,7 +39,7 @@ COLUMNS = {
     "gravity_measured": (25, 28),
     "clearance": (28, 29),
 }
-"""Columns of `look_at_vehicles`."""
+"""Columns of `Episodes.rows`."""
 COLUMN_COUNT = 29
 
 PARAMETERS = {"mass_factor": 0, "inertia_factor": 1, "drag_factor": 2, "wind_m_s": slice(3, 5)}
@@ -149,7 +150,7 @@ def _write(rows: wp.array2d[wp.float32], world: int, column: int, value: wp.vec3
 
 
 @wp.kernel
-def _look(
+def _write_rows(
     # Model:
     fields: wp.array[DistanceField],
     scene_of_world: wp.array[wp.int32],
@@ -299,35 +300,47 @@ def _probe(
 
 
 class Episodes:
-    """Draws how the episodes of all worlds begin; launches only.
+    """Draws how the episodes of all worlds begin, and writes what is known of vehicles; launches only.
+
+    `config`: how they begin. `routes`: of `make_routes`. `probes`: points, ahead of, to the left of and above
+    the vehicle, level [m]. `drawn`: what else episodes draw.
 
     Attributes:
         start: Arguments of `Simulation.reset`: arrays of the device that `begin` overwrites.
         seeds: Seed of the present episode of each world, device array of uint64, shape [N].
-        goal: Where to go [m], device array of vec3, shape [N].
         draws: Uniform numbers of each episode, device array of float32, shape [N, DRAW_COUNT].
         parameters: Of the airframe in each episode, device array of float32, shape [N, 5]; see `PARAMETERS`.
+        rows: What is known of each vehicle, device array of float32, shape [N, COLUMN_COUNT]; see `COLUMNS`.
+        distances: Distance to the scene of the probes, to a voxel [m], likewise, shape [N, K].
     """
 
     def __init__(
-        self, config: StartConfig, routes: Any, scene_of_world: Any, *, world_count: int, device: Any
+        self,
+        sim: Simulation,
+        config: StartConfig,
+        routes: Any,
+        *,
+        probes: Sequence[tuple[float, float, float]],
+        drawn: Randomisation,
     ) -> None:
         self._start = _Start()
         self._start.speed = wp.vec2(*config.speed_m_s)
         self._start.tilt_max = config.tilt_max_rad
         self._start.rate_max = config.rate_max_rad_s
         self._start.aimed = config.aimed
-        self._routes, self._scene_of_world, self._device = routes, scene_of_world, device
+        self._sim, self._routes, self._drawn, worlds = sim, routes, drawn, sim.count
+
+        def zeros(shape: Any, dtype: Any = wp.float32) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=sim.device)
+
         widths = {"position": 3, "velocity": 3, "orientation": 4, "body_rate": 3}
-        self.start = {
-            name: wp.zeros((world_count, width), dtype=wp.float64, device=device)
-            for name, width in widths.items()
-        }
-        self.seeds: Any = wp.zeros(world_count, dtype=wp.uint64, device=device)
-        self.goal: Any = wp.zeros(world_count, dtype=wp.vec3, device=device)
-        self.draws: Any = wp.zeros((world_count, DRAW_COUNT), dtype=wp.float32, device=device)
-        rows = np.tile(np.array([1.0, 1.0, 1.0, 0.0, 0.0], dtype=np.float32), (world_count, 1))
-        self.parameters: Any = wp.array(rows, dtype=wp.float32, device=device)
+        self.start = {name: zeros((worlds, width), wp.float64) for name, width in widths.items()}
+        self.seeds, self._goal = zeros(worlds, wp.uint64), zeros(worlds, wp.vec3)
+        self.draws, self.rows = zeros((worlds, DRAW_COUNT)), zeros((worlds, COLUMN_COUNT))
+        self.distances = zeros((worlds, len(probes)))
+        self._probes: Any = wp.array(list(probes), dtype=wp.vec3, device=sim.device)
+        rows = np.tile(np.array([1.0, 1.0, 1.0, 0.0, 0.0], dtype=np.float32), (worlds, 1))
+        self.parameters: Any = wp.array(rows, dtype=wp.float32, device=sim.device)
         self._nominal: Any = None
 
     def seed(self, seed: int) -> None:
@@ -338,88 +351,29 @@ class Episodes:
 
     def begin(self, mask: Any, *, again: bool = False) -> None:
         """Draw the next episode of the worlds of a mask, device array of bool, [N]; or the same again."""
-        wp.launch(
-            _begin,
-            dim=len(self.seeds),
-            inputs=[*self._routes, self._scene_of_world, self._start, mask, again, self.seeds],
-            outputs=[*self.start.values(), self.goal, self.draws],
-            device=self._device,
-        )
+        inputs = [*self._routes, self._sim.scene_of_world, self._start, mask, again, self.seeds]
+        self._launch(_begin, inputs, [*self.start.values(), self._goal, self.draws])
 
-    def vary_airframes(
-        self,
-        mask: Any,
-        airframes: Any,
-        drawn: Randomisation,
-    ) -> None:
+    def vary_airframes(self, mask: Any) -> None:
         """Draw the airframes of the worlds of a mask: factors on those of the first call, and a wind."""
+        airframes, drawn = self._sim.airframes, self._drawn
         if self._nominal is None:
             self._nominal = wp.clone(airframes[:1])
         ranges = _Ranges()
         ranges.mass, ranges.inertia = wp.vec2(*drawn.mass_factor), wp.vec2(*drawn.inertia_factor)
         ranges.drag, ranges.wind_max = wp.vec2(*drawn.drag_factor), drawn.wind_m_s
-        wp.launch(
-            _vary_airframes,
-            dim=len(self.seeds),
-            inputs=[self._nominal, ranges, mask, self.seeds],
-            outputs=[airframes, self.parameters],
-            device=self._device,
-        )
+        self._launch(_vary_airframes, [self._nominal, ranges, mask, self.seeds], [airframes, self.parameters])
 
+    def write_rows(self, observation: Observation) -> None:
+        """Write what is known of all vehicles: `rows` and `distances`."""
+        scenes, drawn, state = [self._sim.fields, self._sim.scene_of_world], self._drawn, observation.state
+        noise = [drawn.gyro_bias_rad_s, drawn.gyro_noise_rad_s, drawn.gravity_noise]
+        moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
+        self._launch(_write_rows, [*scenes, *noise, self.seeds, *moving, self._goal], [self.rows])
+        if self.distances.shape[1]:
+            inputs = [*scenes, self._probes, self.rows]
+            self._launch(_probe, inputs, [self.distances], dim=self.distances.shape)
 
-def look_at_vehicles(
-    rows: Any,
-    observation: Observation,
-    episodes: Episodes,
-    *,
-    fields: Any,
-    scene_of_world: Any,
-    drawn: Randomisation,
-) -> None:
-    """Write what is known of the vehicles of all worlds, in float32; launches only.
-
-    Args:
-        rows: Overwritten, float32, shape [N, COLUMN_COUNT]; see `COLUMNS`.
-        observation: Of the step.
-        episodes: Their seeds address the noise; and where to go.
-        fields: Distance to each scene, array of `DistanceField`.
-        scene_of_world: Index of the scene of each world.
-        drawn: What gyroscope and attitude are measured with.
-    """
-    state = observation.state
-    moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
-    wp.launch(
-        _look,
-        dim=rows.shape[0],
-        inputs=[
-            fields,
-            scene_of_world,
-            drawn.gyro_bias_rad_s,
-            drawn.gyro_noise_rad_s,
-            drawn.gravity_noise,
-            episodes.seeds,
-            *moving,
-            episodes.goal,
-        ],
-        outputs=[rows],
-        device=rows.device,
-    )
-
-
-def probe(distances: Any, probes: Any, rows: Any, *, fields: Any, scene_of_world: Any) -> None:
-    """Write the distance to the scene of points about each vehicle, to a voxel; launches only.
-
-    Args:
-        distances: Overwritten [m], float32, shape [N, K].
-        probes: The points, ahead of, to the left of and above the vehicle, level [m], array of vec3, [K].
-        rows: Of `look_at_vehicles`.
-        fields: Distance to each scene, array of `DistanceField`.
-        scene_of_world: Index of the scene of each world.
-    """
-    wp.launch(
-        _probe,
-        dim=distances.shape,
-        inputs=[fields, scene_of_world, probes, rows],
-        outputs=[distances],
-        device=distances.device,
-    )
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any], dim: Any = None) -> None:
+        dim = len(self.seeds) if dim is None else dim
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)

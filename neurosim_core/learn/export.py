@@ -3,125 +3,99 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 from torch import nn
 
 from neurosim_core.learn import need
 from neurosim_core.learn.pilot import CARD
 from neurosim_core.learn.policies import EventPolicy
 
-_OPSET, _IR = 17, 8
+_GRAPH = """
+<ir_version: 8, opset_import: ["" : 17]>
+policy (float[1, {channels}, {height}, {width}] events, float[1, {vector_size}] vector,
+        float[1, {memory_size}] memory)
+    => (float[1, {action_count}] action, float[1, {memory_size}] memory_out)
+{{
+    one = Constant <value_float = 1.0> ()
+    tenth = Constant <value_float = 0.1> ()
+    lowest = Constant <value_float = -1.0> ()
+    parts = Constant <value_ints = [{hidden}, {hint_count}]> ()
+    time = Constant <value_ints = [0]> ()
+    magnitude = Abs (events)
+    grown = Add (magnitude, one)
+    logarithm = Log (grown)
+    sign = Sign (events)
+    surfaces = Mul (logarithm, sign)
+    {eyes}
+    features = Concat <axis = 1> (seen, vector)
+    {mix}
+    before, estimate = Split <axis = 1> (memory, parts)
+    input = Concat <axis = 1> (mixed, estimate)
+    memory_bias = Concat <axis = 1> (memory_bias_ih, memory_bias_hh)
+    input_of_time = Unsqueeze (input, time)
+    before_of_time = Unsqueeze (before, time)
+    every, after_of_time = GRU <hidden_size = {hidden}, linear_before_reset = 1>
+        (input_of_time, memory_weight_ih, memory_weight_hh, memory_bias, , before_of_time)
+    after = Squeeze (after_of_time, time)
+    change = Gemm <transB = 1> (after, change_weight, change_bias)
+    step = Mul (change, tenth)
+    moved = Add (estimate, step)
+    memory_out = Concat <axis = 1> (after, moved)
+    remembered = Concat <axis = 1> (memory_out, vector)
+    {head}
+    action = Clip (mean, lowest, one)
+}}
+"""
+"""The graph in ONNX's own language: exporters of PyTorch change from release to release."""
+
+_OPERATORS: dict[type, str] = {nn.ELU: "Elu", nn.Flatten: "Flatten"}
 
 
 def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> None:
     """Write one step of a student for one vehicle.
 
     Inputs: `events` [1, C, H, W], `vector` [1, n], `memory` [1, m], zeros when an episode begins. Outputs:
-    `action` [1, 4] in [-1, 1], `memory_out`. All float32. The graph is written node by node: exporters of
-    PyTorch change from release to release. `card`: what whoever flies it needs to know; kept in the file.
+    `action` [1, 4] in [-1, 1], `memory_out`. All float32. `card`: what whoever flies it needs to know; kept
+    in the file.
     """
     onnx = need("onnx")
-    shape, graph = policy.shape, _Graph(onnx)
-    hidden, size = policy.hidden, policy.memory_size
-    grown = graph.add("Add", [graph.add("Abs", ["events"]), graph.constant(np.float32(1.0))])
-    seen = graph.add("Mul", [graph.add("Log", [grown]), graph.add("Sign", ["events"])])
-    for layer in policy.eyes:
-        seen = graph.layer(layer, seen)
-    features = graph.add("Concat", [seen, "vector"], axis=1)
-    for layer in policy.mix:
-        features = graph.layer(layer, features)
-    before, estimate = graph.columns("memory", 0, hidden), graph.columns("memory", hidden, size)
-    inputs = graph.add("Concat", [features, estimate], axis=1)
-    after = graph.gru(policy.memory, inputs, before)
-    change = graph.add("Mul", [graph.layer(policy.change, after), graph.constant(np.float32(0.1))])
-    estimate = graph.add("Add", [estimate, change])
-    memory = graph.add("Concat", [after, estimate], output="memory_out", axis=1)
-    action = graph.add("Concat", [memory, "vector"], axis=1)
-    for layer in policy.head:
-        action = graph.layer(layer, action)
-    bounds = [graph.constant(np.float32(bound)) for bound in (-1.0, 1.0)]
-    graph.add("Clip", [action, *bounds], output="action")
-
-    def tensor(name: str, *size: int) -> Any:
-        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, *size])
-
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(
-            graph.nodes,
-            "policy",
-            [
-                tensor("events", shape["channels"], shape["height"], shape["width"]),
-                tensor("vector", shape["vector_size"]),
-                tensor("memory", size),
-            ],
-            [tensor("action", shape["action_count"]), tensor("memory_out", size)],
-            graph.constants,
-        ),
-        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
-        ir_version=_IR,
-    )
+    layers = {
+        "eyes": _lines(policy.eyes, "eyes", "surfaces", "seen"),
+        "mix": _lines(policy.mix, "mix", "features", "mixed"),
+        "head": _lines(policy.head, "head", "remembered", "mean"),
+    }
+    text = {name: "\n    ".join(lines) for name, lines in layers.items()}
+    model = onnx.parser.parse_model(_GRAPH.format(**policy.shape, memory_size=policy.memory_size, **text))
+    for name, value in _weights(policy):
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value.detach().cpu().numpy(), name))
     onnx.helper.set_model_props(model, {CARD: json.dumps(dict(card))})
     onnx.checker.check_model(model)
     onnx.save(model, str(file))
 
 
-class _Graph:
-    """Nodes and constants of an ONNX graph."""
-
-    def __init__(self, onnx: Any) -> None:
-        self._onnx = onnx
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-
-    def constant(self, value: Any) -> str:
-        name = f"c{len(self.constants)}"
-        self.constants.append(self._onnx.numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-    def add(self, kind: str, inputs: list[str], output: str | None = None, **attributes: Any) -> str:
-        name = output or f"n{len(self.nodes)}"
-        self.nodes.append(self._onnx.helper.make_node(kind, inputs, [name], **attributes))
-        return name
-
-    def columns(self, x: str, begin: int, end: int) -> str:
-        bounds = [self.constant(np.array([n], np.int64)) for n in (begin, end, 1)]
-        return self.add("Slice", [x, *bounds])
-
-    def weights(self, values: Any) -> str:
-        return self.constant(values.detach().cpu().numpy())
-
-    def linear(self, weight: Any, bias: Any, x: str) -> str:
-        return self.add("Gemm", [x, self.weights(weight), self.weights(bias)], transB=1)
-
-    def layer(self, layer: nn.Module, x: str) -> str:
+def _lines(layers: nn.Sequential, name: str, x: str, output: str) -> Iterator[str]:
+    """Yield the nodes of layers, whose weights are `NAME_INDEX_weight` and `NAME_INDEX_bias`."""
+    for index, layer in enumerate(layers):
+        y = output if index == len(layers) - 1 else f"{name}_{index}"
+        inputs = f"({x}, {name}_{index}_weight, {name}_{index}_bias)"
         if isinstance(layer, nn.Conv2d):
-            values = [self.weights(each) for each in layer.parameters()]
-            pads, strides = (int(layer.padding[0]),) * 4, layer.stride  # type: ignore[arg-type]
-            return self.add("Conv", [x, *values], pads=pads, strides=strides)
-        if isinstance(layer, nn.Linear):
-            return self.linear(layer.weight, layer.bias, x)
-        kinds: dict[type, str] = {nn.ELU: "Elu", nn.Flatten: "Flatten"}
-        return self.add(kinds[type(layer)], [x])
+            pads = [*layer.padding, *layer.padding]
+            yield f"{y} = Conv <pads = {pads}, strides = {[*layer.stride]}> {inputs}"
+        elif isinstance(layer, nn.Linear):
+            yield f"{y} = Gemm <transB = 1> {inputs}"
+        else:
+            yield f"{y} = {_OPERATORS[type(layer)]} ({x})"
+        x = y
 
-    def gru(self, cell: nn.GRUCell, x: str, memory: str) -> str:
-        """Return the memory after a step, by the equations of `torch.nn.GRUCell`."""
-        parts = []
-        size = self.constant(np.full(3, cell.hidden_size, np.int64))
-        for weight, bias, value in (
-            (cell.weight_ih, cell.bias_ih, x),
-            (cell.weight_hh, cell.bias_hh, memory),
-        ):
-            names = [f"g{len(self.nodes)}_{part}" for part in range(3)]
-            joined = self.linear(weight, bias, value)
-            self.nodes.append(self._onnx.helper.make_node("Split", [joined, size], names, axis=1))
-            parts.append(names)
-        reset, update = (
-            self.add("Sigmoid", [self.add("Add", [parts[0][gate], parts[1][gate]])]) for gate in range(2)
-        )
-        kept = self.add("Mul", [reset, parts[1][2]])
-        new = self.add("Tanh", [self.add("Add", [parts[0][2], kept])])
-        return self.add("Add", [new, self.add("Mul", [update, self.add("Sub", [memory, new])])])
+
+def _weights(policy: EventPolicy) -> Iterator[tuple[str, torch.Tensor]]:
+    """Yield the initialisers of the graph; a GRU of ONNX has its update gate before its reset gate."""
+    for name, value in policy.state_dict().items():
+        if name.startswith("memory."):
+            reset, update, new = value.chunk(3)
+            value = torch.cat([update, reset, new])[None]
+        yield name.replace(".", "_"), value

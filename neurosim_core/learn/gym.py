@@ -92,9 +92,6 @@ class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
             extra,
         )
 
-    def close_extras(self, **_: Any) -> None:
-        """Nothing to close: memory is freed with the object."""
-
     def _arrays(self, observations: Observations) -> Arrays:
         """Return copies on the host."""
         return {
@@ -138,8 +135,6 @@ def make_numpy_env(*, task: str, num_envs: int = 1, group: str | None = None, **
 
 def register_all() -> None:
     """Register all tasks as `neurosim/NAME-v0`."""
-    import neurosim_core.learn.tasks  # noqa: F401  (registers)
-
     for name in kinds("task"):
         identifier = f"neurosim/{name}-v0"
         if identifier not in gymnasium.registry:

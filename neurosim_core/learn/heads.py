@@ -10,7 +10,8 @@ events: Das et al. (2025), Fast Feature Field: past events in a form that suffic
 from __future__ import annotations
 
 import math
-from typing import ClassVar, NamedTuple
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,13 +31,52 @@ _RATE_MIN = 1e-4
 """Of a pixel without events: what never came may come."""
 
 
-class DepthHead:
+class Head(ABC):
+    """What is predicted of each pixel, and how well; targets and predictions are [..., C, H, W]."""
+
+    field: ClassVar[str]
+    """Of a batch: where the target comes from."""
+    start: ClassVar[tuple[float, ...]]
+    """Predicted before training, one number for each channel."""
+    mirrored: ClassVar[tuple[float, ...]]
+    """Factor of each channel in a mirrored picture."""
+    ahead: ClassVar[int] = 0
+    """Of so many windows later."""
+
+    @abstractmethod
+    def target(self, value: Tensor) -> Tensor:
+        """Return the target of what a batch has."""
+
+    @abstractmethod
+    def loss(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Return what is to become small."""
+
+    @abstractmethod
+    def constant(self, targets: Tensor) -> Tensor:
+        """Return the best prediction of each pixel without events, of targets [n, C, H, W]."""
+
+    @abstractmethod
+    def measure(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> Tensor:
+        """Return sums over a picture, shape [1, C, H, W], and the voxels that it was predicted from.
+
+        Sums of several pictures, float64 on the host, may be added.
+        """
+
+    @abstractmethod
+    def errors(self, sums: Tensor) -> Any:
+        """Return the errors of all pictures, a NamedTuple.
+
+        Raises:
+            ValueError: There is nothing to compare with.
+        """
+
+
+class DepthHead(Head):
     """The logarithm of planar depth [log m] at the end of a window; targets are depth [m]."""
 
     field: ClassVar[str] = "depth"
     start: ClassVar[tuple[float, ...]] = (math.log(2.0),)
     mirrored: ClassVar[tuple[float, ...]] = (1.0,)
-    ahead: ClassVar[int] = 0
 
     def target(self, value: Tensor) -> Tensor:
         """See `Head.target`."""
@@ -51,9 +91,30 @@ class DepthHead:
         known = _known(targets)
         return torch.where(known, targets, 1.0).log().sum(0) / known.sum(0).clamp(min=1)
 
-    def errors(self) -> DepthErrorSums:
+    def measure(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> Tensor:
+        """See `Head.measure`; what was seen does not count."""
+        known = _known(truth)
+        goal, found = truth[known].double(), predicted[known].double()
+        error, off_m = found - goal.log(), (found.exp() - goal).abs()
+        ratio = error.abs().exp()
+        shares = [off_m / goal, error**2, *(ratio < 1.25**k for k in (1, 2, 3)), torch.ones_like(goal)]
+        near = [goal < cut_m for cut_m in CUTOFFS_M]
+        cuts = [*(off_m[each] for each in near), *near]
+        spread = error.var(correction=0) if len(goal) else error.sum()
+        return torch.stack(
+            [*(each.double().sum() for each in (*shares, *cuts)), spread, known.any().double()]
+        ).cpu()
+
+    def errors(self, sums: Tensor) -> DepthErrors:
         """See `Head.errors`."""
-        return DepthErrorSums()
+        shares, count, cuts, (spread, pictures) = sums.split([5, 1, 2 * len(CUTOFFS_M), 2])
+        if not count:
+            raise ValueError("no picture has a depth to compare with")
+        abs_rel, squared, one, two, three = (shares / count).tolist()
+        off_m, near = cuts.chunk(2)
+        means = (off_m / near.clamp(min=1)).tolist()
+        si_log = float(spread / pictures)
+        return DepthErrors(abs_rel, squared**0.5, si_log, (one, two, three), tuple(means))
 
 
 def depth_loss(log_depth: Tensor, depth_m: Tensor) -> Tensor:
@@ -106,54 +167,12 @@ class DepthErrors(NamedTuple):
         )
 
 
-class DepthErrorSums:
-    """Adds up the errors of pictures."""
-
-    def __init__(self) -> None:
-        self._sums = torch.zeros(5, dtype=torch.float64)
-        self._cuts = torch.zeros(2, len(CUTOFFS_M), dtype=torch.float64)
-        self._si_log: list[float] = []
-        self._count = 0
-
-    def add(self, log_depth: Tensor, depth_m: Tensor, seen: Tensor | None = None) -> None:
-        """Add pictures, shape [..., H, W]; what was seen does not count."""
-        for prediction, truth in zip(
-            log_depth.reshape(-1, *log_depth.shape[-2:]),
-            depth_m.reshape(-1, *depth_m.shape[-2:]),
-            strict=True,
-        ):
-            known = _known(truth)
-            if not known.any():
-                continue
-            goal, found = truth[known].double(), prediction[known].double()
-            error, off_m = found - goal.log(), (found.exp() - goal).abs()
-            ratio = error.abs().exp()
-            terms = [off_m / goal, error**2, *(ratio < 1.25**k for k in (1, 2, 3))]
-            self._sums += torch.stack([term.double().sum().cpu() for term in terms])
-            self._si_log.append(float(error.var(correction=0)))
-            self._count += len(goal)
-            for index, cut_m in enumerate(CUTOFFS_M):
-                near = goal < cut_m
-                self._cuts[:, index] += torch.stack([off_m[near].sum(), near.sum().double()]).cpu()
-
-    def result(self) -> DepthErrors:
-        """Return the errors of all pictures."""
-        if self._count == 0:
-            raise ValueError("no picture has a depth to compare with")
-        abs_rel, squared, *deltas = (self._sums / self._count).tolist()
-        one, two, three = deltas
-        means = (self._cuts[0] / self._cuts[1].clamp(min=1)).tolist()
-        si_log = sum(self._si_log) / len(self._si_log)
-        return DepthErrors(abs_rel, squared**0.5, si_log, (one, two, three), tuple(means))
-
-
-class FlowHead:
+class FlowHead(Head):
     """Where in the picture at the start of a window each pixel of its end was, column and row [px]."""
 
     field: ClassVar[str] = "flow"
     start: ClassVar[tuple[float, ...]] = (0.0, 0.0)
     mirrored: ClassVar[tuple[float, ...]] = (-1.0, 1.0)
-    ahead: ClassVar[int] = 0
 
     def target(self, value: Tensor) -> Tensor:
         """See `Head.target`."""
@@ -168,9 +187,20 @@ class FlowHead:
         """Return the mean flow of each pixel."""
         return torch.nanmean(torch.where(torch.isfinite(targets), targets, torch.nan), 0).nan_to_num()
 
-    def errors(self) -> FlowErrorSums:
+    def measure(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> Tensor:
+        """See `Head.measure`."""
+        off, known = _off(predicted, truth)
+        error = off.double().square().sum(-3).sqrt()
+        taken = [error[counted] for counted in (known, known & (seen != 0).any(-3))]
+        sums = [(each.sum(), (each > OUTLIER_PX).sum(), torch.tensor(len(each))) for each in taken]
+        return torch.tensor(sums, dtype=torch.float64)
+
+    def errors(self, sums: Tensor) -> FlowErrors:
         """See `Head.errors`."""
-        return FlowErrorSums()
+        if sums[0, 2] == 0:
+            raise ValueError("no picture has a flow to compare with")
+        means = sums[:, :2] / sums[:, 2:].clamp(min=1)
+        return FlowErrors(*means.flatten().tolist())
 
 
 def _off(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -197,29 +227,7 @@ class FlowErrors(NamedTuple):
         )
 
 
-class FlowErrorSums:
-    """Adds up the errors of pictures."""
-
-    def __init__(self) -> None:
-        self._sums = torch.zeros(2, 3, dtype=torch.float64)
-
-    def add(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> None:
-        """See `Errors.add`."""
-        off, known = _off(predicted, truth)
-        error = off.double().square().sum(-3).sqrt()
-        for row, counted in enumerate((known, known & (seen != 0).any(-3))):
-            taken = error[counted]
-            self._sums[row] += torch.stack([taken.sum(), (taken > OUTLIER_PX).sum(), counted.sum()]).cpu()
-
-    def result(self) -> FlowErrors:
-        """See `Errors.result`."""
-        if self._sums[0, 2] == 0:
-            raise ValueError("no picture has a flow to compare with")
-        means = self._sums[:, :2] / self._sums[:, 2:].clamp(min=1)
-        return FlowErrors(*means.flatten().tolist())
-
-
-class FutureHead:
+class FutureHead(Head):
     """Log odds that a pixel has an event of each polarity, darker and brighter, in the next window.
 
     Pretraining without labels: what predicts them has to know how edges move, which depth and flow follow
@@ -243,9 +251,19 @@ class FutureHead:
         """Return the log odds of how often each pixel has events."""
         return torch.logit(targets.float().mean(0), eps=_RATE_MIN)
 
-    def errors(self) -> FutureErrorSums:
+    def measure(self, predicted: Tensor, truth: Tensor, seen: Tensor) -> Tensor:
+        """See `Head.measure`."""
+        nats = functional.binary_cross_entropy_with_logits(
+            predicted.double(), truth.double(), reduction="sum"
+        )
+        said, happened = predicted > 0.0, truth > 0
+        counts = ((said & happened).sum(), said.sum() + happened.sum(), truth.numel())
+        return torch.tensor([nats, *counts], dtype=torch.float64)
+
+    def errors(self, sums: Tensor) -> FutureErrors:
         """See `Head.errors`."""
-        return FutureErrorSums()
+        nats, hits, both, count = sums.tolist()
+        return FutureErrors(nats / count / math.log(2.0), 2.0 * hits / max(both, 1.0))
 
 
 class FutureErrors(NamedTuple):
@@ -260,26 +278,5 @@ class FutureErrors(NamedTuple):
         return f"{self.bits:.4f} bit for each pixel and polarity, F1 {self.f1:.3f}"
 
 
-class FutureErrorSums:
-    """Adds up the errors of pictures."""
-
-    def __init__(self) -> None:
-        self._sums = torch.zeros(4, dtype=torch.float64)
-
-    def add(self, predicted: Tensor, truth: Tensor, seen: Tensor | None = None) -> None:
-        """See `Errors.add`."""
-        nats = functional.binary_cross_entropy_with_logits(
-            predicted.double(), truth.double(), reduction="sum"
-        )
-        said = predicted > 0.0
-        counts = [(said & (truth > 0)).sum(), said.sum() + (truth > 0).sum()]
-        self._sums += torch.stack(
-            [nats.cpu(), *(count.double().cpu() for count in counts), nats.new_tensor(truth.numel()).cpu()]
-        )
-
-    def result(self) -> FutureErrors:
-        """See `Errors.result`."""
-        nats, hits, both, count = self._sums.tolist()
-        if not count:
-            raise ValueError("no window follows on another")
-        return FutureErrors(nats / count / math.log(2.0), 2.0 * hits / max(both, 1.0))
+HEADS: dict[str, Head] = {"depth": DepthHead(), "flow": FlowHead(), "pretrain": FutureHead()}
+"""What can be learned, by the name of its command."""

@@ -118,7 +118,7 @@ class EventPolicy(nn.Module):
             nn.Linear(self.memory_size + vector_size, 64), nn.ELU(), nn.Linear(64, action_count)
         )
 
-    def see(self, surfaces: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    def encode(self, surfaces: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
         """Return features of a step, [n, 96]; on CUDA bfloat16 does for surfaces in half precision."""
         seen = torch.log1p(surfaces.abs()) * surfaces.sign()  # voxel grids have both signs
         halved = seen.is_cuda and seen.dtype == torch.float16
@@ -127,7 +127,7 @@ class EventPolicy(nn.Module):
         features: torch.Tensor = self.mix(torch.cat([seen, vector], dim=-1))
         return features
 
-    def remember(self, features: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
+    def update_memory(self, features: torch.Tensor, memory: torch.Tensor) -> torch.Tensor:
         """Return the memory after a step, [N, memory_size]."""
         hidden, estimate = memory[:, : self.hidden], memory[:, self.hidden :]
         hidden = self.memory(torch.cat([features, estimate], dim=1), hidden)
@@ -144,7 +144,7 @@ class EventPolicy(nn.Module):
         self, surfaces: torch.Tensor, vector: torch.Tensor, memory: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return actions (not clamped), and the memory for the next step."""
-        memory = self.remember(self.see(surfaces, vector), memory)
+        memory = self.update_memory(self.encode(surfaces, vector), memory)
         return self.head(torch.cat([memory, vector], dim=1)), memory
 
     def unroll(
@@ -155,10 +155,10 @@ class EventPolicy(nn.Module):
         `surfaces`: [T, N, C, H, W]. `vectors`: [T, N, n]. `begun`: an episode begins with this step: the
         memory is empty, float32, [T, N]. `memory`: before the first, [N, memory_size].
         """
-        seen = self.see(surfaces.flatten(0, 1), vectors.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
+        seen = self.encode(surfaces.flatten(0, 1), vectors.flatten(0, 1)).unflatten(0, surfaces.shape[:2])
         memories = []
         for features, keep in zip(seen, 1.0 - begun, strict=True):
-            memory = self.remember(features, memory * keep[:, None])
+            memory = self.update_memory(features, memory * keep[:, None])
             memories.append(memory)
         remembered = torch.stack(memories)
         return self.head(torch.cat([remembered, vectors], dim=2)), remembered[..., self.hidden :]

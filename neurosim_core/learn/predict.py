@@ -14,7 +14,7 @@ from cortex.messages import Image
 from neurosim_core.data import LiveSource, Stream
 from neurosim_core.install import check_cortex
 from neurosim_core.learn.dense_train import load_dense
-from neurosim_core.live.topics import predicted_topic
+from neurosim_core.live.topics import stream_topic
 
 check_cortex()
 
@@ -42,7 +42,7 @@ def predict(
     if config.task not in _ENCODINGS:
         raise ValueError(f"{file} is of `neurosim learn {config.task}`: only depth and flow are pictures")
     net.to(device)
-    topic, encoding = predicted_topic(vehicle, config.task), _ENCODINGS[config.task]
+    topic, encoding = stream_topic(vehicle, f"predicted/{config.task}"), _ENCODINGS[config.task]
     source = LiveSource(vehicles=[vehicle], timeout_s=_SILENT_S)
     options: dict[str, Any] = {
         "fields": ["events"],

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from neurosim_core.learn.descent import Descent, Replayed
+from neurosim_core.learn.descent import Descent, GraphedFunction
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import Critic, EventPolicy, make_event_policy
 from neurosim_core.learn.ppo import (
@@ -80,7 +80,7 @@ class RecurrentPpo:
             for name in ("surface", "vector", "hint", "critic", "begun", "action", "log_p", "value")
         }
         self._noise = torch.zeros_like(self._seen["action"])
-        self._act = Replayed(self._decide, on_cuda=on_cuda)
+        self._act = GraphedFunction(self._decide, on_cuda=on_cuda)
         self._rows = torch.zeros(env.num_envs // config.minibatches, dtype=torch.int64, device=env.device)
         self._hint_error = torch.zeros((), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
@@ -110,7 +110,7 @@ class RecurrentPpo:
         self._first_memory.copy_(self._memory)
         ended = torch.zeros(3, device=env.device)  # episodes, successes, crashes
         for step in range(config.horizon):
-            self._look(self._now)
+            self._copy_observations(self._now)
             self._noise.normal_(generator=self._generator)
             self._act()
             for name, value in self._seen.items():
@@ -127,8 +127,8 @@ class RecurrentPpo:
             kept[name].copy_(batch[name])
         return flown_log(kept["reward"], torch.exp(self._module.log_spread), ended)
 
-    def _look(self, now: Observations) -> None:
-        """Copy what is seen to where `_decide` looks."""
+    def _copy_observations(self, now: Observations) -> None:
+        """Copy what is seen to where `_decide` reads it."""
         seen, env = self._seen, self.env
         seen["begun"].copy_(self._begun)
         seen["surface"].copy_(now["events"])

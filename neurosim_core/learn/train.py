@@ -24,8 +24,14 @@ import torch
 from neurosim_core.learn import need, ranks
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
 from neurosim_core.learn.env import Env, find_task, make_env
-from neurosim_core.learn.evaluate import Evaluation, evaluate_policy, student_actor, teacher_actor
-from neurosim_core.learn.film import film_episode, film_sensors
+from neurosim_core.learn.evaluate import (
+    Evaluation,
+    evaluate_policy,
+    film_episode,
+    film_sensors,
+    student_actor,
+    teacher_actor,
+)
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
 from neurosim_core.learn.randomisation import Randomisation
@@ -163,11 +169,6 @@ class Training:
         policy = self._trainers["student"].policy
         assert isinstance(policy, EventPolicy)
         return policy
-
-    @property
-    def models(self) -> Sequence[Model]:
-        """Of the scenes it trains in."""
-        return self.env.sim.models
 
     def resume(self) -> None:
         """Go on from the checkpoint of the folder."""

@@ -1,25 +1,33 @@
-"""Requests to a running simulator: `neurosim call reset | step | pause | resume | set | status`."""
+"""A running simulator from the terminal: requests and its status (`neurosim call`), and `neurosim top`."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.markdown import Markdown
 from rich.markup import escape
+from rich.text import Text
 
-from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
+from cortex import Node, ServiceTimeout, ServiceUnavailable, Subscriber, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.live.topics import SERVICES, STATUS, STEP_DEADLINE_S
 from neurosim_core.overrides import read_settings
+from neurosim_core.signals import raise_at_signals
 
 _TABLE_WIDTH = 100
+_BARS = " ▁▂▃▄▅▆▇█"
+_HISTORY = 60
+_NEXT_S = 1.0
+_LOST_AFTER_S = 5.0
 GRACE_S = 1.0
 """How much longer than the steps may take the client waits to hear that they were not over [s]."""
 
@@ -36,7 +44,8 @@ def call(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--timeout must be > 0, got {timeout_s}")
     if arguments.what == "status":
         wide = Console(highlight=False, width=max(console.width, _TABLE_WIDTH))
-        wide.print(Markdown(describe_status(_status(timeout_s))))
+        with Node("call") as node, node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses:
+            wide.print(Markdown(describe_status(_status(statuses, timeout_s))))
         return 0
     service, request = _request(arguments)
     with Node("call") as node:
@@ -186,13 +195,12 @@ def ask(node: Node, service: str, request: Any, timeout_s: float) -> SimulatorRe
     return reply
 
 
-def _status(timeout_s: float) -> SimulatorStatus:
+def _status(statuses: Subscriber[SimulatorStatus], timeout_s: float) -> SimulatorStatus:
     """Wait for the next status."""
-    with Node("call") as node, node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses:
-        try:
-            return statuses.recv(timeout_s)
-        except TimeoutError:
-            raise RuntimeError(no_simulator(timeout_s)) from None
+    try:
+        return statuses.recv(timeout_s)
+    except TimeoutError:
+        raise RuntimeError(no_simulator(timeout_s)) from None
 
 
 def no_simulator(timeout_s: float) -> str:
@@ -202,3 +210,52 @@ def no_simulator(timeout_s: float) -> str:
 
 def _ms(duration_ns: int) -> str:
     return f"{duration_ns * 1e-6:.2f} ms"
+
+
+class Dashboard:
+    """What `top` shows, from one status to the next."""
+
+    def __init__(self) -> None:
+        self._factors: deque[float] = deque(maxlen=_HISTORY)
+        self._rates = SensorRates()
+
+    def update(self, status: SimulatorStatus) -> Group:
+        """Return the screen after a status."""
+        self._factors.append(status.real_time_factor)
+        most = max(1.0, status.real_time_factor_wanted, *self._factors)
+        bars = "".join(_BARS[round(factor / most * (len(_BARS) - 1))] for factor in self._factors)
+        return Group(
+            Text.assemble(("real-time factor ", "dim"), (bars, "green"), f" {status.real_time_factor:.2f}"),
+            Markdown(describe_status(status, rates_hz=self._rates.update(status))),
+        )
+
+
+def top(*, once: bool = False, timeout_s: float = 10.0) -> int:
+    """Show the status until Ctrl-C, or until the run has ended.
+
+    `once`: print the screen after two statuses, and stop. `timeout_s`: how long to wait for a simulator [s].
+    """
+    console, dashboard = Console(highlight=False), Dashboard()
+    with (
+        raise_at_signals() as raise_again,
+        Node("top") as node,
+        node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses,
+    ):
+        screen = dashboard.update(_status(statuses, timeout_s))
+        if once:
+            with contextlib.suppress(TimeoutError):  # of a run that has ended there is no other
+                screen = dashboard.update(statuses.recv(_NEXT_S))
+            console.print(screen)
+            return 0
+        with Live(screen, console=console, screen=console.is_terminal, auto_refresh=False) as live:
+            while True:
+                raise_again()
+                try:
+                    status = statuses.recv(_LOST_AFTER_S)
+                except TimeoutError:
+                    break
+                live.update(dashboard.update(status), refresh=True)
+                if status.phase == "ended":
+                    break
+    console.print("the simulator has ended")
+    return 0

@@ -76,14 +76,11 @@ class CommandSubscriber:
     def __init__(
         self, node: Node, vehicle: str, *, rotor_count: int, ranges: CommandRanges, lockstep: bool
     ) -> None:
-        """Subscribe.
+        """Subscribe on a node.
 
-        Args:
-            node: Owner of the subscriptions.
-            vehicle: Name of the vehicle.
-            rotor_count: Numbers in a command of rotor speeds.
-            ranges: What the vehicle can be asked for; its controller clamps what is beyond.
-            lockstep: Every command counts, and a sender that floods is held up.
+        `rotor_count`: numbers in a command of rotor speeds. `ranges`: what the vehicle can be asked for; its
+        controller clamps what is beyond. `lockstep`: every command counts, and a sender that floods is held
+        up.
         """
         policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
@@ -160,15 +157,10 @@ class CommandSubscriber:
     def wait(
         self, fits: Callable[[Command], bool], *, deadline_s: float | None, wake: Callable[[], bool]
     ) -> Command | None:
-        """Wait for a command that fits; others are superseded.
+        """Wait for a command that fits, and return it; others are superseded.
 
-        Args:
-            fits: Returns whether a command is waited for.
-            deadline_s: When to give up, on `time.monotonic` [s]; None: never.
-            wake: Called about every 20 ms; ends the wait by returning True.
-
-        Returns:
-            The command; None if the wait ended without one.
+        `deadline_s`: when to give up and return None, on `time.monotonic` [s]; None: never. `wake`: called
+        about every 20 ms; ends the wait by returning True.
         """
         while True:
             left_s = _BLOCK_S if deadline_s is None else deadline_s - time.monotonic()
@@ -285,14 +277,7 @@ class CommandHold:
     """
 
     def __init__(self, live: LiveConfig, link: LinkConfig, *, airframe: MultirotorConfig, seed: int) -> None:
-        """Begin without a command.
-
-        Args:
-            live: See above.
-            link: The link of the commands.
-            airframe: What is flown.
-            seed: Seed of the link.
-        """
+        """Begin without a command; `link` is that of the commands, and `seed` its seed."""
         self.live = live
         self.link = Link(link, seed=seed, name="command")
         self._lowest = np.full(airframe.rotor_count, airframe.rotor_speed_min_rad_s)
@@ -314,14 +299,10 @@ class CommandHold:
     def command_at(
         self, stamp_ns: int, observe: Callable[[], Odometry]
     ) -> tuple[CommandMode, NDArray[np.float64] | None]:
-        """Return the command of the control period that begins at a tick.
+        """Return mode and setpoint of the control period that begins at a tick [ns].
 
-        Args:
-            stamp_ns: The tick [ns], after that of the last call.
-            observe: Returns the state of the vehicle at the tick.
-
-        Returns:
-            Mode and setpoint; the setpoint is None before the first command, unless the vehicle hovers then.
+        The setpoint is None before the first command, unless the vehicle hovers then. `observe`: returns the
+        state of the vehicle at the tick.
         """
         arrived = self.link.due(stamp_ns)
         if arrived:

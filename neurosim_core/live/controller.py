@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, TypeVar, cast, get_args
 
@@ -74,6 +75,7 @@ class PathController:
         self.vehicle = vehicle
         self.command_count = self.lost_count = self.missing_count = 0
         self.error_square_sum_m2 = 0.0
+        self._told = (0, 0.0)
         self._follower = follower
         self._delay_s = delay_s
         self._wait_s = _ROTORS_S["lockstep" if lockstep else "streaming"]
@@ -133,6 +135,17 @@ class PathController:
         with contextlib.suppress(Closed):
             while not self._closed.is_set():
                 self.answer(_LOOK_S)
+
+    def describe(self, elapsed_s: float) -> str:
+        """Return how it is doing since the last call, which is some time ago [s]."""
+        now = self.command_count, self.error_square_sum_m2
+        before, self._told = self._told, now
+        count, square_sum_m2 = now[0] - before[0], now[1] - before[1]
+        if not count:
+            return f"{self.vehicle}: no odometry"
+        error_m = math.sqrt(square_sum_m2 / count)
+        rate = f"{count / elapsed_s:.0f} commands/s"
+        return f"{self.vehicle}: {rate}, {100.0 * error_m:.1f} cm from its path (RMS)"
 
     def close(self) -> None:
         """Leave the topics, from any thread; `run` returns soon after."""
@@ -194,27 +207,27 @@ class PathController:
             logger.warning("%s: %s", self.vehicle, text)
 
 
+@dataclass(kw_only=True, eq=False)
 class _Fleet:
     """The controllers of all vehicles, a thread for each. A context manager."""
 
-    def __init__(self, node: Node, *, only: str | None, mode: FollowMode, delay_s: float) -> None:
-        self.mode = mode
-        self._node = node
-        self._only = only
-        self._delay_s = delay_s
-        self._planned: SimulationConfig | None = None
-        self._paths: dict[str, Path] = {}
-        self._controllers: list[PathController] = []
-        self._threads: list[Future[None]] = []
-        self._stack = contextlib.ExitStack()
-        self._updated_s = 0.0
-        self._before: dict[str, tuple[int, float]] = {}
+    node: Node
+    only: str | None
+    """Vehicle that is flown; None: all."""
+    mode: FollowMode
+    delay_s: float
+    _planned: SimulationConfig | None = None
+    _paths: dict[str, Path] = field(default_factory=dict)
+    _controllers: list[PathController] = field(default_factory=list)
+    _threads: list[Future[None]] = field(default_factory=list)
+    _stack: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    _updated_s: float = 0.0
 
     def plan(self, config: SimulationConfig) -> None:
         """Plan the paths, unless that was done."""
         if config == self._planned:
             return
-        names = list(config.vehicles) if self._only is None else [self._only]
+        names = list(config.vehicles) if self.only is None else [self.only]
         if unknown := [name for name in names if name not in config.vehicles]:
             raise ValueError(f"unknown vehicle {unknown[0]!r}, known: {', '.join(config.vehicles)}")
         self._paths, self._planned = plan_paths(config, names), config
@@ -228,14 +241,14 @@ class _Fleet:
             vehicle = config.of(name)
             airframe = vehicle.vehicle.airframe()
             controller = PathController(
-                self._node,
+                self.node,
                 name,
                 PathFollower(
                     path, airframe, vehicle.control.gains, mode=self.mode, controller=vehicle.control
                 ),
                 lockstep=lockstep,
                 rotor_speed=np.full(airframe.rotor_count, airframe.hover_rotor_speed_rad_s),
-                delay_s=self._delay_s,
+                delay_s=self.delay_s,
             )
             self._stack.callback(controller.close)  # before the pool waits for its threads
             self._controllers.append(controller)
@@ -247,7 +260,6 @@ class _Fleet:
         self._stack.close()
         self._controllers.clear()
         self._threads.clear()
-        self._before.clear()
 
     @property
     def vehicles(self) -> list[str]:
@@ -261,18 +273,7 @@ class _Fleet:
                 thread.result()
         now_s = time.monotonic()
         elapsed_s, self._updated_s = now_s - self._updated_s, now_s
-        return "; ".join(self._describe(controller, elapsed_s) for controller in self._controllers)
-
-    def _describe(self, controller: PathController, elapsed_s: float) -> str:
-        now = controller.command_count, controller.error_square_sum_m2
-        before = self._before.get(controller.vehicle, (0, 0.0))
-        self._before[controller.vehicle] = now
-        count, square_sum_m2 = now[0] - before[0], now[1] - before[1]
-        if not count:
-            return f"{controller.vehicle}: no odometry"
-        error_m = math.sqrt(square_sum_m2 / count)
-        rate = f"{count / elapsed_s:.0f} commands/s"
-        return f"{controller.vehicle}: {rate}, {100.0 * error_m:.1f} cm from its path (RMS)"
+        return "; ".join(controller.describe(elapsed_s) for controller in self._controllers)
 
     def __enter__(self) -> _Fleet:
         return self
@@ -285,15 +286,9 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
     """Fly the vehicles of a simulator along their paths, until it ends or this is interrupted.
 
     It waits for a simulator, and for the next one when that has gone. After a collision it waits for a reset.
-
-    Args:
-        config: What is flown where; None: as the simulator says.
-        vehicle: Fly only this one; None: all.
-        mode: What to command: motor_speeds, velocity or position.
-        delay_s: How long to sleep before each command [s].
-
-    Returns:
-        0: the simulator has flown all that it was to fly; 130: interrupted.
+    `config`: what is flown where; None: as the simulator says. `vehicle`: fly only this one; None: all.
+    `mode`: what to command: motor_speeds, velocity or position. `delay_s`: how long to sleep before each
+    command [s]. Returns 0 if the simulator has flown all that it was to fly, 130 if interrupted.
 
     Raises:
         ValueError: An argument is not allowed, there is no such vehicle, or no path.
@@ -312,7 +307,7 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
 
     with (
         Node("controller") as node,
-        _Fleet(node, only=vehicle, mode=cast(FollowMode, mode), delay_s=delay_s) as fleet,
+        _Fleet(node=node, only=vehicle, mode=cast(FollowMode, mode), delay_s=delay_s) as fleet,
         console.status("") as line,
         handle_signals(on_signal),
     ):

@@ -85,7 +85,8 @@ class Link:
             return None
         number = self._sent_count
         self._sent_count += 1
-        delay_ns, lost = self._latency_ns, self._wait_ns(stamp_ns) > self._queue_ns
+        wait_ns = 0 if self._ns_per_byte is None else self._busy_until_ns - stamp_ns
+        delay_ns, lost = self._latency_ns, wait_ns > self._queue_ns
         left_ns = stamp_ns if lost else self._occupy(stamp_ns, size_bytes)
         if self._jitter_ns or self._lost_below:
             jitter_bits, loss_bits = self._random_bits(number)
@@ -130,10 +131,6 @@ class Link:
         """Count the bytes that follow each other without a gap, so that no rounding accumulates."""
         self._burst_start_ns = start_ns
         self._burst_bytes = 0
-
-    def _wait_ns(self, stamp_ns: int) -> int:
-        """Return how long a message sent now waits for those before it [ns]."""
-        return 0 if self._ns_per_byte is None else max(self._busy_until_ns - stamp_ns, 0)
 
     def _occupy(self, stamp_ns: int, size_bytes: int) -> int:
         """Put a message on the link after those before it; return when its last byte is on it [ns]."""

@@ -19,9 +19,6 @@ class Pacer:
 
     Every deadline is computed from one origin in exact arithmetic: a late wake-up makes no later deadline
     late.
-
-    Attributes:
-        slipped_ns: Wall-clock time by which `slip` has moved deadlines in total [ns].
     """
 
     def __init__(
@@ -40,7 +37,6 @@ class Pacer:
         self._clock_ns = clock_ns
         self._sleep = sleep
         self._ratio = _exact(factor)
-        self.slipped_ns = 0
         self.start(0)
 
     @property
@@ -84,7 +80,6 @@ class Pacer:
         """
         late_ns = max(self.lateness_ns(stamp_ns), 0)
         self._origin_wall_ns += late_ns
-        self.slipped_ns += late_ns
         return late_ns
 
     def set_factor(self, factor: float) -> None:

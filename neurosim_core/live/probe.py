@@ -181,10 +181,9 @@ class StreamProbe:
         topic = stream_topic(vehicle, camera)
         self._imu = self._node.subscriber(stream_topic(vehicle, imu), Imu, policy=keep_last(_SMALL_DEPTH))
         self._events = self._node.subscriber(topic, Events, self._on_events, policy=keep_last(256))
-        self._node.subscriber(STATUS, SimulatorStatus, self._on_status, policy=latest())
+        self._statuses = self._node.subscriber(STATUS, SimulatorStatus, policy=latest())
         self._sequences: list[int] = []
         self._event_count = self._dropped_count = 0
-        self._status: SimulatorStatus | None = None
 
     def __enter__(self) -> StreamProbe:
         return self
@@ -196,9 +195,6 @@ class StreamProbe:
         self._sequences.append(events.sequence)
         self._event_count += len(events.t)
         self._dropped_count += events.dropped_count
-
-    def _on_status(self, status: SimulatorStatus) -> None:
-        self._status = status
 
     def listen(self, seconds: float, *, resident: Callable[[], list[int]], check: Check) -> StreamTrace:
         """Note what arrives.
@@ -218,8 +214,10 @@ class StreamProbe:
                 memory_ns.append(received_ns)
         memory.append(resident())
         memory_ns.append(samples[-1][1])
-        if self._status is None:
-            raise ProbeError(f"{STATUS} was silent for {seconds:g} s")
+        try:
+            status = self._statuses.recv(0.0)
+        except TimeoutError:
+            raise ProbeError(f"{STATUS} was silent for {seconds:g} s") from None
         stamps, times, sequences = np.array(samples, dtype=np.int64).T
         packets = self._sequences[:]
         return StreamTrace(
@@ -230,7 +228,7 @@ class StreamProbe:
             event_count=self._event_count,
             packet_lost_count=_gaps(packets),
             event_dropped_count=self._dropped_count,
-            status=self._status,
+            status=status,
             resident_bytes=np.array(memory, dtype=np.int64),
             resident_s=1e-9 * (np.array(memory_ns) - times[0]),
         )

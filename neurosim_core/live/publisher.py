@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -27,38 +27,12 @@ _EVENT_BYTES = 13
 _RESERVED_MAX_BYTES = 8 << 20
 
 
-class Topic:
-    """A publisher, and what its reliable readers lost.
-
-    Attributes:
-        publisher: Where messages go.
-        undelivered_count: Messages that a reliable reader lost since the last reset.
-    """
-
-    def __init__(self, publisher: Publisher[Any]) -> None:
-        self.publisher = publisher
-        self.undelivered_count = self._told_count = 0
-
-    def publish(self, message: Any, send: Callable[[Any], bool] | None = None) -> None:
-        """Publish a message with `send`, by default as usual; count it if a reliable reader loses it."""
-        if not (send or self.publisher.publish)(message):
-            self.undelivered_count += 1
-
-    def take_lost(self) -> bool:
-        """Return whether readers have lost messages since the last call."""
-        before, self._told_count = self._told_count, self.undelivered_count
-        return self.undelivered_count > before
-
-    def reset(self) -> None:
-        """Count from 0."""
-        self.undelivered_count = self._told_count = 0
-
-
-class PacketTopic(Topic):
+class PacketTopic:
     """One topic of packets, with the link in front of it.
 
     Attributes:
         name: Of the sensor, or odometry, rotor_speeds, collision.
+        publisher: Where messages go.
         link: Messages in flight.
         loan: Memory for its next picture; None: pictures are copied.
         late_times: How late by the wall clock messages were published since the last status [ns].
@@ -71,17 +45,9 @@ class PacketTopic(Topic):
     def __init__(
         self, name: str, publisher: Publisher[Any], link: Link, convert: Callable[..., Any], **options: Any
     ) -> None:
-        """Wrap a publisher.
-
-        Args:
-            name: See above.
-            publisher: Where messages go.
-            link: In front of it.
-            convert: Makes the message of a packet.
-            options: Further arguments of `convert`.
-        """
-        super().__init__(publisher)
+        """Put a link in front of a publisher; `convert` makes messages of packets, with further `options`."""
         self.name = name
+        self.publisher = publisher
         self.link = link
         self.loan: PictureLoan | None = None
         self.late_times = Timings()
@@ -94,7 +60,7 @@ class PacketTopic(Topic):
 
     def begin(self) -> None:
         """Begin a new run."""
-        self.reset()
+        self._lost_before = self.publisher.counters.timeouts
         self.late_times.take()
         self.published_count = 0
         self.delivered_ns: int | None = None
@@ -103,14 +69,16 @@ class PacketTopic(Topic):
         if self.loan is not None:
             self.loan.release()  # after the packet that holds it
 
+    @property
+    def undelivered_count(self) -> int:
+        """Messages that a reliable reader lost since the last reset."""
+        return self.publisher.counters.timeouts - self._lost_before
+
     def send(self, packet: Packet, *, at_once: bool = False) -> bool:
         """Publish a packet if there are subscribers; return whether it was published.
 
         A latched topic without subscribers keeps the newest packet and publishes it with the next `update`.
-
-        Args:
-            packet: What to publish.
-            at_once: Publish it without subscribers, too.
+        With `at_once` a packet is published without subscribers, too.
         """
         config = self.link.config
         clocked = config.clock_offset_s or config.clock_drift_ppm
@@ -121,8 +89,10 @@ class PacketTopic(Topic):
             return False
         message = self._convert(packet, clock_ns=config.clock_ns if clocked else None, **self._options)
         self._kept = None
-        in_place = self.loan is not None and isinstance(packet, Image) and self.loan.holds(packet.data)
-        self.publish(message, self.loan.publish if in_place and self.loan is not None else None)
+        if self.loan is not None and isinstance(packet, Image) and self.loan.holds(packet.data):
+            self.loan.publish(message)
+        else:
+            self.publisher.publish(message)
         self.published_count += not self.is_recorded
         if self._latched:
             self._last = message
@@ -138,7 +108,7 @@ class PacketTopic(Topic):
     def repeat(self) -> None:
         """Publish the last message of a latched topic again, bit for bit."""
         if self._last is not None:
-            self.publish(self._last)
+            self.publisher.publish(self._last)
 
 
 class PacketPublisher:
@@ -156,20 +126,17 @@ class PacketPublisher:
     def __init__(
         self, node: Node, vehicle: str, model: Model, *, record: Callable[[Packet], None] | None = None
     ) -> None:
-        """Open the topics of a vehicle, and publish what does not change.
+        """Open the topics of a vehicle on a node, and publish what does not change.
 
-        Args:
-            node: Owner of the topics.
-            vehicle: Name of the vehicle.
-            model: What is flown.
-            record: Called with every packet and every delivery.
+        `record`: called with every packet and every delivery.
         """
         self.vehicle = vehicle
         self.record = record
         self.lateness_ns: Callable[[int], int] | None = None
         self._node = node
         self._device = model.device
-        self._deliveries: dict[str, Topic] = {}
+        self._deliveries: dict[str, Publisher[Any]] = {}
+        self._lost_counts: dict[str, int] = {}
         config = model.config
         self._sensor_names = tuple(config.sensors)
         sensors = describe_sensors(config.sensors)
@@ -204,9 +171,9 @@ class PacketPublisher:
         for sensor in sensors:
             transform = messages.mount_transform(vehicle, sensor)
             if transform.child != transform.parent:
-                constants.append((topics.transform_topic(vehicle, sensor.name), transform))
+                constants.append((topics.stream_topic(vehicle, f"{sensor.name}/transform"), transform))
             if (info := messages.camera_info(vehicle, sensor)) is not None:
-                constants.append((topics.info_topic(vehicle, sensor.name), info))
+                constants.append((topics.stream_topic(vehicle, f"{sensor.name}/info"), info))
         self._constants = [node.publisher(topic, type(message), latch=True) for topic, message in constants]
         for publisher, (_, message) in zip(self._constants, constants, strict=True):
             publisher.publish(message)
@@ -219,8 +186,7 @@ class PacketPublisher:
         for topic in self.topics.values():
             topic.link.reset(seed=seed)
             topic.begin()
-        for delivery in self._deliveries.values():
-            delivery.reset()
+        self._lost_before = sum(publisher.counters.timeouts for publisher in self._publishers())
 
     def write_in_place(self, settle: Callable[[], object]) -> None:
         """Let the device write images into the memory of the topics; `settle` waits until it has."""
@@ -232,19 +198,13 @@ class PacketPublisher:
         """Return memory into which the device can write the next picture of a camera.
 
         There is none if the picture is recorded or passes a link, or if the camera has no subscriber.
-
-        Args:
-            name: Of the camera.
-            picture: Of the shape and dtype needed.
+        `picture`: of the shape and dtype needed.
         """
         topic = self.topics[name]
         if self.record is not None or not topic.subscriber_count or topic.loan is None:
             return None
-        return (
-            topic.loan.acquire(picture)
-            if topic.link.config.delivers_at_once and not len(topic.link)
-            else None
-        )
+        passes_link = not topic.link.config.delivers_at_once or len(topic.link)
+        return None if passes_link else topic.loan.acquire(picture)
 
     def close_loans(self) -> None:
         """Give back the memory of pictures; call it before the topics close."""
@@ -319,14 +279,13 @@ class PacketPublisher:
     def open_delivery(self, link: str) -> None:
         """Open the topic of what a link does, if it is not open yet."""
         if link not in self._deliveries:
-            publisher = self._node.publisher(topics.delivery_topic(self.vehicle, link), msg.Delivery)
-            self._deliveries[link] = Topic(publisher)
+            topic = topics.stream_topic(self.vehicle, f"{link}/delivery")
+            self._deliveries[link] = self._node.publisher(topic, msg.Delivery)
 
     def publish_due(self, stamp_ns: int) -> int | None:
         """Publish everything that has arrived by a simulated time [ns], in the order of arrival.
 
-        Returns:
-            Stamp in the newest odometry message among it [ns]; None if there is none.
+        Returns the stamp in the newest odometry message among it [ns]; None if there is none.
         """
         arrived = [
             (due_ns, rank, topic, packet)
@@ -346,21 +305,22 @@ class PacketPublisher:
     @property
     def other_undelivered_count(self) -> int:
         """Messages of topics other than those of sensors that a reliable reader lost since the last reset."""
-        sensors = [self.topics[name] for name in self._sensor_names]
-        return sum(topic.undelivered_count for topic in self._all() if topic not in sensors)
+        lost = sum(publisher.counters.timeouts for publisher in self._publishers()) - self._lost_before
+        return lost - sum(self.topics[name].undelivered_count for name in self._sensor_names)
 
     def take_lossy_topics(self) -> list[str]:
         """Return the topics whose reliable readers have lost messages since the last call."""
-        return [topic.publisher.topic for topic in self._all() if topic.take_lost()]
+        before = self._lost_counts
+        self._lost_counts = {each.topic: each.counters.timeouts for each in self._publishers()}
+        return [topic for topic, count in self._lost_counts.items() if count > before.get(topic, 0)]
 
     @property
     def next_due_ns(self) -> int | None:
         """When the next packet arrives [ns]; None if none is in flight."""
         return min((t.link.next_due_ns for t in self.topics.values() if len(t.link)), default=None)  # type: ignore[type-var]
 
-    def _all(self) -> Iterator[Topic]:
-        yield from self.topics.values()
-        yield from self._deliveries.values()
+    def _publishers(self) -> list[Publisher[Any]]:
+        return [*(topic.publisher for topic in self.topics.values()), *self._deliveries.values()]
 
     def _send(self, topic: PacketTopic, packet: Packet) -> None:
         free = topic.link.is_free(packet.stamp_ns)

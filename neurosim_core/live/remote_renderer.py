@@ -24,14 +24,15 @@ from pydantic import Field
 from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.render.renderer import Renderer, RendererConfig, refuse_worlds
+from neurosim_core.render.ray_times import refuse_several
+from neurosim_core.render.renderer import Renderer, RendererConfig
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.srgb import linear_to_srgb8, srgb_to_linear
 
 if TYPE_CHECKING:
     from cortex import Node
-    from neurosim_core.live.render_messages import RenderRequest
+    from neurosim_core.live.render_messages import RenderReply, RenderRequest
 
 OUTPUTS = ("depth", "log_radiance", "rgb")
 """What a renderer in another process can be asked for."""
@@ -129,8 +130,10 @@ class RemoteScene:
     number: int = 0
     warned: bool = False
 
-    def ask(self, lens: PinholeConfig, positions: Any, orientations: Any, outputs: Collection[str]) -> Frames:
-        """Return the frames of some poses.
+    def ask(
+        self, lens: PinholeConfig, positions: Any, orientations: Any, outputs: Collection[str]
+    ) -> RenderReply:
+        """Return the frames of some poses; what was not asked for has size 0.
 
         `positions`: p_WC [m], shape [n, 3]. `orientations`: q_WC of the optical frame, xyzw, shape [n, 4].
         """
@@ -168,16 +171,12 @@ class RemoteScene:
         missing = {"radiance": not reply.linear.size and not reply.srgb.size, "depth": not reply.depth.size}
         if lacks := [name for name in sorted(outputs) if missing[name]]:
             raise RemoteRendererError(f"{where} sent no {', '.join(lacks)}")
-        return Frames(
-            linear=reply.linear if reply.linear.size else None,
-            srgb=reply.srgb if reply.srgb.size else None,
-            depth=reply.depth if reply.depth.size else None,
-        )
+        return reply
 
-    def _wait(self) -> Any:
+    def _wait(self) -> RenderReply:
         try:
             while True:
-                reply = self.replies.recv(timeout_s=self.settings.timeout_s)
+                reply: RenderReply = self.replies.recv(timeout_s=self.settings.timeout_s)
                 if (reply.client, reply.number) == (self.client, self.number):
                     return reply
         except TimeoutError as error:
@@ -238,7 +237,7 @@ class RemoteRendererConfig(RendererConfig):
     @staticmethod
     def make(scene: RemoteScene, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
         """Return a renderer for one lens."""
-        refuse_worlds("remote", shape)
+        refuse_several("remote", shape)
         if not isinstance(lens, PinholeConfig):
             kind = getattr(lens, "kind", type(lens).__name__)
             raise ValueError(f"the renderer 'remote' renders pinholes, not a lens of kind {kind}")
@@ -302,25 +301,22 @@ class RemoteRenderer:
         chosen = np.arange(instant_count) if self.log_radiance is not None else np.flatnonzero(slots >= 0)
         if not len(chosen):
             return
-        frames = self._scene.ask(
-            self._lens, p_WC.numpy()[chosen], q_WC.numpy()[chosen], outputs=self._outputs
-        )
-        linear = self._linear(frames)
+        reply = self._scene.ask(self._lens, p_WC.numpy()[chosen], q_WC.numpy()[chosen], outputs=self._outputs)
+        linear = self._linear(reply)
         for frame, instant in enumerate(chosen.tolist()):
             slot = int(slots[instant])
-            if self.log_radiance is not None and linear is not None:
+            if self.log_radiance is not None:
                 luma = np.maximum(linear[frame] @ _LUMA, 0.0) + np.float32(self._scene.config.dark_floor)
                 self.log_radiance[instant].assign(np.log(luma, dtype=np.float32))
             if slot >= 0 and self.rgb is not None:
-                self.rgb[slot].assign(self._display(frames, linear, frame))
-            if slot >= 0 and self.depth is not None and frames.depth is not None:
-                self.depth[slot].assign(frames.depth[frame])
+                self.rgb[slot].assign(self._display(reply, frame))
+            if slot >= 0 and self.depth is not None:
+                self.depth[slot].assign(reply.depth[frame])
 
-    def _linear(self, frames: Frames) -> NDArray[np.float32] | None:
-        if frames.linear is not None or frames.srgb is None:
-            return frames.linear
-        if self.log_radiance is None:
-            return None
+    def _linear(self, reply: RenderReply) -> NDArray[np.float32]:
+        """Return what log radiance is made of."""
+        if reply.linear.size or self.log_radiance is None:
+            return reply.linear
         if not self._scene.warned:
             self._scene.warned = True
             _logger.warning(
@@ -328,11 +324,10 @@ class RemoteRenderer:
                 "which an event camera reports as events; let it send linear float32",
                 self._scene.settings.topic,
             )
-        return np.asarray(srgb_to_linear(frames.srgb), dtype=np.float32)
+        return np.asarray(srgb_to_linear(reply.srgb), dtype=np.float32)
 
-    def _display(self, frames: Frames, linear: NDArray[np.float32] | None, frame: int) -> NDArray[np.uint8]:
-        if linear is None or frames.linear is None:
-            assert frames.srgb is not None
-            return np.asarray(frames.srgb[frame])
+    def _display(self, reply: RenderReply, frame: int) -> NDArray[np.uint8]:
+        if not reply.linear.size:
+            return reply.srgb[frame]
         exposure = self._scene.config.exposure
-        return linear_to_srgb8(linear[frame] * np.float32(1.0 if exposure == "auto" else exposure))
+        return linear_to_srgb8(reply.linear[frame] * np.float32(1.0 if exposure == "auto" else exposure))

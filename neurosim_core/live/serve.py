@@ -43,14 +43,9 @@ def serve(
 ) -> int:
     """Simulate for controllers in other processes until interrupted.
 
-    Args:
-        config: What to fly, and how.
-        record: Folder to record to.
-        overwrite: Replace a recording that exists.
-        reader: Reads the scene in another process; None: it is read here.
-
-    Returns:
-        The exit status: 0 done, 1 ended with an error, 130 interrupted.
+    `record`: folder to record to. `overwrite`: replace a recording that exists. `reader`: reads the scene in
+    another process; None: it is read here. Returns the exit status: 0 done, 1 ended with an error, 130
+    interrupted.
 
     Raises:
         ValueError: The scene cannot be loaded, no path exists, or there is no such device.
@@ -144,12 +139,7 @@ class StatusLine:
     """
 
     def __init__(self, console: Console, *, is_over: Callable[[], bool]) -> None:
-        """Begin with an empty line.
-
-        Args:
-            console: Where to print.
-            is_over: Whether the simulator ends with the run.
-        """
+        """Begin with an empty line. `is_over`: returns whether the simulator ends with the run."""
         self.last: SimulatorStatus | None = None
         self._slow_count = self._late_count = 0
         self._senders: set[tuple[str, str]] = set()
@@ -239,12 +229,6 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus, *, is_over:
     return lines
 
 
-def count_lost(status: SimulatorStatus) -> int:
-    """Return the commands, frames and messages that were lost since the last reset."""
-    lost = sum(vehicle.lost_count + vehicle.undelivered_count for vehicle in status.vehicles)
-    return lost + sum(sensor.dropped_count + sensor.undelivered_count for sensor in status.sensors)
-
-
 def _summary(status: SimulatorStatus) -> str:
     text = f"{status.phase} {status.reason}" if status.phase != "running" else "running"
     parts = [f"{text}, {status.stamp_ns / 1e9:.2f} s"]
@@ -252,7 +236,9 @@ def _summary(status: SimulatorStatus) -> str:
         parts.append(f"{status.real_time_factor:.2f} x real time")
         if status.mode == "streaming":
             parts.append(f"late {status.late_p99_ns / 1e6:.2f} ms (p99)")
-        parts.append(f"{count_lost(status):,} lost")
+        lost = sum(vehicle.lost_count + vehicle.undelivered_count for vehicle in status.vehicles)
+        lost += sum(sensor.dropped_count + sensor.undelivered_count for sensor in status.sensors)
+        parts.append(f"{lost:,} lost")
         if status.reason:
             parts.append(f"[yellow]{status.reason}[/]")
         if any(vehicle.fail_safe for vehicle in status.vehicles):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import re
@@ -101,18 +102,16 @@ class Request:
 
         A request that the loop has begun with is waited for twice as long; steps are ended instead.
         """
-        try:
+        with contextlib.suppress(TimeoutError):
             return self.future.result(timeout_s)
-        except TimeoutError:
-            if self.future.cancel():
-                return f"no answer within {timeout_s:g} s; it will not be done"
+        if self.future.cancel():
+            return f"no answer within {timeout_s:g} s; it will not be done"
         if self.service == "/step":
             self.is_abandoned = True
             return f"not over within {timeout_s:g} s: it stops where it is"
-        try:
+        with contextlib.suppress(TimeoutError):
             return self.future.result(timeout_s)
-        except TimeoutError:
-            return f"no answer within {2 * timeout_s:g} s; it may still be done"
+        return f"no answer within {2 * timeout_s:g} s; it may still be done"
 
 
 class Steps:

@@ -20,8 +20,9 @@ from neurosim_core.live.messages import sensor_message_type, setpoint_of, to_pac
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.view.rerun_log import RerunLogger
+from neurosim_core.view.rerun_sdk import RerunFiles
 from neurosim_core.view.rerun_shapes import SceneShapes, scene_shapes
-from neurosim_core.view.rerun_targets import RerunTarget
+from neurosim_core.view.rerun_viewer import RerunViewer
 
 DRAIN_MAX = 1000
 """Messages of one stream that are taken before those of the next."""
@@ -107,7 +108,7 @@ class LiveSession:
         self,
         node: Node,
         simulation: msg.Simulation,
-        target: RerunTarget,
+        target: RerunViewer | RerunFiles,
         options: ViewOptions,
         *,
         number: Iterator[int],
@@ -206,13 +207,13 @@ class LiveSession:
         subscribe(at("collision"), msg.Collision, partial(self._log_packet, vehicle, "collision"))
         for field in ("depth", "flow"):
             log = partial(self._log_packet, vehicle, f"predicted_{field}")
-            subscribe(topics.predicted_topic(vehicle, field), msg.Image, log)
+            subscribe(at(f"predicted/{field}"), msg.Image, log)
         for mode, command in topics.COMMANDS.items():
             log = partial(self._log_command, vehicle, mode)
             subscribe(topics.command_topic(vehicle, mode), command, log, is_ordered=False)
         for link in dict.fromkeys(["command", *config.sensors, "odometry", "rotor_speeds"]):
             log = partial(self._log_packet, vehicle, f"{link}_link")
-            subscribe(topics.delivery_topic(vehicle, link), msg.Delivery, log)
+            subscribe(at(f"{link}/delivery"), msg.Delivery, log)
 
     def _subscribe(
         self,

@@ -1,7 +1,7 @@
 """The simulator as a node: it flies vehicles for controllers in other processes.
 
 One thread flies, reads commands, publishes and answers requests, in the order of simulated time. In streaming
-a second one renders (`cameras.py`), and a third writes the recording (`recorder.py`).
+a second one renders (`streaming.py`).
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from cortex import Node
 from cortex.messages import Reset, SimulatorStatus
 from neurosim_core.clock import to_ns
 from neurosim_core.config import SimulationConfig
-from neurosim_core.live.cameras import CameraThread
 from neurosim_core.live.commands import Command
 from neurosim_core.live.pacing import Pacer
 from neurosim_core.live.recorder import Recorder, open_folders
 from neurosim_core.live.services import Request, Services, Steps
 from neurosim_core.live.status import RunStats, StatusPublisher, SubscriberMonitor
-from neurosim_core.live.streaming import StreamingLoop
-from neurosim_core.live.vehicle import ResetState, VehicleCollisions, VehicleNode, make_reset
+from neurosim_core.live.streaming import CameraThread, StreamingLoop
+from neurosim_core.live.vehicle import ResetState, VehicleNode, make_reset, report_touches
 from neurosim_core.packets import Packet
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.sim import Model, make_fleet, warm_flight, warm_up
@@ -62,14 +61,10 @@ class Simulator:
     ) -> None:
         """Prepare everything, and announce topics and services.
 
-        Args:
-            config: What to fly, and how.
-            node: Owner of the topics; by default a new one.
-            models: What `make_fleet` returned for the configuration, to save its time.
-            record: Folder to record to.
-            overwrite: Replace a recording that exists.
-            on_phase: Called with the name of each part of the preparation when it begins.
-            reader: Reads the scene in another process; None: it is read here.
+        `node`: owner of the topics; by default a new one. `models`: what `make_fleet` returned for the
+        configuration, to save its time. `record`: folder to record to. `overwrite`: replace a recording that
+        exists. `on_phase`: called with the name of each part of the preparation when it begins. `reader`:
+        reads the scene in another process; None: it is read here.
 
         Raises:
             ValueError: The scene cannot be loaded, no path exists, there is no such device, or nothing can be
@@ -99,11 +94,10 @@ class Simulator:
         self._exit: int | None = None
         self._reason = ""
         self._steps = Steps()
-        self._stats = RunStats()
-        self._collisions = VehicleCollisions()
+        self._touching: set[tuple[str, str]] = set()
+        """Pairs of vehicles that touch each other."""
         self._pacer = Pacer(config.live.real_time_factor, sleep=self._wakeup.wait)
-        self._cameras: CameraThread | None = None
-        self._streaming: StreamingLoop | None = None
+        self._is_streaming = config.live.mode == "streaming"
         with contextlib.ExitStack() as stack:
             node = node or stack.enter_context(Node("simulator"))
             services = stack.enter_context(Node("simulator services"))
@@ -116,20 +110,21 @@ class Simulator:
             ]
             for vehicle in self.vehicles:
                 stack.callback(vehicle.close_loans)
-            if config.live.mode == "streaming":
-                inline = self.vehicles[0].is_cuda
-                self._cameras = CameraThread(inline=inline, on_packets=self._wakeup.set)
-                stack.callback(self._cameras.close)
-                self._streaming = StreamingLoop(
-                    self.vehicles,
-                    self._cameras,
-                    self._pacer,
-                    self._stats,
-                    live=lambda: self.config.live,
-                    stop=lambda: self._stop.is_set(),
-                    requested=lambda: bool(self._services),
-                    wakeup=self._wakeup,
-                )
+            self._cameras = CameraThread(inline=self.vehicles[0].is_cuda, on_packets=self._wakeup.set)
+            stack.callback(self._cameras.close)
+            self._stats = RunStats(self.vehicles)
+            self._streaming = StreamingLoop(
+                vehicles=self.vehicles,
+                cameras=self._cameras,
+                pacer=self._pacer,
+                stats=self._stats,
+                live=lambda: self.config.live,
+                stop=lambda: self._stop.is_set(),
+                requested=lambda: bool(self._services),
+                wakeup=self._wakeup,
+            )
+            for vehicle in self.vehicles if self._is_streaming else ():
+                vehicle.publisher.lateness_ns = self._pacer.lateness_ns
             self._subscribers = SubscriberMonitor(self.vehicles, self.status)
             self._begin(make_reset(self.vehicles, config, Reset()))
             self.status.announce(config)
@@ -165,34 +160,28 @@ class Simulator:
         return self._exit is not None
 
     def run(self, stop: threading.Event) -> int:
-        """Fly until told to stop.
+        """Fly until told to stop; return 1 if the flight ended with an error, else 0.
 
-        Args:
-            stop: Ends it within a few hundredths of a second, unless a reliable reader holds it up; see
-                `Node.stop_waiting`.
-
-        Returns:
-            0 if it was stopped or the flight is over, 1 if the flight ended with an error.
+        `stop`: ends it within a few hundredths of a second, unless a reliable reader holds it up; see
+        `Node.stop_waiting`.
 
         Raises:
             OSError: The recording cannot be written.
             RuntimeError: The cameras failed.
         """
         self._stop = stop
-        if self._recorder is not None:
-            self._recorder.stop = stop
         while not stop.is_set() and self._exit is None:
             self._answer_requests()
             self._housekeep()
             if self._is_ended or (self._is_paused and not self._steps):
-                if self._streaming is not None and self._tick and not self._is_ended:
+                if self._tick and not self._is_ended:
                     self._streaming.publish_rendered(self.stamp_ns)
                 self._wakeup.wait(POLL_S)
                 self._wakeup.clear()
-            elif self._streaming is None:
-                self._fly_lockstep()
+            elif self._is_streaming:
+                self._fly_streaming()
             else:
-                self._fly_streaming(self._streaming)
+                self._fly_lockstep()
         if not self._is_ended:
             self._flush()
         self._publish_status(at_once=True)
@@ -225,7 +214,7 @@ class Simulator:
         except DynamicsError as error:
             self._end_with(error)
             return
-        self._collisions.check(self.vehicles)
+        report_touches(self.vehicles, self._touching)
         self._stats.step_times.add(time.monotonic_ns() - begin_ns)
         self._publish_end(end_ns)
         for vehicle in self.vehicles:
@@ -246,7 +235,7 @@ class Simulator:
         finally:
             end_step()
 
-    def _fly_streaming(self, streaming: StreamingLoop) -> None:
+    def _fly_streaming(self) -> None:
         """Fly a control period, and publish its packets when they are due."""
         if self._tick == 0 and not self._is_flown and not self._receive_commands(every=1):
             return
@@ -254,20 +243,20 @@ class Simulator:
         end_ns = self._control.stamp_ns(self._tick + 1)
         if not self._is_flown:
             try:
-                if not streaming.fly(self.stamp_ns, end_ns):
+                if not self._streaming.fly(self.stamp_ns, end_ns):
                     return
             except DynamicsError as error:
                 self._end_with(error)
                 return
-            self._collisions.check(self.vehicles)
+            report_touches(self.vehicles, self._touching)
             self._stats.step_times.add(time.monotonic_ns() - begin_ns)
             self._is_flown = True
-        if not streaming.publish_until(self.stamp_ns, end_ns):
+        if not self._streaming.publish_until(self.stamp_ns, end_ns):
             return
         self._is_flown = False
         self._take_commands(end_ns)  # before this stamp is published: its answers count from the next tick on
         self._publish_end(end_ns)
-        streaming.yield_to_readers(self.stamp_ns, end_ns)
+        self._streaming.yield_to_readers(self.stamp_ns, end_ns)
         self._end_period(end_ns)
 
     def _receive_commands(self, *, every: int) -> bool:
@@ -310,7 +299,7 @@ class Simulator:
         self._stats.step_count += 1
         live = self.config.live
         self.status.publish_clock(end_ns, live, sequence=self._tick - 1)
-        if self._steps.is_last and self._streaming is not None:
+        if self._steps.is_last:
             self._streaming.catch_up(end_ns)
         self._steps.count()
         collided = next((vehicle for vehicle in self.vehicles if vehicle.state.ended), None)
@@ -359,9 +348,8 @@ class Simulator:
 
     def _make_status(self) -> SimulatorStatus:
         return self._stats.make_status(
-            self.vehicles,
-            {} if self._cameras is None else self._cameras.dropped,
-            self.config,
+            self.config.live,
+            self._cameras.dropped,
             stamp_ns=self.stamp_ns,
             phase=self.phase,
             reason=self.reason,
@@ -371,15 +359,14 @@ class Simulator:
 
     def _begin(self, reset: ResetState) -> None:
         """Begin a run at stamp 0, and publish where the vehicles are."""
-        if self._cameras is not None:
-            self._cameras.reset()
+        self._cameras.reset()
         if self._recorder is not None:
             self._recorder.begin(reset.seeds, replace=self._tick == 0)
         self._tick = self.stamp_ns = 0
         self._is_flown = self._is_ended = False
         self._reason = ""
         self._stats.reset()
-        self._collisions.reset()
+        self._touching.clear()
         for vehicle in self.vehicles:
             vehicle.begin(reset.states[vehicle.name], seed=reset.seeds[vehicle.name])
 
@@ -387,8 +374,7 @@ class Simulator:
         """End the run; the simulator goes on if `live.run_on` says so."""
         self._is_ended, self._reason = True, reason
         self._steps.stop(f"the run has ended: {reason}")
-        if self._cameras is not None:
-            self._cameras.finish(self._stop.is_set)
+        self._cameras.finish(self._stop.is_set)
         self._flush()
         if not self.config.live.run_on:
             self._exit = 0
@@ -402,9 +388,8 @@ class Simulator:
 
         What is not rendered yet is dropped and counted.
         """
-        at_rest = self._cameras is None or self._cameras.drop_rest()
-        if self._streaming is not None:
-            self._streaming.offer_rendered()
+        at_rest = self._cameras.drop_rest()
+        self._streaming.offer_rendered()
         for vehicle in self.vehicles:
             if at_rest:
                 vehicle.finish()
@@ -442,7 +427,7 @@ class Simulator:
 
     def _pause(self, *, paused: bool) -> None:
         """Stop time, or let it go on."""
-        if paused and not self._is_ended and self._tick and self._streaming is not None:
+        if paused and not self._is_ended and self._tick:
             self._streaming.catch_up(self.stamp_ns)
         self._steps.stop("paused" if paused else "resumed")
         if self._is_paused and not paused:
@@ -462,14 +447,14 @@ class Simulator:
     def _resume(self) -> None:
         """Let a paused run go on, with the commands that came meanwhile."""
         self._pacer.start(self.stamp_ns)
-        if self._streaming is not None and self._tick:
+        if self._is_streaming and self._tick:
             self._take_commands(self.stamp_ns)
 
     def _configure(self, config: SimulationConfig) -> None:
         """Change settings."""
         if config.live.real_time_factor != self.config.live.real_time_factor:
             self._pacer.set_factor(config.live.real_time_factor)
-        if self._cameras is not None and config.bodies != self.config.bodies:
+        if config.bodies != self.config.bodies:
             self._cameras.finish(self._stop.is_set)
         self.config = config
         for vehicle in self.vehicles:

@@ -122,7 +122,7 @@ class SubscriberMonitor:
 
 
 class RunStats:
-    """What a run measures besides what its vehicles count.
+    """What a run measures besides what its vehicles count, and the status that says it.
 
     Attributes:
         step_times: Time to compute a control period, since the last status [ns].
@@ -132,9 +132,10 @@ class RunStats:
         slipped_ns: By how much the run was delayed [ns].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, vehicles: Sequence[VehicleNode]) -> None:
         self.step_times = Timings()
         self.late_times = Timings()
+        self._vehicles = vehicles
         self._sequence = 0
         self.reset()
 
@@ -148,9 +149,8 @@ class RunStats:
 
     def make_status(
         self,
-        vehicles: Sequence[VehicleNode],
+        live: LiveConfig,
         dropped: Mapping[tuple[str, str], int],
-        config: SimulationConfig,
         *,
         stamp_ns: int,
         phase: str,
@@ -168,8 +168,7 @@ class RunStats:
             times.take() for times in (self.step_times, self.late_times)
         )
         self._sequence += 1
-        streaming = config.live.mode == "streaming"
-        lossy = [topic for vehicle in vehicles for topic in vehicle.publisher.take_lossy_topics()]
+        lossy = [topic for vehicle in self._vehicles for topic in vehicle.publisher.take_lossy_topics()]
         if lossy and not reason:
             reason = f"reliable readers do not keep up with {', '.join(lossy)}"
         return SimulatorStatus(
@@ -177,8 +176,8 @@ class RunStats:
             wall_ns=time.time_ns(),
             phase=phase,
             reason=reason,
-            mode=config.live.mode,
-            real_time_factor_wanted=config.live.real_time_factor if streaming else 0.0,
+            mode=live.mode,
+            real_time_factor_wanted=live.real_time_factor if live.mode == "streaming" else 0.0,
             real_time_factor=factor,
             step_count=self.step_count,
             step_median_ns=step_median_ns,
@@ -187,8 +186,8 @@ class RunStats:
             late_p99_ns=late_p99_ns,
             overrun_count=self.overrun_count,
             slipped_ns=self.slipped_ns,
-            sensors=[entry for vehicle in vehicles for entry in _sensors(vehicle, dropped)],
-            vehicles=[_vehicle(vehicle, stamp_ns) for vehicle in vehicles],
+            sensors=[entry for vehicle in self._vehicles for entry in _sensors(vehicle, dropped)],
+            vehicles=[_vehicle(vehicle, stamp_ns) for vehicle in self._vehicles],
             sequence=self._sequence - 1,
         )
 

@@ -62,28 +62,8 @@ STEP_DEADLINE_S = 60.0
 
 
 def stream_topic(vehicle: str, name: str) -> str:
-    """Topic of a sensor, or of odometry, rotor_speeds, path, collision."""
+    """Topic of a vehicle: a sensor, odometry, path, ..., or what is below one, such as SENSOR/info."""
     return f"/{vehicle}/{name}"
-
-
-def info_topic(vehicle: str, sensor: str) -> str:
-    """Topic of the calibration of a camera."""
-    return f"/{vehicle}/{sensor}/info"
-
-
-def transform_topic(vehicle: str, sensor: str) -> str:
-    """Topic of the pose of a sensor on its vehicle."""
-    return f"/{vehicle}/{sensor}/transform"
-
-
-def predicted_topic(vehicle: str, field: str) -> str:
-    """Topic of what a network says of the pixels of an event camera: depth or flow."""
-    return f"/{vehicle}/predicted/{field}"
-
-
-def delivery_topic(vehicle: str, link: str) -> str:
-    """Topic of what a simulated link does to each message."""
-    return f"/{vehicle}/{link}/delivery"
 
 
 def command_topic(vehicle: str, mode: str) -> str:

@@ -32,7 +32,7 @@ class VehicleNode:
     """Everything that belongs to one vehicle. For the thread that flies.
 
     In lockstep `begin_step` flies a control period, cameras included. In streaming `fly` flies one, and the
-    cameras look at its batches later (`cameras.py`).
+    cameras look at its batches later (`streaming.py`).
 
     Attributes:
         name: Of the vehicle.
@@ -52,14 +52,7 @@ class VehicleNode:
     def __init__(
         self, node: Node, name: str, model: Model, *, record: Callable[[Packet], None] | None = None
     ) -> None:
-        """Open the topics of a vehicle; `begin` starts its run.
-
-        Args:
-            node: Owner of the topics.
-            name: Of the vehicle.
-            model: What is flown.
-            record: Called with every packet.
-        """
+        """Open the topics of a vehicle on a node; `begin` starts its run. `record` gets every packet."""
         config = model.config
         link = config.links.get("command", NO_LINK)
         self.name, self.model = name, model
@@ -204,8 +197,7 @@ class VehicleNode:
     def can_fly(self, *, drop: bool) -> bool:
         """Return whether a control period may be flown before more batches have been rendered.
 
-        Args:
-            drop: Late frames are dropped: the flight may go on for some more periods.
+        With `drop` late frames are dropped: the flight may go on for some more periods.
         """
         spare = 0 if drop else self._batches_per_period * _SPARE_PERIODS
         return sim.render_backlog_left(self.state) >= self._batches_per_period + spare
@@ -230,8 +222,7 @@ class VehicleNode:
     def report_collision(self, clearance_m: float) -> None:
         """Count and send a collision with another vehicle, which ends the run if so configured.
 
-        Args:
-            clearance_m: Distance between the two, minus their radii [m]; <= 0.
+        `clearance_m`: distance between the two, minus their radii [m]; <= 0.
         """
         state, now = self.state, sim.observe(self.state)
         packet = Collision(
@@ -253,11 +244,7 @@ class VehicleNode:
         self.publisher.close_loans()
 
     def configure(self, config: SimulationConfig) -> None:
-        """Change links, gains, the fail-safe, and bodies, for which nothing may be being rendered.
-
-        Args:
-            config: Settings of this vehicle.
-        """
+        """Change links, gains, the fail-safe, and bodies, for which nothing may be being rendered."""
         before, self.model = self.config, dataclasses.replace(self.model, config=config)
         if config.control.gains != before.control.gains:
             sim.forget_controllers(self.state)
@@ -288,12 +275,7 @@ class ResetState(NamedTuple):
 
 
 def make_reset(vehicles: Sequence[VehicleNode], config: SimulationConfig, request: Reset) -> ResetState:
-    """Return the beginning of the run that a request asks for.
-
-    Args:
-        vehicles: All vehicles.
-        config: Holds what the request leaves out.
-        request: Seed, and the start of one vehicle.
+    """Return the beginning of the run that a request asks for; what it leaves out is as configured.
 
     Raises:
         ValueError: There is no such vehicle, a seed is negative, or a start is not finite.
@@ -318,27 +300,20 @@ def make_reset(vehicles: Sequence[VehicleNode], config: SimulationConfig, reques
     return ResetState(states, seeds)
 
 
-class VehicleCollisions:
-    """Vehicles that touch each other: spheres, checked once every control period."""
+def report_touches(vehicles: Sequence[VehicleNode], touching: set[tuple[str, str]]) -> None:
+    """Report each pair of vehicles that has begun to touch since the last call, as a collision of both.
 
-    def __init__(self) -> None:
-        self._touching: set[tuple[str, str]] = set()
-
-    def reset(self) -> None:
-        """Forget which vehicles touch."""
-        self._touching.clear()
-
-    def check(self, vehicles: Sequence[VehicleNode]) -> None:
-        """Report each pair that has begun to touch since the last call, as a collision of both."""
-        for first, second in itertools.combinations(vehicles, 2):
-            pair = (first.name, second.name)
-            clearance_m = _clearance_m(first, second)
-            if clearance_m > 0.0:
-                self._touching.discard(pair)
-            elif pair not in self._touching:
-                self._touching.add(pair)
-                for vehicle in (first, second):
-                    vehicle.report_collision(clearance_m)
+    Vehicles are spheres here. `touching`: the pairs that touch; updated.
+    """
+    for first, second in itertools.combinations(vehicles, 2):
+        pair = (first.name, second.name)
+        clearance_m = _clearance_m(first, second)
+        if clearance_m > 0.0:
+            touching.discard(pair)
+        elif pair not in touching:
+            touching.add(pair)
+            for vehicle in (first, second):
+                vehicle.report_collision(clearance_m)
 
 
 def _clearance_m(first: VehicleNode, second: VehicleNode) -> float:

@@ -26,8 +26,7 @@ from neurosim_core.live.session import LiveSession, ViewOptions
 from neurosim_core.live.topics import SIMULATION
 from neurosim_core.settings_file import ConfigError
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_sdk import import_rerun
-from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
+from neurosim_core.view.rerun_sdk import RerunFiles, check_new_file, import_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded, has_display
 
 POLL_S = 0.01
@@ -83,15 +82,14 @@ def view(
     options = ViewOptions(only=only, event_window_ns=round(event_window_s * 1e9), image_rate_hz=image_rate_hz)
     stop = threading.Event()
     with stop_at_signals(stop), contextlib.ExitStack() as stack:
-        target: RerunTarget
+        target: RerunViewer | RerunFiles
         if save is not None:
-            target = FileTarget(save, say)
+            target = RerunFiles(save, say)
         else:
-            viewer = stack.enter_context(RerunViewer(web=web, waiting=lambda: not stop.is_set()))
-            target = ViewerTarget(viewer)
+            target = stack.enter_context(RerunViewer(web=web, waiting=lambda: not stop.is_set()))
         node = stack.enter_context(Node("viewer"))
-        if web:
-            page = stack.enter_context(ControlPage(node, viewer.page_url, port=port))
+        if web and isinstance(target, RerunViewer):
+            page = stack.enter_context(ControlPage(node, target.page_url, port=port))
             say(f"open {page.url}")
             if open_browser and has_display():
                 webbrowser.open(page.url)
@@ -106,7 +104,7 @@ def view(
 
 def watch(
     node: Node,
-    target: RerunTarget,
+    target: RerunViewer | RerunFiles,
     options: ViewOptions,
     *,
     stop: threading.Event,

@@ -23,7 +23,7 @@ Reference: Akeley (1993), RealityEngine graphics (multisampling); Aila, Laine (2
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache
 from typing import Any
 
@@ -32,10 +32,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernels
-from neurosim_core.render.block_lists import make_lists, thread_counts
-from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.candidate_data import TILE
+from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
 from neurosim_core.render.coverage import (
     APART,
     FACE_COUNT_MAX,
@@ -47,14 +44,22 @@ from neurosim_core.render.coverage import (
     ray_point,
 )
 from neurosim_core.render.embree import packet_caster
+from neurosim_core.render.kernel_data import (
+    FAR_M,
+    TILE,
+    BodyData,
+    Hit,
+    RenderOutputs,
+    RenderTerms,
+    SceneData,
+    ViewData,
+)
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer
-from neurosim_core.render.packet_shading import PACKET_TERMS
-from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
-from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.outputs import RADIANCE, radiance_writer
+from neurosim_core.render.packet_shading import PACKET_TERMS, PixelBlock
+from neurosim_core.render.ray_intersection import UNFUSED, intersect_bodies, intersect_scene
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
+from neurosim_core.render.tiles import TilePlace, pose_finder, tile_locator
 
 _SIDE = 4
 _LANES = _SIDE * _SIDE
@@ -67,21 +72,18 @@ _LIGHT_COUNT = 3 * _LANES * _BLOCK_COUNT
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _cover_pixel(
     scene: SceneData,
+    view: ViewData,
     faces: wp.array3d[int],
     instant: int,
     row: int,
     col: int,
-    height: int,
-    width: int,
     origin: wp.vec3,
     center: wp.vec3,
     across: wp.vec3,
     down: wp.vec3,
-    face_out: wp.array[int],
+    hit_out: wp.array[Hit],
     number_out: wp.array[float],
     ray_out: wp.array[wp.vec3],
-    hit_out: wp.array[wp.vec3],
-    normal_out: wp.array[wp.vec3],
     slope_out: wp.array[wp.vec2],
 ) -> int:
     """Find the faces that a pixel shows, -1: the sky; how many points show each; where to shade it.
@@ -108,7 +110,6 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         scene: SceneData,
         view: ViewData,
         bodies: BodyData,
-        worlds: WorldData,
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
@@ -116,9 +117,9 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         index = first + wp.tid()
         # 64 indices are a tile of 8 x 8 pixels, and 16 side by side a block of 4 x 4
         in_tile = index % 64
-        place = locate_tile(index // 64 // view.instant_count, index // 64 % view.instant_count, view, worlds)
+        place = locate_tile(index // 64 // view.instant_count, index // 64 % view.instant_count, view)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[place.world]]
+            scene = view.worlds.scenes[view.worlds.scene[place.world]]
         col = place.left + 4 * (in_tile // 16 % 2) + in_tile % 4
         row = place.top + 4 * (in_tile // 32) + in_tile // 4 % 4
         if not place.rendered or col >= view.width or row >= view.height:
@@ -134,71 +135,52 @@ def _pixel_kernel(terms: RenderTerms) -> wp.Kernel:
         across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
         down = wp.vec3(rays[2, pixel][0], rays[2, pixel][1], rays[2, pixel][2])
         spread_rad = rays[0, pixel][3]
-        face = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=int)
+        hits = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=Hit)
         number = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=float)
         ray = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
-        met = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
-        normal = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
         slope = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec2)
         count = _cover_pixel(
             scene,
+            view,
             out.face,
             instant,
             row,
             col,
-            view.height,
-            view.width,
             origin,
             wp.quat_rotate(q, center),
             wp.quat_rotate(q, across),
             wp.quat_rotate(q, down),
-            face,
+            hits,
             number,
             ray,
-            met,
-            normal,
             slope,
         )
         total = wp.vec3(0.0)
         whole = float(0.0)
         for entry in range(count):
-            hit = Hit()
-            hit.face = face[entry]
-            hit.t = met[entry][0]
-            hit.u = met[entry][1]
-            hit.v = met[entry][2]
-            hit.normal = normal[entry]
             width_rad = footprint_width(number[entry]) * spread_rad
-            total += number[entry] * shade(scene, ray[entry], origin, width_rad, hit, slope[entry])
+            total += number[entry] * shade(scene, ray[entry], origin, width_rad, hits[entry], slope[entry])
             whole += number[entry]
         if count < 0:
             whole = float(RAY_COUNT)
             if wp.static(bool(terms.embree)):
                 toward = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-                part = wp.zeros(shape=(_LANES,), dtype=int)
-                t = wp.zeros(shape=(_LANES,), dtype=float)
-                u = wp.zeros(shape=(_LANES,), dtype=float)
-                v = wp.zeros(shape=(_LANES,), dtype=float)
-                front = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+                origins = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
                 for sample in range(RAY_COUNT):
                     point = ray_point(sample)
+                    origins[sample] = origin
                     toward[sample] = wp.quat_rotate(
                         q, wp.normalize(center + point[0] * across + point[1] * down)
                     )
-                cast_packet(
-                    scene.embree_intersect, scene.embree_quick, origin, toward, FAR_M, part, t, u, v, front
-                )
+                cast_packet(scene.embree_intersect, scene.embree_quick, origins, toward, FAR_M, hits)
             for sample in range(RAY_COUNT):
                 point = ray_point(sample)
                 direction_C = wp.normalize(center + point[0] * across + point[1] * down)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = Hit()
                 if wp.static(bool(terms.embree)):
-                    hit.face = part[sample]
-                    hit.t = t[sample]
-                    hit.u = u[sample]
-                    hit.v = v[sample]
-                    hit.normal = wp.normalize(front[sample])
+                    hit = hits[sample]
+                    hit.normal = wp.normalize(hit.normal)
                 else:
                     hit = intersect_scene(scene, origin, direction)
                 body = int(-1)
@@ -229,11 +211,8 @@ def _tile_shader(*, timed: bool) -> Any:
         view: ViewData,
         faces: wp.array3d[int],
         rays: wp.array2d[wp.vec4],
-        first_ray: int,
-        first_instant: int,
+        tile: TilePlace,
         wanted: int,
-        tile_top: int,
-        tile_left: int,
         radiance_out: wp.array[float],
         unresolved_out: wp.array[int],
     ): ...
@@ -251,13 +230,8 @@ def _pixel_caster(width: int, *, timed: bool) -> Any:
         scene: SceneData,
         view: ViewData,
         rays: wp.array2d[wp.vec4],
-        first_pixel: int,
+        pixels: PixelBlock,
         far_m: float,
-        instant: int,
-        top: int,
-        left: int,
-        rows: int,
-        columns: int,
         unresolved: int,
         block: int,
         radiance_out: wp.array[float],
@@ -270,10 +244,8 @@ def _pixel_caster(width: int, *, timed: bool) -> Any:
 def _write_log(
     dark_floor: float,
     radiance: wp.array[float],
-    first_instant: int,
+    tile: TilePlace,
     wanted: int,
-    tile_top: int,
-    tile_left: int,
     log_radiance_out: wp.array3d[float],
 ):
     """Write the log radiance of a tile at a few instants; on a CPU only."""
@@ -294,7 +266,6 @@ def _tile_kernel(terms: RenderTerms) -> wp.Kernel:
         scene: SceneData,
         view: ViewData,
         bodies: BodyData,
-        worlds: WorldData,
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
@@ -303,11 +274,11 @@ def _tile_kernel(terms: RenderTerms) -> wp.Kernel:
         group_count = (view.instant_count + _INSTANTS - 1) // _INSTANTS
         tile = index // group_count
         begin = index % group_count * _INSTANTS
-        place = locate_tile(tile, begin, view, worlds)
+        place = locate_tile(tile, begin, view)
         if not place.rendered:
             return
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[place.world]]
+            scene = view.worlds.scenes[view.worlds.scene[place.world]]
         count = wp.min(_INSTANTS, view.instant_count - begin)
         wanted = int(0)
         for later in range(count):
@@ -315,44 +286,21 @@ def _tile_kernel(terms: RenderTerms) -> wp.Kernel:
                 wanted = wanted | (1 << later)
         light = wp.zeros(shape=(_LIGHT_COUNT,), dtype=float)
         unresolved = wp.zeros(shape=(_BLOCK_COUNT,), dtype=int)
-        shade_tile(
-            scene,
-            view,
-            out.face,
-            rays,
-            place.first_ray,
-            place.instant,
-            wanted,
-            place.top,
-            place.left,
-            light,
-            unresolved,
-        )
+        shade_tile(scene, view, out.face, rays, place, wanted, light, unresolved)
         block = int(0)
         while block < _BLOCK_COUNT:  # not `range`, which would be unrolled
             if unresolved[block] != 0:
-                top = place.top + block % 4 // 2 * _SIDE
-                left = place.left + block % 2 * _SIDE
-                cast_pixels(
-                    scene,
-                    view,
-                    rays,
-                    place.first_ray + top * view.width + left,
-                    FAR_M,
-                    place.instant + block // 4,
-                    top,
-                    left,
-                    wp.min(view.height - top, _SIDE),
-                    wp.min(view.width - left, _SIDE),
-                    unresolved[block],
-                    block,
-                    light,
-                )
+                pixels = PixelBlock()
+                pixels.instant = place.instant + block // 4
+                pixels.top = place.top + block % 4 // 2 * _SIDE
+                pixels.left = place.left + block % 2 * _SIDE
+                pixels.first_ray = place.first_ray + pixels.top * view.width + pixels.left
+                pixels.rows = wp.min(view.height - pixels.top, _SIDE)
+                pixels.columns = wp.min(view.width - pixels.left, _SIDE)
+                cast_pixels(scene, view, rays, pixels, FAR_M, unresolved[block], block, light)
             block += 1
         if out.log_radiance.shape[0] > 0:
-            _write_log(
-                scene.dark_floor, light, place.instant, wanted, place.top, place.left, out.log_radiance
-            )
+            _write_log(scene.dark_floor, light, place, wanted, out.log_radiance)
         if out.rgb.shape[0] > 0 or out.radiance.shape[0] > 0:
             for later in range(count):
                 slot = view.image_slot[place.instant + later]
@@ -422,32 +370,22 @@ class Antialiasing:
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 
     def launch(
-        self,
-        scene: SceneData,
-        view: ViewData,
-        bodies: BodyData,
-        worlds: WorldData,
-        out: RenderOutputs,
-        *,
-        pixel_count: int,
+        self, inputs: Sequence[Any], outputs: Sequence[Any], *, pixel_count: int, instant_count: int
     ) -> None:
-        """Write the light of the pixels of all tiles, instants and worlds; `out` has the faces."""
-        inputs = [scene, view, bodies, worlds, self._rays]
+        """Write the light of the pixels of all tiles, instants and worlds; outputs have the faces.
+
+        Inputs are scene, view and bodies, and outputs the `RenderOutputs`, as of the first pass.
+        """
+        inputs = [*inputs, self._rays]
         if self._lists is None:
-            dim = pixel_count
+            dim, multiple = pixel_count, TILE * TILE
             if self._by_tile:
-                count = view.instant_count
-                dim = pixel_count // (TILE * TILE * count) * -(-count // _INSTANTS)
-            launch_split(
-                self._kernels[0],
-                dim=dim,
-                inputs=inputs,
-                outputs=[out],
-                device=self._device,
-                multiple=1 if self._by_tile else 64,
-            )
+                dim = pixel_count // (TILE * TILE * instant_count) * -(-instant_count // _INSTANTS)
+                multiple = 1
+            kernel, device = self._kernels[0], self._device
+            launch_split(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, multiple=multiple)
             return
         self._lists.count.zero_()
-        dims = thread_counts(self._lists, pixel_count, view.instant_count)
+        dims = thread_counts(self._lists, pixel_count, instant_count)
         for kernel, dim in zip(self._kernels, dims, strict=True):
-            launch_split(kernel, dim=dim, inputs=inputs, outputs=[out, self._lists], device=self._device)
+            launch_split(kernel, dim=dim, inputs=inputs, outputs=[*outputs, self._lists], device=self._device)

@@ -18,8 +18,6 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.block_lists import COVER_BOUNDS, INSTANTS, BlockLists, leaves_room, next_entry
-from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import (
     APART,
     FACE_COUNT_MAX,
@@ -30,14 +28,19 @@ from neurosim_core.render.coverage import (
     footprint_width,
     ray_point,
 )
-from neurosim_core.render.outputs import RenderOutputs, radiance_writer, requested_outputs
-from neurosim_core.render.ray_intersection import UNFUSED, Hit, intersect_bodies, intersect_scene
-from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, turn_count
-from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.kernel_data import BodyData, Hit, RenderOutputs, RenderTerms, SceneData, ViewData
+from neurosim_core.render.outputs import radiance_writer, requested_outputs
+from neurosim_core.render.ray_intersection import UNFUSED, intersect_bodies, intersect_scene
+from neurosim_core.render.raycast import PIXEL_BOUNDS, turn_count
 from neurosim_core.render.shading import pixel_shader, surface_shader
-from neurosim_core.render.view_data import ViewData, WorldData, pose_finder, tile_locator
+from neurosim_core.render.tiles import pose_finder, tile_locator
 
+INSTANTS = wp.constant(4)
+"""Instants of a pixel in a block that shows one surface, of a thread."""
+COVER_BOUNDS = (64, 12)
+"""Threads of a block, and blocks of a multiprocessor."""
+_RAY_THREADS = 5120
+"""Threads of a multiprocessor: far more than run at a time, since some take longer than others."""
 _SEVERAL, _SKY, _BODY = (wp.constant(kind) for kind in (1, 2, 3))
 _RAYS = wp.constant(16 * RAY_COUNT)
 _FAST = {"fast_math": True}
@@ -47,10 +50,80 @@ Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
 
 
+@wp.struct
+class BlockLists:
+    """Blocks of 4 x 4 pixels that a kernel leaves to another one; threads 16 n to 16 n + 15 are block n."""
+
+    uneven: wp.array[wp.vec3i]
+    """Those that show several surfaces in one of two consecutive instants: four times the tile, and which of
+    its blocks; the first instant; a bit for each of the two."""
+    unresolved: wp.array[wp.vec2i]
+    """Those with pixels that have to be rendered by rays, and a bit for each of these."""
+    count: wp.array[int]  # Length of the two lists, and how many entries of the first are taken
+    threads: int  # Threads of the kernel that goes through the second one
+
+
+def make_lists(block_count: int, device: Any) -> BlockLists:
+    """Return empty lists for at most so many blocks."""
+    lists = BlockLists()
+    lists.uneven = wp.zeros(block_count, dtype=wp.vec3i, device=device)
+    lists.unresolved = wp.zeros(block_count, dtype=wp.vec2i, device=device)
+    lists.count = wp.zeros(3, dtype=int, device=device)
+    lists.threads = _RAY_THREADS * max(1, wp.get_device(device).sm_count)
+    return lists
+
+
+def thread_counts(lists: BlockLists, pixel_count: int, instant_count: int) -> tuple[int, int, int]:
+    """Return the threads of the three kernels, for so many pixels of all instants of all worlds."""
+    even = pixel_count // instant_count * -(-instant_count // INSTANTS)
+    cover = lists.threads // _RAY_THREADS * COVER_BOUNDS[0] * COVER_BOUNDS[1]
+    return even, cover, lists.threads
+
+
+@wp.func_native(read_native(__file__, "next_entry"))
+def next_entry(count: wp.array[int], counter: int) -> int:
+    """Return the next number that a counter gives to a warp."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "leaves_room", BLOCKS=COVER_BOUNDS[1]))
+def leaves_room() -> wp.bool:
+    """Return whether a block of the kernel of uneven blocks ends before all is done.
+
+    So a multiprocessor is left to what comes and goes: the flight is ahead of the renderer, and a kernel of a
+    vehicle needs more registers than full multiprocessors have.
+    """
+    ...
+
+
+@wp.struct
+class PixelPlace:
+    """A pixel of a block in one instant; for the rest see `tiles.TilePlace`."""
+
+    rendered: wp.bool
+    world: int
+    instant: int
+    slot: int
+    left: int  # Column of the first pixel of the block
+    top: int  # Row of the first pixel of the block
+    row: int
+    col: int
+    outside: wp.bool  # The pixel is not in the picture
+    ray: int  # Index of its ray in a layer
+
+
+@wp.struct
+class PixelRays:
+    """Where a pixel is seen from, and the direction to its centre and its change across and down, in W."""
+
+    position: wp.vec3
+    center: wp.vec3
+    across: wp.vec3
+    down: wp.vec3
+
+
 @wp.func_native(read_native(__file__, "classify_block"))
-def _classify_block(
-    scene: SceneData, faces: wp.array3d[int], instant: int, top: int, left: int, height: int, width: int
-) -> int:
+def _classify_block(scene: SceneData, view: ViewData, faces: wp.array3d[int], at: PixelPlace) -> int:
     """Tell what the first rays show in and around a block: 0: one surface; others: see the file."""
     ...
 
@@ -68,18 +141,12 @@ def _block_coverer(timed: bool) -> Any:
     @wp.func_native(code)
     def cover_block(
         scene: SceneData,
+        view: ViewData,
         faces: wp.array3d[int],
-        instant: int,
-        top: int,
-        left: int,
-        height: int,
-        width: int,
+        at: PixelPlace,
         alone: wp.bool,
         outside: wp.bool,
-        position: wp.vec3,
-        center: wp.vec3,
-        across: wp.vec3,
-        down: wp.vec3,
+        rays: PixelRays,
     ) -> Coverage: ...
 
     return cover_block
@@ -93,10 +160,7 @@ def _meet_pair(
     pair: int,
     own_part: int,
     spread_rad: float,
-    position: wp.vec3,
-    center: wp.vec3,
-    across: wp.vec3,
-    down: wp.vec3,
+    rays: PixelRays,
 ) -> MetPair:
     """Return what a pixel sees of a surface; see the file."""
     ...
@@ -131,33 +195,17 @@ def _xyz(ray: wp.vec4) -> wp.vec3:
     return wp.vec3(ray[0], ray[1], ray[2])
 
 
-@wp.struct
-class PixelPlace:
-    """A pixel of a block in one instant; for the rest see `view_data.TilePlace`."""
-
-    rendered: wp.bool
-    world: int
-    instant: int
-    slot: int
-    left: int  # Column of the first pixel of the block
-    top: int  # Row of the first pixel of the block
-    row: int
-    col: int
-    outside: wp.bool  # The pixel is not in the picture
-    ray: int  # Index of its ray in a layer
-
-
 def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Function:
     """Return the Warp function that locates a pixel of a block.
 
     Its parameters: the tile, as `tile_finder` counts; the instant, of a world; which of the four blocks of
-    the tile; which of the 16 pixels of the block; view and worlds.
+    the tile; which of the 16 pixels of the block; view.
     """
     locate_tile = tile_locator(terms, images=images, instants=instants)
 
     @wp.func
-    def locate_pixel(tile: int, instant: int, quarter: int, lane: int, view: ViewData, worlds: WorldData):
-        place = locate_tile(tile, instant, view, worlds)
+    def locate_pixel(tile: int, instant: int, quarter: int, lane: int, view: ViewData):
+        place = locate_tile(tile, instant, view)
         at = PixelPlace()
         at.rendered = place.rendered
         at.world = place.world
@@ -230,7 +278,6 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
         scene: SceneData,
         view: ViewData,
         bodies: BodyData,
-        worlds: WorldData,
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
@@ -244,19 +291,19 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
         tile = group // group_count
         begin = group % group_count * INSTANTS
         end = wp.min(begin + INSTANTS, view.instant_count)
-        at = locate_pixel(tile, begin, quarter, lane, view, worlds)
+        at = locate_pixel(tile, begin, quarter, lane, view)
         if wp.static(terms.world_scenes):
-            scene = worlds.scenes[worlds.scene[at.world]]
+            scene = view.worlds.scenes[view.worlds.scene[at.world]]
         in_picture = at.left < view.width and at.top < view.height
         first_instant = at.instant - begin
         uneven = int(0)
         for instant in range(begin, end):
             if wp.static(requested.images):
-                at = locate_pixel(tile, instant, quarter, lane, view, worlds)
+                at = locate_pixel(tile, instant, quarter, lane, view)
             at.instant = first_instant + instant
             if not at.rendered:
                 continue
-            kind = _classify_block(scene, out.face, at.instant, at.top, at.left, view.height, view.width)
+            kind = _classify_block(scene, view, out.face, at)
             if lane == 0 and in_picture and kind == _BODY:
                 columns = (1 << wp.min(view.width - at.left, 4)) - 1
                 pixels = int(0)
@@ -293,7 +340,6 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
         scene: SceneData,
         view: ViewData,
         bodies: BodyData,
-        worlds: WorldData,
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
@@ -308,9 +354,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
             bits = wp.where(waiting != 0, waiting & -waiting, listed[2])
             alone = bits != 3
             instant = listed[1] + wp.where(alone, bits // 2, lane // 16)
-            at = locate_pixel(listed[0] // 4, instant, listed[0] % 4, lane % 16, view, worlds)
+            at = locate_pixel(listed[0] // 4, instant, listed[0] % 4, lane % 16, view)
             if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[at.world]]
+                scene = view.worlds.scenes[view.worlds.scene[at.world]]
             unwanted = at.outside or (alone and lane >= 16)
             back = wp.where(at.outside, (at.row - at.top) * view.width + at.col - at.left, 0)
             pixel = at.ray - back
@@ -318,44 +364,21 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
             if not at.outside:
                 part = out.face[at.instant, at.row, at.col]
             pose = find_pose(at.instant, 0, at.row * view.width + at.col - back, view)
-            origin = view.p_WC[pose]
             q = view.q_WC[pose]
-            center = wp.quat_rotate(q, _xyz(rays[0, pixel]))
-            across = wp.quat_rotate(q, _xyz(rays[1, pixel]))
-            down = wp.quat_rotate(q, _xyz(rays[2, pixel]))
-            covered = cover_block(
-                scene,
-                out.face,
-                at.instant,
-                at.top,
-                at.left,
-                view.height,
-                view.width,
-                alone,
-                unwanted,
-                origin,
-                center,
-                across,
-                down,
-            )
+            own = PixelRays()
+            own.position = view.p_WC[pose]
+            own.center = wp.quat_rotate(q, _xyz(rays[0, pixel]))
+            own.across = wp.quat_rotate(q, _xyz(rays[1, pixel]))
+            own.down = wp.quat_rotate(q, _xyz(rays[2, pixel]))
+            covered = cover_block(scene, view, out.face, at, alone, unwanted, own)
             if covered[0] < 0:
                 waiting = int(3)
                 continue
             total = wp.vec3(0.0)
             for step in range((covered[0] + 31) // 32):
                 pair = 32 * step + lane
-                met = _meet_pair(
-                    scene,
-                    covered[5],
-                    alone,
-                    wp.min(pair, covered[0] - 1),
-                    part,
-                    rays[0, pixel][3],
-                    origin,
-                    center,
-                    across,
-                    down,
-                )
+                known = wp.min(pair, covered[0] - 1)
+                met = _meet_pair(scene, covered[5], alone, known, part, rays[0, pixel][3], own)
                 if pair < covered[0]:
                     light = shade_part(
                         scene,
@@ -390,7 +413,6 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
         scene: SceneData,
         view: ViewData,
         bodies: BodyData,
-        worlds: WorldData,
         rays: wp.array2d[wp.vec4],
         # Out:
         out: RenderOutputs,
@@ -403,11 +425,9 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
             block = listed[0]
             lane = index // RAY_COUNT
             group = block // 4
-            at = locate_pixel(
-                group // view.instant_count, group % view.instant_count, block % 4, lane, view, worlds
-            )
+            at = locate_pixel(group // view.instant_count, group % view.instant_count, block % 4, lane, view)
             if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[at.world]]
+                scene = view.worlds.scenes[view.worlds.scene[at.world]]
             wanted = (listed[1] >> lane) & 1
             light = wp.vec3(0.0)
             if wanted != 0:

@@ -1,4 +1,6 @@
-# mypy: disable-error-code="assignment,union-attr"
+# mypy: disable-error-code="index,attr-defined,operator,arg-type,assignment,empty-body,union-attr"
+# mypy: disable-error-code="no-untyped-def,valid-type"
+# ruff: noqa: UP018  (typed literals have a meaning in kernels)
 """Candidate lists: one search of the tree for all rays of a tile of pixels in several instants; exact.
 
 The rays of 8 x 8 pixels in M consecutive instants lie in a narrow frustum: that of the tile, swept by the
@@ -16,25 +18,56 @@ Nothing is approximated: the results are those of rays that traverse the tree (`
 as far as a compiler makes the same code of the same intersection in two places. They depend neither on the
 number of instants per launch or per list nor on the order in which threads find triangles.
 
-Steps 1 and 2 are in `frustum_search.py`; the test of step 3 and its rounding are in
-`candidate_intersection.py`; the margins of tiles are in `tile_bounds.py`.
+The test of step 3 (`candidate_intersector`) evaluates three edge functions, normalised such that their sum is
+one over the distance. The ray hits a triangle first if the triangle is nearer than all others by more than
+rounding, the ray passes inside its edges by more than rounding, and the hit is within the reach of the list.
+`ray_intersection.intersect_face` then computes the exact point, with the tree's own arithmetic. Otherwise the
+answer is UNRESOLVED.
+
+Error bounds. Corners relative to the camera are rounded the same way in both tests, so they count as exact.
+The edge function d . (b x (c - b)) is off by at most 6e-7 |b| |c - b|, that of Woop's test by 1.4e-6 max|a,
+b, c| |c - b|. Rays keep their direction in C, and the functions are turned there: that adds 1.2e-6. A ray is
+within rounding of an edge if the function is below EDGE = 5e-6 of the same product. The distance of a
+triangle is off by less than TIE / 2 of it, unless the triangle is seen nearly from the side or is a sliver
+(SIDE): rays within rounding of such a triangle are unresolved.
+
+Margins. Frustums and the sides of tiles hold all rays of a tile by an angle of 1e-5 rad to spare. What that
+has to cover is the rounding of rays and of the camera's axes when they are rotated (5e-7 rad each), and of a
+triangle's corners along the sides (1e-6 of the distance): 2e-6 rad together, wherever in the picture,
+because all of it is measured as angles. Bounds are kept as slopes x / z, and a slope is an angle only
+short of 90 degrees from the axis: lenses are taken up to a slope of 100 (89.4 degrees), where the 1e-5
+rad move a bound by two thousandths of itself at most, and are refused beyond. A triangle whose plane
+contains the ray to within rounding is the one exception: Woop's test can hit it outside of its edges, and
+where that is outside of the frustum, too, the tree finds it and a list does not.
+
+References: Reshetov, Soupikov, Hurley (2005), Multi-Level Ray Tracing Algorithm; Woop, Benthin, Wald (2013),
+Watertight Ray/Triangle Intersection.
 """
 
-from __future__ import annotations
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
 import math
+from functools import cache
 from typing import Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.candidate_data import BLOCK, TILE, CandidateListData
+from neurosim_core.native_code import read_native
 from neurosim_core.render.config import CandidateListConfig
-from neurosim_core.render.frustum_search import frustum_search_kernel
+from neurosim_core.render.kernel_data import (
+    BLOCK,
+    FAR_M,
+    TILE,
+    UNRESOLVED,
+    CandidateListData,
+    RayTree,
+    SceneData,
+    ViewData,
+)
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.ray_tree import RayTree
-from neurosim_core.render.tile_bounds import looks_forward, tile_bounds
+from neurosim_core.render.ray_tree import intersect_tree
 
 _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
@@ -48,6 +81,17 @@ _UNRESOLVED_SHARE = 8
 """One in so many pixels may be unresolved; if there are more, the fallback kernel renders all pixels."""
 _THREADS_PER_MULTIPROCESSOR = 1280
 """Threads of the fallback kernel: more than run at a time, since some take longer than others."""
+_BORDER_RAD = 1.0e-5
+"""By how much the rays of a tile are taken to reach beyond their border [rad]."""
+_SLOPE_MAX = 100.0
+"""Largest |x / z| and |y / z| of a ray: 89.4 degrees from the axis."""
+_ROUNDING = wp.constant(4.0e-6)
+"""Of the coordinates of a scene: what frustums are widened by."""
+_REACH = wp.constant(1.01)
+_REACH_M = wp.constant(0.01)
+"""A list reaches further than the furthest probe ray: by this factor, and by this length [m]."""
+_COSINE_MIN = wp.constant(0.2)
+"""Least cosine between the axis of a frustum and its rays; a tile that turns further has no list."""
 
 
 def choose_candidate_lists(
@@ -89,6 +133,214 @@ def _check_counts(config: CandidateListConfig, *, groups: int, tiles: int) -> No
             f"{config.face_count_max} are more than 2^31 - 1 entries: {allowed} here; or take fewer worlds "
             "or pixels, or share a list between more instants (render.candidate_lists.instants)"
         )
+
+
+def looks_forward(rays: NDArray[np.float32]) -> bool:
+    """Return whether `tile_bounds` takes the rays of a lens."""
+    x, y, z = np.moveaxis(rays[..., :3].astype(np.float64), -1, 0)
+    return bool((z > 0.0).all() and (np.maximum(np.abs(x), np.abs(y)) <= _SLOPE_MAX * z).all())
+
+
+def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Return the least and largest x / z and y / z of the rays of each tile, shape [tile, 4], row by row.
+
+    They are widened by 1e-5 rad, more than rounding. A ray that reaches z = 1 after the length L, and a plane
+    x = (s + ds) z where it has the slope s, are ds / (L sqrt(1 + s^2)) apart [rad]. Rays are in C, shape
+    [layer, H * W, 3 or more].
+
+    Raises:
+        ValueError: A ray does not look forward (z <= 0), or is too close to 90 degrees from the axis: |x / z|
+            or |y / z| is above 100.
+    """
+    directions = rays[..., :3].astype(np.float64).reshape(-1, height, width, 3)
+    if not (directions[..., 2] > 0.0).all():
+        raise ValueError("candidate lists need rays that look forward, and some of this lens do not (z <= 0)")
+    slopes = directions[..., :2] / directions[..., 2:]
+    steepest = float(np.abs(slopes).max())
+    if steepest > _SLOPE_MAX:
+        raise ValueError(
+            f"candidate lists need rays with |x / z| and |y / z| up to {_SLOPE_MAX:g} "
+            f"({math.degrees(math.atan(_SLOPE_MAX)):.1f} deg from the axis), and this lens has "
+            f"{steepest:.4g}: take a narrower lens, or set render.candidate_lists to null"
+        )
+    length = np.sqrt(1.0 + (slopes**2).sum(axis=-1, keepdims=True))
+    widened = _BORDER_RAD * length * np.sqrt(1.0 + slopes**2)
+    lowest, highest = slopes - widened, slopes + widened
+    bounds = []
+    for top in range(0, height, TILE):
+        for left in range(0, width, TILE):
+            part = np.s_[:, top : top + TILE, left : left + TILE]
+            low, high = lowest[part].min(axis=(0, 1, 2)), highest[part].max(axis=(0, 1, 2))
+            bounds.append((low[0], high[0], low[1], high[1]))
+    return np.array(bounds, dtype=np.float32)
+
+
+@wp.struct
+class _Frustum:
+    """The rays of a tile in several instants: z along the axis, all of them between four planes."""
+
+    origin: wp.vec3  # In W [m], as the axes; what follows is relative to it
+    x: wp.vec3
+    y: wp.vec3
+    z: wp.vec3
+    slope_low: wp.vec2  # Least x / z and y / z of the rays
+    slope_high: wp.vec2
+    foot_low: wp.vec2  # Where the lower planes cross z = 0: x >= foot_low[0] + slope_low[0] z
+    foot_high: wp.vec2
+    near: float  # Least z [m]
+    far: float  # Largest z [m]
+
+
+@wp.func_native(read_native(__file__, "block_max"))
+def _block_max(value: float) -> float:
+    """Return the largest value of the threads of a block; on a CPU, of the one."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "list_frustum_faces"))
+def _list_frustum_faces(
+    tree: RayTree, frustum: _Frustum, limit: int, begin: int, faces_out: wp.array[int]
+) -> int:
+    """Write the faces that reach into a frustum from `begin` on, in any order; return their number.
+
+    It returns -1 if there are more than `limit`. On CUDA the 64 threads of a block call it together.
+    A thread takes a node: it lists the faces of a leaf, or puts the children on the stack.
+    """
+    ...
+
+
+@wp.func
+def _corner_ray(bounds: wp.vec4, corner: int) -> wp.vec3:
+    return wp.vec3(bounds[corner % 2], bounds[2 + corner // 2], 1.0)
+
+
+@cache
+def frustum_search_kernel(lanes: int) -> wp.Kernel:
+    """Return the kernel that fills candidate lists; `lanes` threads share a tile: 64 on CUDA, else 1."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def search_frustums(
+        first: int,
+        # Model:
+        tree: RayTree,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        extent_m: float,
+        # In:
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        # In/out:
+        data: CandidateListData,
+    ) -> None:
+        index = first + wp.tid()
+        lane = index % lanes
+        tile = (index // lanes) % data.bounds.shape[0]
+        group = index // lanes // data.bounds.shape[0]
+        begin = group * data.instants
+        instants = wp.min(data.instants, instant_count - begin)
+        tile_columns = (width + 7) // 8
+        left = (tile % tile_columns) * 8
+        top = (tile // tile_columns) * 8
+        bounds = data.bounds[tile]
+        # A probe is one of 4 x 4 pixels spread over the tile, at one of up to four instants.
+        times = wp.min(instants, 4)
+        reach = float(0.0)
+        for probe in range(lane, 16 * times, lanes):
+            instant = begin + (probe // 16) * (instants - 1) // wp.max(times - 1, 1)
+            col = wp.min(left + (7 * (probe % 4) + 1) // 3, width - 1)
+            row = wp.min(top + (7 * ((probe // 4) % 4) + 1) // 3, height - 1)
+            ray_C = rays[0, row * width + col]
+            ray = wp.quat_rotate(q_WC[instant], wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            reach = wp.max(reach, intersect_tree(tree, p_WC[instant], ray, FAR_M)[0])
+        reach = wp.min(_block_max(reach) * _REACH + _REACH_M, FAR_M)
+
+        frustum = _Frustum()
+        middle = begin + instants // 2
+        q = q_WC[middle]
+        axis_C = wp.vec3(0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[2] + bounds[3]), 1.0)
+        frustum.origin = p_WC[middle]
+        frustum.z = wp.normalize(wp.quat_rotate(q, axis_C))
+        frustum.x = wp.normalize(wp.cross(wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)), frustum.z))
+        frustum.y = wp.cross(frustum.z, frustum.x)
+        low = wp.vec2(FAR_M)
+        high = wp.vec2(-FAR_M)
+        cosine = float(1.0)
+        for corner in range(lane, 4 * instants, lanes):
+            ray = wp.normalize(wp.quat_rotate(q_WC[begin + corner // 4], _corner_ray(bounds, corner % 4)))
+            cosine = wp.min(cosine, wp.dot(ray, frustum.z))
+            slope = wp.vec2(wp.dot(ray, frustum.x), wp.dot(ray, frustum.y)) / wp.dot(ray, frustum.z)
+            low = wp.min(low, slope)
+            high = wp.max(high, slope)
+        cosine = -_block_max(-cosine)
+        frustum.slope_low = wp.vec2(-_block_max(-low[0]), -_block_max(-low[1]))
+        frustum.slope_high = wp.vec2(_block_max(high[0]), _block_max(high[1]))
+        low = wp.vec2(FAR_M)
+        high = wp.vec2(-FAR_M)
+        near = float(FAR_M)
+        far = float(-FAR_M)
+        for instant in range(begin + lane, begin + instants, lanes):
+            moved = p_WC[instant] - frustum.origin
+            place = wp.vec2(wp.dot(moved, frustum.x), wp.dot(moved, frustum.y))
+            along = wp.dot(moved, frustum.z)
+            low = wp.min(low, place - along * frustum.slope_low)
+            high = wp.max(high, place - along * frustum.slope_high)
+            near = wp.min(near, along)
+            far = wp.max(far, along)
+        margin = _ROUNDING * (extent_m + wp.length(frustum.origin))
+        frustum.foot_low = wp.vec2(-_block_max(-low[0]) - margin, -_block_max(-low[1]) - margin)
+        frustum.foot_high = wp.vec2(_block_max(high[0]) + margin, _block_max(high[1]) + margin)
+        frustum.near = -_block_max(-near) - margin
+        frustum.far = _block_max(far) + reach + margin
+        count = -1
+        if cosine > _COSINE_MIN:  # of all lanes or of none
+            begin_of_list = (group * data.bounds.shape[0] + tile) * data.limit
+            count = _list_frustum_faces(tree, frustum, data.limit, begin_of_list, data.faces)
+        if lane == 0:
+            data.count[group, tile] = count
+            data.reach[group, tile] = reach
+
+    return search_frustums
+
+
+@cache
+def candidate_intersector(group: int) -> wp.Function:
+    """Return the Warp function that intersects the ray of a pixel with a candidate list at several instants.
+
+    It returns a vector of `group` integers, a divisor of 64: for each instant the face that the ray hits
+    first; -1: none; UNRESOLVED. On CUDA the 64 threads of a block, the pixels of a tile, call it together and
+    share the set-up of triangles.
+
+    Its parameters: the scene and the view; the tile; the first instant and the number of instants; the
+    distance that counts as infinite [m]; the direction of the pixel's ray in C, of unit length.
+    """
+    found = wp.types.vector(length=group, dtype=int)
+
+    @wp.func_native(read_native(__file__, "intersect_candidates", GROUP=group, UNRESOLVED=UNRESOLVED))
+    def intersect_candidates(
+        scene: SceneData, view: ViewData, tile: int, first: int, instants: int, far_m: float, ray_C: wp.vec3
+    ) -> found: ...
+
+    return intersect_candidates
+
+
+@wp.func_native(read_native(__file__, "intersect_tile", UNRESOLVED=UNRESOLVED))
+def intersect_tile(
+    scene: SceneData,
+    view: ViewData,
+    tile: int,
+    first: int,
+    far_m: float,
+    rays: wp.array[wp.vec3],
+    face_out: wp.array[int],
+):
+    """Intersect all 64 rays of a tile at one instant with its list; for CPU kernels, vectorised over rays.
+
+    See `candidate_intersector`; rays are in W. It writes the face that each ray hits first; -1: none;
+    UNRESOLVED.
+    """
+    ...
 
 
 class CandidateLists:

@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.renderer import make_renderer
+from neurosim_core.render.renderer import make_renderer, take_picture
 
 Array = NDArray[np.float64]
 
@@ -44,11 +43,16 @@ def check_renderer(
         position: p_WC [m], shape [3]: a place from which most of what is seen is between 0.5 and 20 m away.
         orientation: q_WC of the optical frame (x right, y down, z forward), xyzw, shape [4].
     """
-    views = _Views(scene, lens)
+    renderer = make_renderer(scene, lens, outputs=["depth", "rgb"], instant_count=1)
+
+    def look(pose: tuple[Array, Rotation]) -> tuple[Array, NDArray[np.uint8]]:
+        pictures = take_picture(renderer, pose[0], pose[1].as_quat(), outputs=("depth", "rgb"))
+        return pictures["depth"].astype(np.float64), pictures["rgb"]
+
     begin = np.asarray(position, dtype=np.float64), Rotation.from_quat(np.asarray(orientation, np.float64))
-    depth, rgb = views.take(begin)
+    depth, rgb = look(begin)
     complaints = []
-    again, rgb_again = views.take(begin)
+    again, rgb_again = look(begin)
     if not (np.array_equal(depth, again) and np.array_equal(rgb, rgb_again)):
         complaints.append("the same pose gives other frames the second time")
     if not np.isfinite(depth).any() or float(np.nanmin(np.where(np.isfinite(depth), depth, np.nan))) <= 0.0:
@@ -56,7 +60,7 @@ def check_renderer(
     pixels = _pixel_points(depth, lens)
     for name, shift_m, turn_rad in _MOVES:
         moved = begin[0] + begin[1].apply(shift_m), begin[1] * Rotation.from_rotvec(turn_rad)
-        error = _disagreement(pixels, begin, moved, views.take(moved)[0], lens)
+        error = _disagreement(pixels, begin, moved, look(moved)[0], lens)
         if error is None:
             complaints.append(f"moved {name}: too little of the first view is seen in the second")
         elif error > _RELATIVE_MAX:
@@ -65,22 +69,6 @@ def check_renderer(
                 "(planar z, not the length of rays; x right, y down, z forward; pixel centres at +0.5?)"
             )
     return complaints
-
-
-class _Views:
-    """Depth and rgb of one pose after another."""
-
-    def __init__(self, scene: Any, lens: PinholeConfig) -> None:
-        self._renderer = make_renderer(scene, lens, outputs=["depth", "rgb"], instant_count=1)
-        self._device = self._renderer.depth.device
-        self._slot: Any = wp.zeros(1, dtype=int, device=self._device)
-
-    def take(self, pose: tuple[Array, Rotation]) -> tuple[Array, NDArray[np.uint8]]:
-        """Return the frames of a pose."""
-        p_WC: Any = wp.array([pose[0]], dtype=wp.vec3, device=self._device)
-        q_WC: Any = wp.array([pose[1].as_quat()], dtype=wp.quat, device=self._device)
-        self._renderer.render(p_WC, q_WC, self._slot, instant_count=1)
-        return self._renderer.depth.numpy()[0].astype(np.float64), self._renderer.rgb.numpy()[0].copy()
 
 
 def _pixel_points(depth: Array, lens: PinholeConfig) -> Array:

@@ -19,6 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
+from neurosim_core.render.kernel_data import Hit
 
 PACKET = 16
 """Rays that a kernel casts together."""
@@ -147,31 +148,24 @@ def embree_distance(
 
 
 @cache
-def packet_caster(width: int, *, origins: bool = False) -> Any:
-    """Return the Warp function, for CPU kernels only, that casts 16 rays from one origin.
+def packet_caster(width: int) -> Any:
+    """Return the Warp function, for CPU kernels only, that casts 16 rays.
 
-    Its parameters: `EmbreeTree.intersect` and `.scene`; the origin, or with `origins` that of each ray, [16];
-    rays [16], unit length, of which those of zero length are not cast; the distance beyond which hits do not
-    count [m]. Its outputs, each [16]: face, -1 where nothing is hit; distance [m]; u and v, the weights of
-    the first and the second corner; normal of the front, of any length.
+    Its parameters: `EmbreeTree.intersect` and `.scene`; the origin of each ray [16]; rays [16], unit length,
+    of which those of zero length are not cast; the distance beyond which hits do not count [m]. It writes
+    their hits [16], with normals of any length.
 
     The last bits of a hit may depend on the other rays of its packet.
     """
-    origin_type: Any = wp.array[wp.vec3] if origins else wp.vec3
-    code = read_native(__file__, "cast_rays" if origins else "cast_packet", WIDTH=width)
 
-    @wp.func_native(code)
+    @wp.func_native(read_native(__file__, "cast_rays", WIDTH=width))
     def cast_packet(
         intersect: wp.uint64,
         scene: wp.uint64,
-        origin: origin_type,
+        origins: wp.array[wp.vec3],
         rays: wp.array[wp.vec3],
         far_m: float,
-        face_out: wp.array[int],
-        t_out: wp.array[float],
-        u_out: wp.array[float],
-        v_out: wp.array[float],
-        normal_out: wp.array[wp.vec3],
+        hit_out: wp.array[Hit],
     ): ...
 
     return cast_packet

@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.config import LightingConfig
 from neurosim_core.render.embree import EmbreeTree, embree_distance, packet_width
+from neurosim_core.render.kernel_data import SceneData
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.light_cache import cached_arrays
-from neurosim_core.render.refine import RefinedMesh
-from neurosim_core.scene.scene import Scene
+from neurosim_core.render.ray_tree import make_mesh
+from neurosim_core.scene.scene import RefinedMesh, Scene
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,13 +70,7 @@ def reflect_light(albedo: wp.vec3, light: wp.vec3, emission: wp.vec3) -> wp.vec3
 def _bake(
     first: int,
     # Model:
-    occluders: wp.uint64,
-    intersect: wp.uint64,
-    ambient_up: wp.vec3,
-    ambient_down: wp.vec3,
-    light_position: wp.array[wp.vec3],
-    light_intensity: wp.array[wp.vec3],
-    light_radius_m: float,
+    scene: SceneData,
     ambient_radius_m: float,
     interreflection: float,
     hemisphere: wp.array[wp.vec3],
@@ -115,7 +110,7 @@ def _bake(
         below = wp.dot(direction, face_normal)
         if below < 0.0:
             direction = direction - 2.0 * below * face_normal
-        near = _free_distance(occluders, intersect, origin, direction, ambient_radius_m) / ambient_radius_m
+        near = _free_distance(scene, origin, direction, ambient_radius_m) / ambient_radius_m
         openness += near * (2.0 - near)
         ray += 1
         if 4 * ray >= ray_count and (openness == float(ray) or openness < 0.25 * float(ray)):
@@ -123,10 +118,11 @@ def _bake(
     openness = openness / float(ray_count)
     openness_out[index] = openness
     openness = openness / (1.0 - interreflection * (1.0 - openness))
-    light = openness * ambient_light(normal, ambient_up, ambient_down)
+    light = openness * ambient_light(normal, scene.ambient_up, scene.ambient_down)
 
-    for lamp in range(light_position.shape[0]):
-        unshaded = point_light(point, normal, light_position[lamp], light_intensity[lamp], light_radius_m)
+    for lamp in range(scene.light_position.shape[0]):
+        position = scene.light_position[lamp]
+        unshaded = point_light(point, normal, position, scene.light_intensity[lamp], scene.light_radius_m)
         if wp.max(unshaded) > 0.0:
             clear = int(0)
             shadow_ray_count = sphere.shape[0]
@@ -136,9 +132,9 @@ def _bake(
                 origin, _face_normal, _corner_point = _sample_point(
                     vertices, faces, corner, shadow_ray, normal
                 )
-                to_light = light_position[lamp] + light_radius_m * sphere[shadow_ray] - origin
+                to_light = position + scene.light_radius_m * sphere[shadow_ray] - origin
                 distance = wp.length(to_light)
-                if not _is_blocked(occluders, intersect, origin, to_light / distance, distance):
+                if not _is_blocked(scene, origin, to_light / distance, distance):
                     clear += 1
                 shadow_ray += 1
                 if 2 * shadow_ray >= shadow_ray_count and (clear == 0 or clear == shadow_ray):
@@ -148,27 +144,23 @@ def _bake(
 
 
 @wp.func
-def _free_distance(
-    occluders: wp.uint64, intersect: wp.uint64, origin: wp.vec3, ray: wp.vec3, far_m: float
-) -> float:
+def _free_distance(scene: SceneData, origin: wp.vec3, ray: wp.vec3, far_m: float) -> float:
     # Embree's tree where there is a function for it, else Warp's
     distance = far_m
-    if intersect != wp.uint64(0):
-        distance = embree_distance(intersect, occluders, origin, ray, far_m)
+    if scene.embree_intersect != wp.uint64(0):
+        distance = embree_distance(scene.embree_intersect, scene.embree_scene, origin, ray, far_m)
     else:
-        query = wp.mesh_query_ray(occluders, origin, ray, far_m)
+        query = wp.mesh_query_ray(scene.mesh, origin, ray, far_m)
         if query.result:
             distance = query.t
     return distance
 
 
 @wp.func
-def _is_blocked(
-    occluders: wp.uint64, intersect: wp.uint64, origin: wp.vec3, ray: wp.vec3, far_m: float
-) -> bool:
-    if intersect != wp.uint64(0):
-        return embree_distance(intersect, occluders, origin, ray, far_m) < far_m
-    return wp.mesh_query_ray_anyhit(occluders, origin, ray, far_m)
+def _is_blocked(scene: SceneData, origin: wp.vec3, ray: wp.vec3, far_m: float) -> bool:
+    if scene.embree_intersect != wp.uint64(0):
+        return embree_distance(scene.embree_intersect, scene.embree_scene, origin, ray, far_m) < far_m
+    return wp.mesh_query_ray_anyhit(scene.mesh, origin, ray, far_m)
 
 
 @wp.func
@@ -240,17 +232,8 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
             light[touched, side, channel] = total[touched] / count[touched]
 
 
-def shading_mesh(scene: Scene, device: str, *, constructor: str | None = "sah") -> wp.Mesh:
-    """Return the triangles of a scene that cast shadows: all that do not emit light."""
-    return wp.Mesh(
-        wp.array(scene.vertices, dtype=wp.vec3, device=device),
-        wp.array(_shading_faces(scene).reshape(-1), dtype=int, device=device),
-        bvh_constructor=constructor,
-        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
-    )
-
-
-def _shading_faces(scene: Scene) -> NDArray[np.int32]:
+def shading_faces(scene: Scene) -> NDArray[np.int32]:
+    """Return the triangles of a scene that cast shadows: all that do not emit light, shape [F, 3]."""
     dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
     return scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
 
@@ -282,7 +265,7 @@ def bake_light(
         return {"light": light, "group": group.astype(np.int32)}
 
     caster = wp.get_device(device).name, embree and packet_width()
-    inputs = scene.vertices, _shading_faces(scene), mesh.vertices, mesh.faces, mesh.normals
+    inputs = scene.vertices, shading_faces(scene), mesh.vertices, mesh.faces, mesh.normals
     rest = scene.lights, scene.ambient, config, caster, wp.__version__, _source()
     large = wp.get_device(device).is_cpu and len(mesh.faces) >= _KEPT_FACES_MIN
     found = cached_arrays((*inputs, *rest), compute) if large else compute()
@@ -293,13 +276,25 @@ def bake_light(
 def _build_occluders(scene: Scene, device: str, *, embree: bool) -> wp.Mesh | EmbreeTree:
     """Return the tree of the triangles that cast shadows."""
     if embree:
-        return EmbreeTree(scene.vertices, _shading_faces(scene))
-    return shading_mesh(scene, device, constructor=None)  # on CUDA: built there in 0.01 s, not here in 0.12 s
+        return EmbreeTree(scene.vertices, shading_faces(scene))
+    # on CUDA: built there in 0.01 s, not here in 0.12 s
+    return make_mesh(scene.vertices, shading_faces(scene), device, constructor=None)
 
 
 @functools.cache
 def _source() -> bytes:
     return Path(__file__).read_bytes() + Path(inspect.getfile(RefinedMesh)).read_bytes()
+
+
+def upload_lights(data: SceneData, scene: Scene, config: LightingConfig, device: str) -> None:
+    """Write the lamps of a scene and its ambient light."""
+    positions = np.array([light.position_m for light in scene.lights], np.float32).reshape(-1, 3)
+    intensities = np.array([light.intensity for light in scene.lights], np.float32).reshape(-1, 3)
+    data.light_position = wp.array(positions, dtype=wp.vec3, device=device)
+    data.light_intensity = wp.array(intensities, dtype=wp.vec3, device=device)
+    data.light_radius_m = config.light_radius_m
+    data.ambient_up = wp.vec3(*scene.ambient.up)
+    data.ambient_down = wp.vec3(*scene.ambient.down)
 
 
 def _light_groups(
@@ -311,19 +306,18 @@ def _light_groups(
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
     openness = wp.empty(2 * len(example), dtype=float, device=device)
-    lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
-    power = np.array([lamp.intensity for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
+    data = SceneData()
+    if isinstance(occluders, EmbreeTree):
+        data.embree_scene = wp.uint64(occluders.scene)
+        data.embree_intersect = wp.uint64(occluders.intersect_one)
+    else:
+        data.mesh = occluders.id
+    upload_lights(data, scene, config, device)
     launch_split(
         _bake,
         dim=2 * len(example),
         inputs=[
-            wp.uint64(occluders.scene if isinstance(occluders, EmbreeTree) else occluders.id),
-            wp.uint64(occluders.intersect_one if isinstance(occluders, EmbreeTree) else 0),
-            wp.vec3(*scene.ambient.up),
-            wp.vec3(*scene.ambient.down),
-            wp.array(lamps, dtype=wp.vec3, device=device),
-            wp.array(power, dtype=wp.vec3, device=device),
-            config.light_radius_m,
+            data,
             config.ambient_radius_m,
             config.interreflection,
             wp.array(_hemisphere(config.ambient_ray_count), dtype=wp.vec3, device=device),

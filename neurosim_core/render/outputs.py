@@ -1,19 +1,20 @@
-# mypy: disable-error-code="index,attr-defined,assignment,return-value,empty-body"
+# mypy: disable-error-code="index,attr-defined,assignment,return-value,empty-body,operator"
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
-"""Render outputs: their arrays, and the functions that write a pixel of them."""
+"""Render outputs: their names, the functions that write a pixel of them, and pixels that no light reaches."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.ray_intersection import Hit
-from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.camera import Lens
+from neurosim_core.render.kernel_data import Hit, RenderOutputs, RenderTerms, SceneData
+from neurosim_core.render.launch import launch_split
 from neurosim_core.render.shading import albedo_reader
 
 OUTPUTS = ("log_radiance", "rgb", "radiance", "depth", "range", "normal", "instance", "returns")
@@ -62,24 +63,6 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
         radiance=any(name in outputs for name in RADIANCE),
         geometry=any(name in outputs for name in _GEOMETRY),
     )
-
-
-@wp.struct
-class RenderOutputs:
-    """The arrays of outputs; those not requested are empty. All but the first two have image slots."""
-
-    log_radiance: wp.array3d[float]  # log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]
-    face: wp.array3d[int]  # Index of the face that the last ray of a pixel hits, -1: none, shape [K, H, W]
-    rgb: wp.array4d[wp.uint8]  # sRGB of exposure times radiance, shape [M, H, W, 3]
-    radiance: wp.array3d[wp.vec3]  # Exposure times linear radiance, of which 1 is white, shape [M, H, W]
-    depth: wp.array3d[float]  # Planar z [m], inf where nothing is hit, shape [M, H, W]
-    range: wp.array3d[float]  # Length of the ray [m], inf where nothing is hit, shape [M, H, W]
-    normal: wp.array3d[wp.vec3]
-    """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
-    instance: wp.array3d[int]  # -1 where nothing is hit, shape [M, H, W]
-    returns: wp.array3d[wp.vec3]
-    """Length of the ray [m], inf where nothing is hit; |cosine| of incidence; luma of the albedo; shape
-    [M, H, W]."""
 
 
 @wp.func
@@ -180,3 +163,75 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool, allocated: 
                 out.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
     return write_radiance
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _darken_pixels(
+    first: int,
+    # Model:
+    pixels: wp.array2d[wp.vec2i],
+    lens_of_world: wp.array[int],
+    stride: int,
+    log_dark: float,
+    # In:
+    instant_count: int,
+    image_slot: wp.array[int],
+    # Out:
+    out: RenderOutputs,
+) -> None:
+    index = first + wp.tid()
+    place = index % pixels.shape[1]
+    instant = index // pixels.shape[1] % instant_count
+    world = index // pixels.shape[1] // instant_count
+    pixel = pixels[lens_of_world[world], place]
+    row = pixel[0]
+    col = pixel[1]
+    if row < 0:
+        return
+    instant += world * stride
+    if out.log_radiance.shape[0] > 0:
+        out.log_radiance[instant, row, col] = log_dark
+    slot = image_slot[instant]
+    if slot < 0:
+        return
+    if out.rgb.shape[0] > 0:
+        for channel in range(3):
+            out.rgb[slot, row, col, channel] = wp.uint8(0)
+    if out.radiance.shape[0] > 0:
+        out.radiance[slot, row, col] = wp.vec3(0.0)
+    if out.depth.shape[0] > 0:
+        out.depth[slot, row, col] = wp.inf
+    if out.range.shape[0] > 0:
+        out.range[slot, row, col] = wp.inf
+    if out.normal.shape[0] > 0:
+        out.normal[slot, row, col] = wp.vec3(0.0)
+    if out.instance.shape[0] > 0:
+        out.instance[slot, row, col] = -1
+
+
+class BlindPixels:
+    """The pixels that no light reaches, such as those outside the image circle of a fisheye lens.
+
+    They are those of one lens or of several.
+    """
+
+    def __init__(self, lenses: Sequence[Lens], lens_of_world: Any, *, stride: int, dark_floor: float) -> None:
+        """Bring them to the device; lenses are of one size, and each world has at most `stride` instants."""
+        masks = [lens.blind_pixels() for lens in lenses]
+        found = [np.zeros((0, 2), int) if mask is None else np.argwhere(mask) for mask in masks]
+        self.count = max(map(len, found))
+        """The most of one lens."""
+        rows = np.full((len(found), self.count, 2), -1, dtype=np.int32)
+        for row, pixels in zip(rows, found, strict=True):
+            row[: len(pixels)] = pixels
+        self._lens_of_world = lens_of_world
+        places: Any = wp.array(rows, dtype=wp.vec2i, device=lens_of_world.device)
+        self._model = [places, lens_of_world, stride, float(np.log(dark_floor))]
+
+    def darken(self, image_slot: Any, out: RenderOutputs, *, instant_count: int) -> None:
+        """Write what a pixel is that sees nothing: black, infinitely far, no surface."""
+        if self.count:
+            dim = self._lens_of_world.shape[0] * instant_count * self.count
+            inputs = [*self._model, instant_count, image_slot]
+            device = self._lens_of_world.device
+            launch_split(_darken_pixels, dim=dim, inputs=inputs, outputs=[out], device=device)

@@ -15,20 +15,30 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.view_data import ViewData
+from neurosim_core.render.kernel_data import Hit, SceneData, ViewData
 
 PACKET_TERMS = {"TEXTURED": True, "EMISSIVE": True, "LIGHT_WITHIN": False, "APART": 0}
 """Constants of `shade_lanes.cuh`: on a CPU to look for textures takes less than to compile both kernels."""
+
+
+@wp.struct
+class PixelBlock:
+    """4 x 4 pixels in one instant, or as many of them as are in the picture."""
+
+    first_ray: int  # Index of the first ray in a layer
+    instant: int  # Row of the arrays of instants
+    top: int  # Row of the first pixel
+    left: int  # Column of the first pixel
+    rows: int
+    columns: int
 
 
 @cache
 def packet_shader(lanes: int, *, unit_normals: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that adds the radiance of a packet's hits to a total.
 
-    Its parameters are the scene; then of each lane: ray, of unit length; spread [rad]; face, -1: nothing was
-    hit; distance [m]; u and v, the weights of the first and the second corner; the normal of the front, of
-    unit length if so said. The last is the radiance of each lane so far, to add to.
+    Its parameters are the scene; then of each lane: ray, of unit length; spread [rad]; hit, whose normal is
+    of unit length if so said. The last is the radiance of each lane so far, to add to.
     """
     code = read_native(__file__, "shade_packet", N=lanes, UNIT=unit_normals, **PACKET_TERMS)
 
@@ -37,11 +47,7 @@ def packet_shader(lanes: int, *, unit_normals: bool) -> Any:
         scene: SceneData,
         rays: wp.array[wp.vec3],
         spreads: wp.array[float],
-        hit_face: wp.array[int],
-        hit_t: wp.array[float],
-        hit_u: wp.array[float],
-        hit_v: wp.array[float],
-        normals: wp.array[wp.vec3],
+        hits: wp.array[Hit],
         total: wp.array[wp.vec3],
     ): ...
 
@@ -57,27 +63,17 @@ def packet_program(width: int) -> Any:
     left out, and the radiance is the mean of the others; four layers of 2 x 2 pixels are a packet if their
     number is a multiple of four, so the last bits may differ from those of packets of one layer.
 
-    Its parameters: the scene; rays of pixels, as `ViewData` has them, contiguous; the first of the packet,
-    and the columns of the picture; position and orientation of the camera; the distance beyond which hits do
-    not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4. The last
-    is the log radiance, of which these pixels are written.
+    Its parameters: the scene; the view, whose rays are contiguous; the pixels; the distance beyond which hits
+    do not count [m]. The last is the log radiance, of which these pixels are written.
     """
     code = read_native(__file__, "render_packet", N=16, SIDE=4, WIDTH=width, UNIT=False, **PACKET_TERMS)
 
     @wp.func_native(code)
     def render_packet(
         scene: SceneData,
-        rays: wp.array2d[wp.vec4],
-        first_pixel: int,
-        width: int,
-        origin: wp.vec3,
-        q_WC: wp.quat,
+        view: ViewData,
+        pixels: PixelBlock,
         far_m: float,
-        instant: int,
-        top: int,
-        left: int,
-        rows: int,
-        columns: int,
         log_radiance_out: wp.array3d[float],
     ): ...
 
@@ -88,22 +84,13 @@ def packet_program(width: int) -> Any:
 def face_caster(width: int, *, timed: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that writes the faces that 4 x 4 pixels see, -1: none.
 
-    It casts the rays of the last layer. Its parameters: the scene; the view; the rest as of `packet_program`,
-    but for its last, of which these pixels are written.
+    It casts the rays of the last layer. Its parameters are those of `packet_program`, but for the last, of
+    which these pixels are written.
     """
 
     @wp.func_native(read_native(__file__, "cast_faces", N=16, SIDE=4, WIDTH=width, TIMED=timed))
     def cast_faces(
-        scene: SceneData,
-        view: ViewData,
-        first_pixel: int,
-        far_m: float,
-        instant: int,
-        top: int,
-        left: int,
-        rows: int,
-        columns: int,
-        face_out: wp.array3d[int],
+        scene: SceneData, view: ViewData, pixels: PixelBlock, far_m: float, face_out: wp.array3d[int]
     ): ...
 
     return cast_faces

@@ -20,15 +20,15 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.install import install_hint
-from neurosim_core.render.body_arrays import join_bodies
-from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.lighting import bake_light
-from neurosim_core.render.refine import RefinedMesh, refine
-from neurosim_core.render.scene_arrays import areas_m2, auto_exposure
+from neurosim_core.render.ray_times import refuse_several
+from neurosim_core.render.refine import refine
+from neurosim_core.render.scene_arrays import auto_exposure
 from neurosim_core.scene.bodies import Body, BodyPoses, body_poses
 from neurosim_core.scene.materials import mean_albedo, pack_textures
-from neurosim_core.scene.scene import Material, Scene
+from neurosim_core.scene.scene import Material, RefinedMesh, Scene
 
 _NEAR_M = 0.02
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -95,7 +95,7 @@ def upload_pyrender_scene(
     material_of = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
-        exposure = auto_exposure(areas_m2(mesh), light, albedo[material_of])
+        exposure = auto_exposure(mesh, light, albedo[material_of])
     nodes = pyrender.Scene(
         bg_color=[*_to_display(exposure * np.array(scene.sky)), 1.0], ambient_light=[1.0] * 3
     )
@@ -114,16 +114,16 @@ def upload_pyrender_scene(
 def _body_mesh(
     pyrender: Any, body: Body, scene: Scene, config: RenderConfig, exposure: float, device: str
 ) -> Any:
-    joined = join_bodies([body], material_count=0, instance_count=0)
+    mesh = refine(body.solid, None)
     p_WO, q_WO = body_poses({body.name: body.config}, [0])
     R_WO = scipy.spatial.transform.Rotation.from_quat(q_WO[0, 0])
     placed = replace(
-        joined.mesh,
-        vertices=(R_WO.apply(joined.mesh.vertices) + p_WO[0, 0]).astype(np.float32),
-        normals=R_WO.apply(joined.mesh.normals).astype(np.float32),
+        mesh,
+        vertices=(R_WO.apply(mesh.vertices) + p_WO[0, 0]).astype(np.float32),
+        normals=R_WO.apply(mesh.normals).astype(np.float32),
     )
     light = bake_light(scene, placed, config.lighting, device=device)
-    return _mesh(pyrender, joined.mesh, light, joined.material, joined.materials, exposure)
+    return _mesh(pyrender, mesh, light, body.solid.face_material, body.solid.materials, exposure)
 
 
 def _mesh(
@@ -180,14 +180,25 @@ class PyrenderRenderer:
     """
 
     def __init__(
-        self, scene: PyrenderScene, lens: PinholeConfig, *, outputs: Collection[str], image_count: int = 1
+        self,
+        scene: PyrenderScene,
+        lens: Lens,
+        *,
+        outputs: Collection[str],
+        image_count: int = 1,
+        **several: Any,
     ) -> None:
         """Allocate the outputs and open an OpenGL context; parameters as of `make_renderer`.
 
         Raises:
-            ValueError: Another output than rgb and depth is asked for.
+            ValueError: Another output than rgb and depth is asked for, or another lens than a pinhole; there
+                are several worlds, or rays have times of their own.
             PyrenderError: There is no OpenGL.
         """
+        refuse_several("pyrender", several)
+        if not isinstance(lens, PinholeConfig):
+            kind = getattr(lens, "kind", type(lens).__name__)
+            raise ValueError(f"pyrender renders pinholes, not a lens of kind {kind}: use renderer: warp")
         unknown = sorted(set(outputs) - {"rgb", "depth"})
         if unknown or not outputs:
             raise ValueError(

@@ -9,26 +9,11 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.candidate_data import UNRESOLVED
+from neurosim_core.render.kernel_data import FAR_M, UNRESOLVED, BodyData, Hit, SceneData
 from neurosim_core.render.ray_tree import intersect_tree
-from neurosim_core.render.scene_data import SceneData
 
-FAR_M = wp.constant(1.0e9)
-"""Beyond this distance rays hit nothing [m]."""
 UNFUSED = {"fuse_fp": False}
 """Products and sums are rounded one by one: so pixels have the same bits whichever kernel renders them."""
-
-
-@wp.struct
-class Hit:
-    """The first intersection of a ray."""
-
-    face: int  # -1: the ray hits nothing, and the other fields have no meaning
-    t: float  # Distance along the ray [m]
-    u: float  # Weight of the first corner
-    v: float  # Weight of the second corner
-    normal: wp.vec3  # Unit normal of the face's front
 
 
 @wp.func_native(read_native(__file__, "intersect_face"))

@@ -9,8 +9,9 @@ controller that has the picture sees nothing of the future.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,3 +124,16 @@ def _scattered(count: int) -> NDArray[np.int64]:
     while math.gcd(step, count) > 1:
         step += 1
     return (np.arange(count) * step) % count
+
+
+def refuse_several(kind: str, shape: Mapping[str, Any]) -> None:
+    """Raise if a renderer of one world and one time is asked for more.
+
+    Raises:
+        ValueError: There are several worlds, or rays have times of their own.
+    """
+    worlds = shape.get("worlds")
+    if worlds is not None and worlds.count > 1:
+        raise ValueError(f"{worlds.count} worlds are rendered by renderer 'warp' only, not by {kind!r}")
+    if shape.get("times") is not None:
+        raise ValueError(f"rays with times of their own need renderer: warp, not {kind!r}")

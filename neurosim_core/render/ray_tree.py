@@ -17,24 +17,14 @@ Traversal; Aila, Laine (2009), Understanding the Efficiency of Ray Traversal on 
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
+from neurosim_core.render.kernel_data import RayTree
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class RayTree:
-    """A tree for `intersect_tree`. A child is the index of a node or, below zero, -1 - that of a triangle."""
-
-    root: int  # The first child
-    nodes: wp.array[wp.vec4]
-    """Four rows a node: low x, high x, low y, high y of its first child; the same of its second; low and high
-    z of the first, then of the second; both children, as the bits of integers."""
-    triangles: wp.array[wp.vec4]
-    """Three rows a triangle, in the order of the leaves: its corners. Beside them, as the bits of integers:
-    which face it is; 1 for the last of its leaf."""
 
 
 @wp.func_native(read_native(__file__, "bound_node"))
@@ -68,8 +58,23 @@ def _lay_out(
     _lay_out_node(mesh, wp.tid(), first, root, nodes, triangles)
 
 
+def make_mesh(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], device: str, *, constructor: str | None = "sah"
+) -> wp.Mesh:
+    """Bring triangles to a device and build their tree; None: the constructor that is soonest done there.
+
+    On a CPU "sah" is three times faster to traverse than "median" and as fast as "cubql".
+    """
+    return wp.Mesh(
+        wp.array(vertices, dtype=wp.vec3, device=device),
+        wp.array(faces.reshape(-1), dtype=int, device=device),
+        bvh_constructor=constructor,
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+
+
 def make_ray_tree(mesh: wp.Mesh) -> RayTree:
-    """Return the tree of a mesh (`bvh_constructor="sah"`, not empty) as it is now; waits for the device."""
+    """Return the tree of a mesh of `make_mesh` ("sah", not empty) as it is now; waits for the device."""
     face_count = mesh.indices.shape[0] // 3
     device, node_limit = mesh.device, 2 * face_count
     tree = RayTree()

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.scene.scene import RefinedMesh, Scene
-
-__all__ = ["RefinedMesh", "refine", "refine_within"]
+from neurosim_core.scene.triangles import corner_columns, dot
 
 log = logging.getLogger(__name__)
 
@@ -53,9 +52,9 @@ def refine_within(
     faces, origin = scene.faces, np.arange(len(scene.faces), dtype=np.int32)
     short: list[tuple[NDArray[np.int32], NDArray[np.int32]]] = []
     while edge_max_m is not None and len(faces):
-        tips = vertices.take(faces, axis=0)
+        tips = corner_columns(vertices, faces)
         sides = np.roll(tips, -1, axis=1) - tips  # side k goes from corner k to corner k + 1
-        long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
+        long = (dot(sides, sides) > np.float32(edge_max_m**2)).T
         split = long[:, 0] | long[:, 1] | long[:, 2]
         added_count_max -= int(long.sum())
         if added_count_max < 0:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, ClassVar, Literal, Protocol
 
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.registry import find, kinds, register, registered
-from neurosim_core.render.camera import Lens, PinholeConfig
+from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
 from neurosim_core.render.ray_times import RayTimes
@@ -28,6 +29,7 @@ __all__ = [
     "Renderer",
     "RendererConfig",
     "make_renderer",
+    "take_picture",
     "upload_scene",
 ]
 
@@ -86,24 +88,16 @@ class RendererConfig(Settings):
 
     scene_type: ClassVar[type]
     """Class of what `upload` returns."""
+    make: ClassVar[Callable[..., Renderer]]
+    """Makes a renderer for one lens. It takes what `upload` returned, the lens, and by name `outputs`,
+    `instant_count`, `image_count`, `worlds` and `times` of `make_renderer`, and raises a ValueError where it
+    cannot do what is asked for."""
+    only_launches: ClassVar[bool] = False
+    """Whether `Renderer.render` only launches work on the device, and waits for nothing. Otherwise no CUDA
+    graph records it, and one batch is rendered after the other."""
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Prepare a scene, for all cameras; see `upload_scene`."""
-        raise NotImplementedError
-
-    @staticmethod
-    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
-        """Return a renderer for one lens.
-
-        Args:
-            scene: What `upload` returned.
-            lens: The camera.
-            outputs: What is asked for.
-            shape: `instant_count`, `image_count`, `worlds` and `times` of `make_renderer`.
-
-        Raises:
-            ValueError: It cannot do what is asked for.
-        """
         raise NotImplementedError
 
 
@@ -113,15 +107,12 @@ class WarpRendererConfig(RendererConfig):
 
     kind: Literal["warp"] = "warp"
     scene_type = SceneArrays
+    make = WarpRenderer
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Bring a scene to a device."""
         return upload_warp_scene(scene, config, device=device, bodies=bodies)
-
-    @staticmethod
-    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
-        """Return a renderer for one lens."""
-        return WarpRenderer(scene, lens, outputs=outputs, **shape)
 
 
 @register("renderer", "pyrender")
@@ -130,19 +121,11 @@ class PyrenderRendererConfig(RendererConfig):
 
     kind: Literal["pyrender"] = "pyrender"
     scene_type = PyrenderScene
+    make = PyrenderRenderer
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Light a scene and hand it to pyrender."""
         return upload_pyrender_scene(scene, config, device=device, bodies=bodies)
-
-    @staticmethod
-    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
-        """Return a renderer for one lens."""
-        refuse_worlds("pyrender", shape)
-        if not isinstance(lens, PinholeConfig):
-            kind = getattr(lens, "kind", type(lens).__name__)
-            raise ValueError(f"pyrender renders pinholes, not a lens of kind {kind}: use renderer: warp")
-        return PyrenderRenderer(scene, lens, outputs=outputs, image_count=shape["image_count"])
 
 
 @register("renderer", "synthetic")
@@ -151,6 +134,8 @@ class SyntheticRendererConfig(RendererConfig):
 
     kind: Literal["synthetic"] = "synthetic"
     scene_type = SyntheticScene
+    make = SyntheticRenderer
+    only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Return what all test cards of a run share."""
@@ -158,27 +143,6 @@ class SyntheticRendererConfig(RendererConfig):
             names = ", ".join(body.name for body in bodies)
             raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
         return SyntheticScene(scene=scene, config=config, device=device)
-
-    @staticmethod
-    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
-        """Return a renderer for one lens."""
-        refuse_worlds("synthetic", shape)
-        counts = {name: shape[name] for name in ("instant_count", "image_count")}
-        return SyntheticRenderer(scene, lens, outputs=outputs, **counts)
-
-
-def refuse_worlds(kind: str, shape: Mapping[str, Any]) -> None:
-    """Raise if a renderer of one world and one time is asked for more.
-
-    Raises:
-        ValueError: There are several worlds, or rays have times of their own.
-    """
-    if shape["worlds"].count > 1:
-        raise ValueError(
-            f"{shape['worlds'].count} worlds are rendered by renderer 'warp' only, not by {kind!r}"
-        )
-    if shape["times"] is not None:
-        raise ValueError(f"rays with times of their own need renderer: warp, not {kind!r}")
 
 
 def upload_scene(
@@ -231,17 +195,22 @@ def make_renderer(
         ValueError: An output is unknown, or the renderer does not have it; it renders one world only, or only
             pinholes.
     """
+    shape = {"instant_count": instant_count, "image_count": image_count, "worlds": worlds, "times": times}
     kind: Any
     for kind in registered("renderer").values():
         if isinstance(scene, kind.scene_type):
-            renderer: Renderer = kind.make(
-                scene,
-                lens,
-                outputs=outputs,
-                instant_count=instant_count,
-                image_count=image_count,
-                worlds=worlds,
-                times=times,
-            )
+            renderer: Renderer = kind.make(scene, lens, outputs=outputs, **shape)
             return renderer
     raise ValueError(f"no renderer made {type(scene).__name__}, known: {sorted(kinds('renderer'))}")
+
+
+def take_picture(
+    renderer: Renderer, position: ArrayLike, orientation: ArrayLike, *, outputs: Collection[str]
+) -> dict[str, NDArray[Any]]:
+    """Return outputs of one pose, p_WC [m] and q_WC, by name; waits for the device."""
+    device = getattr(renderer, next(iter(outputs))).device
+    p_WC: Any = wp.array([position], dtype=wp.vec3, device=device)
+    q_WC: Any = wp.array([orientation], dtype=wp.quat, device=device)
+    slot: Any = wp.zeros(1, dtype=int, device=device)
+    renderer.render(p_WC, q_WC, slot, instant_count=1)
+    return {name: getattr(renderer, name).numpy()[0].copy() for name in outputs}

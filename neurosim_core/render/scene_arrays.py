@@ -12,18 +12,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
+from neurosim_core.render.body_arrays import BodyArrays, upload_bodies
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_width
-from neurosim_core.render.lighting import bake_light, shading_mesh
+from neurosim_core.render.kernel_data import RenderTerms, SceneData
+from neurosim_core.render.lighting import bake_light, shading_faces, upload_lights
 from neurosim_core.render.ray_intersection import face_normals
-from neurosim_core.render.ray_tree import make_ray_tree
-from neurosim_core.render.refine import RefinedMesh, refine
-from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.ray_tree import make_mesh, make_ray_tree
+from neurosim_core.render.refine import refine
 from neurosim_core.scene.bodies import Body
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
-from neurosim_core.scene.scene import Material, Scene
+from neurosim_core.scene.scene import Material, RefinedMesh, Scene
 from neurosim_core.scene.source import unique_name
 
 _logger = logging.getLogger(__name__)
@@ -69,10 +68,9 @@ def upload_scene(
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
     """
     baked = config.lighting.mode == "baked"
-    joined = join_bodies(
-        bodies, material_count=len(scene.materials), instance_count=len(scene.instance_names)
-    )
-    materials = (*scene.materials, *joined.materials)
+    edge_max_m = config.lighting.edge_max_m if baked else None
+    solids = [body.solid for body in bodies]
+    materials = [material for each in (scene, *solids) for material in each.materials]
     light: NDArray[np.float32] | None = None
     data = SceneData()
     wp.zeros(1, device=device)  # Warp makes a device's streams at its first use, which must be in one thread
@@ -82,29 +80,29 @@ def upload_scene(
             aside.submit(lambda: scene.connections) if config.samples_per_pixel == "adaptive" else None
         )
         embree_width = _embree_width(config, device)
-        mesh = refine(scene, config.lighting.edge_max_m if baked else None)
+        mesh, whole = refine(scene, edge_max_m), [refine(solid, None) for solid in solids]
         building = aside.submit(
             _build_trees, mesh, device, embree=bool(embree_width), quick=connecting is not None
         )
 
-        def cover() -> tuple[PackedTextures, RenderTerms, NDArray[np.float64]]:
-            area_m2, packed = areas_m2(mesh), packing.result()
+        def cover() -> tuple[PackedTextures, RenderTerms]:
+            packed = packing.result()
             terms = _terms_of(materials, packed, config, device, embree=embree_width, bodies=bool(bodies))
-            _upload_surfaces(data, scene, mesh, area_m2, joined, packed, terms, device)
+            _upload_surfaces(data, (scene, *solids), (mesh, *whole), packed, terms, device)
             if connecting is not None:
                 _upload_wholes(data, scene, mesh, connecting.result(), device)
-            return packed, terms, area_m2
+            return packed, terms
 
         covering = aside.submit(cover)
         if baked or config.exposure == "auto":
             light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(embree_width))
-        packed, terms, area_m2 = covering.result()
+        packed, terms = covering.result()
         tree, embree = building.result()
     material = scene.face_material[mesh.origin]
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
-        exposure = auto_exposure(area_m2, light, mean_albedo(materials, packed)[material])
+        exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
     data.mesh = tree.id
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
@@ -113,7 +111,13 @@ def upload_scene(
     else:
         data.tree = make_ray_tree(tree)
         data.face_normal = face_normals(tree)
-    _upload_light(data, scene, mesh, light, config, lamps=bool(bodies) or not baked, device=device)
+    if baked:
+        assert light is not None
+        data.corner_light = wp.array(light.reshape(2, -1, 3), dtype=wp.vec3, device=device)
+    else:
+        data.corner_normal = wp.array(mesh.corner_normals.reshape(-1, 3), dtype=wp.vec3, device=device)
+    upload_lights(data, scene, config.lighting, device)
+    data.sky = wp.vec3(*scene.sky)
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure
@@ -127,9 +131,9 @@ def upload_scene(
         embree=embree,
         bodies=upload_bodies(
             bodies,
-            joined,
+            whole,
             scene_face_count=len(mesh.faces),
-            shading=shading_mesh(scene, device) if baked else None,
+            shading=make_mesh(scene.vertices, shading_faces(scene), device) if baked else None,
             device=device,
         )
         if bodies
@@ -147,12 +151,7 @@ def _build_trees(
     mesh: RefinedMesh, device: str, *, embree: bool, quick: bool
 ) -> tuple[wp.Mesh, EmbreeTree | None]:
     """Return the tree of a mesh as Warp has it, and as Embree has it if that casts rays."""
-    tree = wp.Mesh(
-        wp.array(mesh.vertices, dtype=wp.vec3, device=device),
-        wp.array(mesh.faces.reshape(-1), dtype=int, device=device),
-        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
-        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
-    )
+    tree = make_mesh(mesh.vertices, mesh.faces, device)
     return tree, EmbreeTree(mesh.vertices, mesh.faces, quick=quick) if embree else None
 
 
@@ -182,58 +181,38 @@ def _terms_of(
 
 def _upload_surfaces(
     data: SceneData,
-    scene: Scene,
-    mesh: RefinedMesh,
-    area_m2: NDArray[np.float64],
-    joined: JoinedBodies,
+    scenes: Sequence[Scene],
+    meshes: Sequence[RefinedMesh],
     packed: PackedTextures,
     terms: RenderTerms,
     device: str,
 ) -> None:
     """Write what faces are made of: those of the scene, then those of the bodies."""
-    materials = (*scene.materials, *joined.materials)
-    material = scene.face_material[mesh.origin]
-    instance = scene.face_instance[mesh.origin]
-    data.face_material = wp.array(np.append(material, joined.material), dtype=int, device=device)
-    data.face_instance = wp.array(np.append(instance, joined.instance), dtype=int, device=device)
-    data.base_color = wp.array(_rows([m.base_color for m in materials]), dtype=wp.vec3, device=device)
-    data.emission = wp.array(_rows([m.emission for m in materials]), dtype=wp.vec3, device=device)
+    materials = [material for scene in scenes for material in scene.materials]
+    material, instance = [], []
+    material_count = instance_count = 0
+    for scene, mesh in zip(scenes, meshes, strict=True):
+        material.append(material_count + scene.face_material[mesh.origin])
+        instance.append(instance_count + scene.face_instance[mesh.origin])
+        material_count += len(scene.materials)
+        instance_count += len(scene.instance_names)
+    data.face_material = wp.array(np.concatenate(material), dtype=int, device=device)
+    data.face_instance = wp.array(np.concatenate(instance), dtype=int, device=device)
+    data.base_color = wp.array(
+        np.array([m.base_color for m in materials], np.float32), dtype=wp.vec3, device=device
+    )
+    data.emission = wp.array(
+        np.array([m.emission for m in materials], np.float32), dtype=wp.vec3, device=device
+    )
     if terms.textured:
         data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
     if len(packed.levels):
-        surfaces = ((mesh, area_m2, material), (joined.mesh, areas_m2(joined.mesh), joined.material))
-        density = np.concatenate([_texel_density(*surface, packed) for surface in surfaces])
-        uv = np.concatenate([m.uv.take(m.faces, axis=0).reshape(-1, 2) for m, *_ in surfaces])
-        data.face_lod = wp.array(density, dtype=float, device=device)
+        density = [_texel_density(*surface, packed) for surface in zip(meshes, material, strict=True)]
+        uv = np.concatenate([mesh.uv.take(mesh.faces, axis=0).reshape(-1, 2) for mesh in meshes])
+        data.face_lod = wp.array(np.concatenate(density), dtype=float, device=device)
         data.corner_uv = wp.array(uv, dtype=wp.vec2, device=device)
         data.levels = wp.array(packed.levels, dtype=wp.vec3i, device=device)
         data.texels = wp.array(packed.texels, dtype=wp.uint32, device=device)
-
-
-def _upload_light(
-    data: SceneData,
-    scene: Scene,
-    mesh: RefinedMesh,
-    light: NDArray[np.float32] | None,
-    config: RenderConfig,
-    *,
-    lamps: bool,
-    device: str,
-) -> None:
-    """Write how faces are lit: baked light or shading normals, lamps if they are asked for, and the sky."""
-    if config.lighting.mode == "baked":
-        assert light is not None
-        data.corner_light = wp.array(light.reshape(2, -1, 3), dtype=wp.vec3, device=device)
-    else:
-        data.corner_normal = wp.array(mesh.corner_normals.reshape(-1, 3), dtype=wp.vec3, device=device)
-    if lamps:
-        positions, intensities = [x.position_m for x in scene.lights], [x.intensity for x in scene.lights]
-        data.light_position = wp.array(_rows(positions), dtype=wp.vec3, device=device)
-        data.light_intensity = wp.array(_rows(intensities), dtype=wp.vec3, device=device)
-    data.light_radius_m = config.lighting.light_radius_m
-    data.ambient_up = wp.vec3(*scene.ambient.up)
-    data.ambient_down = wp.vec3(*scene.ambient.down)
-    data.sky = wp.vec3(*scene.sky)
 
 
 def _embree_width(config: RenderConfig, device: str) -> int:
@@ -248,10 +227,6 @@ def _embree_width(config: RenderConfig, device: str) -> int:
             raise EmbreeError(f"cpu_traversal is 'embree', but {error}") from None
         _logger.info("rays are cast by Warp, several times slower than by Embree: %s", error)
         return 0
-
-
-def _rows(values: list[tuple[float, float, float]]) -> NDArray[np.float32]:
-    return np.array(values, dtype=np.float32).reshape(-1, 3)
 
 
 def _upload_wholes(
@@ -273,15 +248,8 @@ def _upload_wholes(
     data.face_surface = wp.array(surface[mesh.origin], dtype=int, device=device)
 
 
-def areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:
-    """Return the area of each face [m^2], shape [F]."""
-    tips = mesh.vertices.take(mesh.faces, axis=0).astype(np.float64)
-    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-    return 0.5 * np.asarray(np.linalg.norm(normal, axis=1))
-
-
 def _texel_density(
-    mesh: RefinedMesh, area_m2: NDArray[np.float64], material: NDArray[np.int32], packed: PackedTextures
+    mesh: RefinedMesh, material: NDArray[np.int32], packed: PackedTextures
 ) -> NDArray[np.float32]:
     """Return log2 of texels of level 0 per metre on each face: half the log2 of texels per square metre."""
     u, v = np.moveaxis(mesh.uv.take(mesh.faces, axis=0).astype(np.float64), -1, 0)
@@ -290,20 +258,19 @@ def _texel_density(
     )
     sizes = np.array([packed.size_px(k) for k in range(len(packed.material_texture))], dtype=np.float64)
     texels = uv_area * sizes.prod(axis=1)[material]
-    return (0.5 * np.log2(np.maximum(texels, 1e-12) / np.maximum(area_m2, 1e-12))).astype(np.float32)
+    return (0.5 * np.log2(np.maximum(texels, 1e-12) / np.maximum(mesh.areas_m2, 1e-12))).astype(np.float32)
 
 
-def auto_exposure(
-    area_m2: NDArray[np.float64], light: NDArray[np.float32], albedo: NDArray[np.float32]
-) -> float:
+def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray[np.float32]) -> float:
     """Return an exposure that shows the mean surface as middle grey and nine tenths of all below white.
 
     The mean is that of log luma; faces count by area and with their brighter side: the other one is
-    often the inside of a wall.
+    often the inside of a wall. Light is that of `bake_light`; albedo is that of each face, shape [F, 3].
     """
     one, two, three = np.moveaxis(light.max(axis=0), 1, 0)
     luma = np.maximum(((one + two + three) / np.float32(3.0) * albedo) @ _LUMA, 1e-4)
     order = np.argsort(luma)
-    share = np.cumsum(area_m2[order]) / area_m2.sum()
+    share = np.cumsum(mesh.areas_m2[order]) / mesh.areas_m2.sum()
     bright = luma[order[np.searchsorted(share, 0.9)]]
-    return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area_m2)), _BRIGHT / bright))
+    mean = np.exp(np.average(np.log(luma), weights=mesh.areas_m2))
+    return float(min(_MIDDLE_GREY / mean, _BRIGHT / bright))

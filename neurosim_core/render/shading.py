@@ -9,12 +9,9 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.coverage import APART
+from neurosim_core.render.kernel_data import BodyData, Hit, RenderTerms, SceneData
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
-from neurosim_core.render.ray_intersection import Hit
-from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
 _COSINE_MIN = wp.constant(0.05)
@@ -118,16 +115,7 @@ def _baked_shader(*, textured: bool, emissive: bool) -> wp.Function:
     code = read_native(__file__, "shade_hit", **terms, UNIT=True, LIGHT_WITHIN=False, APART=0)
 
     @wp.func_native(code)
-    def shade_hit(
-        scene: SceneData,
-        hit: int,
-        direction: wp.vec3,
-        t: float,
-        u: float,
-        v: float,
-        front: wp.vec3,
-        spread_rad: float,
-    ) -> wp.vec3: ...
+    def shade_hit(scene: SceneData, direction: wp.vec3, hit: Hit, spread_rad: float) -> wp.vec3: ...
 
     @wp.func
     def shade(
@@ -135,7 +123,7 @@ def _baked_shader(*, textured: bool, emissive: bool) -> wp.Function:
     ) -> wp.vec3:
         if hit.face < 0:
             return scene.sky
-        return shade_hit(scene, hit.face, ray, hit.t, hit.u, hit.v, hit.normal, spread_rad)
+        return shade_hit(scene, ray, hit, spread_rad)
 
     return shade
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.ray_times import refuse_several
 from neurosim_core.scene.bodies import BodyPoses
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.srgb import srgb_to_linear
@@ -100,8 +101,6 @@ def _draw(
     # In:
     p_WC: wp.array[wp.vec3],
     q_WC: wp.array[wp.quat],
-    position_bytes: wp.array2d[wp.uint8],
-    orientation_bytes: wp.array2d[wp.uint8],
     image_slot: wp.array[int],
     # Out:
     picture_place_out: wp.array[wp.vec2i],
@@ -131,19 +130,20 @@ def _draw(
             depth_out[slot, row, col] = _SQUARE_DEPTH_M
         if down == 0 and right == 0:
             picture_place_out[slot] = wp.vec2i(corner_row, corner_col)
-            if rgb_out:
-                for place in range(12):
-                    pixel = place // 3
-                    rgb_out[slot, pixel // width, pixel % width, place % 3] = position_bytes[instant, place]
-                for place in range(12, 28):
-                    pixel = place // 3
-                    value = orientation_bytes[instant, place - 12]
-                    rgb_out[slot, pixel // width, pixel % width, place % 3] = value
-            if depth_out:
-                for axis in range(3):
-                    depth_out[slot, axis // width, axis % width] = p[axis]
-                for place in range(3, 7):
-                    depth_out[slot, place // width, place % width] = q_WC[instant][place - 3]
+            for number in range(7):
+                value = p[wp.min(number, 2)]
+                if number >= 3:
+                    value = q_WC[instant][number - 3]
+                if depth_out:
+                    depth_out[slot, number // width, number % width] = value
+                if rgb_out:
+                    bits = wp.cast(value, wp.uint32)
+                    for byte in range(4):
+                        place = 4 * number + byte
+                        pixel = place // 3
+                        rgb_out[slot, pixel // width, pixel % width, place % 3] = wp.uint8(
+                            bits >> wp.uint32(8 * byte) & wp.uint32(255)
+                        )
 
 
 class SyntheticRenderer:
@@ -160,13 +160,15 @@ class SyntheticRenderer:
         outputs: Collection[str],
         instant_count: int,
         image_count: int = 1,
+        **several: Any,
     ) -> None:
         """Draw the card into every picture; parameters as of `make_renderer`.
 
         Raises:
             ValueError: An output beyond `OUTPUTS` is asked for, none is, or a picture is too small for a
-                pose.
+                pose; there are several worlds, or rays have times of their own.
         """
+        refuse_several("synthetic", several)
         if not set(outputs) <= set(OUTPUTS) or not outputs:
             raise ValueError(
                 f"the synthetic renderer has {list(OUTPUTS)}, asked for {sorted(outputs)}: use renderer: warp"
@@ -239,11 +241,10 @@ class SyntheticRenderer:
             record_cmd=True,
         )
         shape = [self._side, self._width, self._height, self._log_white]
-        poses = [p_WC, q_WC, _bytes_of(p_WC, 12), _bytes_of(q_WC, 16), image_slot]
         draw = wp.launch(
             _draw,
             dim=dim,
-            inputs=[*shape, *poses],
+            inputs=[*shape, p_WC, q_WC, image_slot],
             outputs=[*places, *outputs],
             device=self._device,
             record_cmd=True,
@@ -265,8 +266,3 @@ def _card(width: int, height: int) -> tuple[NDArray[np.uint8], NDArray[np.float3
     rgb[split:] = np.linspace(0, 255, width).astype(np.uint8)[:, None]
     depth = np.linspace(_DEPTH_NEAR_M, _DEPTH_FAR_M, width, dtype=np.float32)
     return rgb, np.repeat(depth[None], height, axis=0)
-
-
-def _bytes_of(array: Any, size: int) -> Any:
-    """The same memory as bytes, shape [n, size]."""
-    return wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(array.shape[0], size), device=array.device)

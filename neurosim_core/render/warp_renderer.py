@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,21 +13,18 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.antialias import Antialiasing
-from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import make_body_data, place_camera
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.candidate_data import TILE, CandidateListData
 from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
 from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
+from neurosim_core.render.kernel_data import TILE, RenderOutputs, RenderTerms, ViewData
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, RenderOutputs, requested_outputs
+from neurosim_core.render.outputs import FACE, RADIANCE, BlindPixels, requested_outputs
 from neurosim_core.render.ray_layers import first_rays, pixel_rays, ray_layers
 from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
-from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.view_data import WorldData, make_view
 from neurosim_core.scene.bodies import BodyPoses
 
 EXPOSURE_RAY_COUNT = 16
@@ -120,11 +118,12 @@ class WarpRenderer:
         rendered = {FACE, *outputs}.difference(RADIANCE) if adaptive else set(outputs)
         self._kernel = raycast_kernel(rendered, self.terms)
         self._fallback = fallback_kernel(rendered, self.terms)
-        self._group = instants_per_thread(self.terms)
+        self._group = self.terms.instants_per_thread
         rays_together = TILE * TILE if self.terms.by_tile else PACKET if self.terms.embree else 1
         self._instant_threads = self._tile_count * TILE * TILE // rays_together
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
-        self._view = make_view(self.rays, lens.width, lens.height)
+        self._view = ViewData()
+        self._view.rays, self._view.width, self._view.height = self.rays, lens.width, lens.height
         self._pose_count = 1 if times is None else len(times.offsets_ns)
         if times is not None:
             self._view.pose_count = self._pose_count
@@ -132,10 +131,14 @@ class WarpRenderer:
             self._view.pose = wp.array(pose, dtype=int, device=device)
         rows = worlds.count * instant_count * self._pose_count
         self._body_data = make_body_data(arrays.bodies, rows, device)
-        self._world_data = self._make_world_data()
+        self._view.worlds.stride = instant_count
+        if worlds.scenes is not None:
+            self._view.worlds.scenes, self._view.worlds.scene = worlds.scenes, worlds.scene_of_world
+        if len(worlds.lenses) > 1:
+            self._view.worlds.lens = worlds.lens_of_world
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
-        self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
-        images = (image_count, lens.height, lens.width)
+        if self.candidates is not None:
+            self._view.candidates = self.candidates.data
         self._antialiasing = None
         if adaptive:
             fill_factor = arrays.config.fill_factor
@@ -146,11 +149,18 @@ class WarpRenderer:
                 device=device,
                 pixel_count=worlds.count * instant_count * self._tile_count * TILE * TILE,
             )
+        self._render_outputs = RenderOutputs()
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
-            return wp.zeros(shape, dtype=dtype, device=device) if name in {*rendered, *outputs} else None
+            if name not in {*rendered, *outputs}:
+                return None
+            array = wp.zeros(shape, dtype=dtype, device=device)
+            setattr(self._render_outputs, name, array)
+            return array
 
-        instants = (worlds.count * instant_count, *images[1:])
+        images = (image_count, lens.height, lens.width)
+        instants = (worlds.count * instant_count, lens.height, lens.width)
+        allocate(FACE, instants, int)
         self.log_radiance = allocate("log_radiance", instants, float)
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
         self.radiance = allocate("radiance", images, wp.vec3)
@@ -159,10 +169,6 @@ class WarpRenderer:
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
         self.returns = allocate("returns", images, wp.vec3)
-        self._render_outputs = RenderOutputs()
-        self._render_outputs.face = allocate(FACE, instants, int)
-        for name in OUTPUTS:
-            setattr(self._render_outputs, name, getattr(self, name))
         self._blind = BlindPixels(
             lenses,
             worlds.lens_of_world if worlds.lenses else wp.zeros(worlds.count, dtype=int, device=device),
@@ -194,40 +200,24 @@ class WarpRenderer:
                 names = ", ".join(body.name for body in self._arrays.bodies.bodies)
                 raise ValueError(f"bodies move in this scene ({names}): render() needs their poses")
             rows = pose_count * self._pose_count
-            place_camera(self._arrays.bodies, bodies, p_WC, q_WC, instant_count=rows, data=self._body_data)
+            device = self._arrays.device
+            place_camera(self._body_data, bodies, p_WC, q_WC, instant_count=rows, device=device)
         if self.candidates is not None:
             self.candidates.update(self.rays, p_WC, q_WC, instant_count=pose_count)
-        if active is not None:
-            self._world_data.active = active
         view = self._view
+        if active is not None:
+            view.worlds.active = active
         view.instant_count, view.p_WC, view.q_WC, view.image_slot = instant_count, p_WC, q_WC, image_slot
-        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._candidate_data]
-        outputs = [self._render_outputs]
+        inputs, outputs = [self._arrays.data, view, self._body_data], [self._render_outputs]
+        dim = count * -(-instant_count // self._group) * self._instant_threads
         device = self._arrays.device
-        launch_split(
-            self._kernel,
-            dim=count * -(-instant_count // self._group) * self._instant_threads,
-            inputs=inputs,
-            outputs=outputs,
-            device=device,
-        )
+        launch_split(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
         if self._fallback is not None and self.candidates is not None:
-            launch_split(
-                self._fallback,
-                dim=self.candidates.data.fallback_threads,
-                inputs=inputs,
-                outputs=outputs,
-                device=device,
-            )
+            dim = self.candidates.data.fallback_threads
+            launch_split(self._fallback, dim=dim, inputs=inputs, outputs=outputs, device=device)
         if self._antialiasing is not None:
-            self._antialiasing.launch(
-                self._arrays.data,
-                view,
-                self._body_data,
-                self._world_data,
-                self._render_outputs,
-                pixel_count=count * instant_count * self._tile_count * TILE * TILE,
-            )
+            pixel_count = count * instant_count * self._tile_count * TILE * TILE
+            self._antialiasing.launch(inputs, outputs, pixel_count=pixel_count, instant_count=instant_count)
         self._blind.darken(image_slot, self._render_outputs, instant_count=instant_count)
 
     def _layers(self, lens: Lens, adaptive: bool, has_geometry: bool) -> NDArray[np.float32]:
@@ -264,19 +254,13 @@ class WarpRenderer:
                 is_cuda=wp.get_device(arrays.device).is_cuda,
                 embree=bool(terms.embree),
             )
-        # with several worlds, groups end with the instants of a world
-        group = 1 << min(2, self._stride.bit_length() - 1) if several else None
-        self.terms = with_candidate_lists(terms, shared, group=group)
+        group = 0
+        if shared is not None and several:  # groups end with the instants of a world
+            group = 1 << min(2, self._stride.bit_length() - 1)
+        elif shared is not None:
+            group = math.gcd(shared.instants, 4)
+        self.terms = terms._replace(candidate_group=group, by_tile=terms.by_tile and group > 0)
         return shared
-
-    def _make_world_data(self) -> WorldData:
-        worlds, data = self._worlds, WorldData()
-        data.stride = self._stride
-        if worlds.scenes is not None:
-            data.scenes, data.scene = worlds.scenes, worlds.scene_of_world
-        if len(worlds.lenses) > 1:
-            data.lens = worlds.lens_of_world
-        return data
 
     def _make_candidates(
         self, lens: Lens, rays: NDArray[np.float32], config: CandidateListConfig

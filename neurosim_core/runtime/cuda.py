@@ -26,6 +26,9 @@ in two states of the pixels and, of a camera that has one stack under way, with 
 that are streamed take turns among slots: each combination is a graph. With fewer places than a cycle has,
 each would be given up before it comes again."""
 
+_RECORDED_COUNT_MAX = 256
+"""Most launches of one kernel, by key, that stay recorded."""
+
 _PLACES_MAX = 64
 """Most addresses that copies of one array go to and that are remembered."""
 
@@ -136,7 +139,7 @@ class GraphCache:
 
 
 class RecordedLaunch:
-    """A launch that comes again with other arguments.
+    """A launch that comes again, perhaps with other arguments.
 
     It is recorded, since to check and pack the arguments takes Warp longer than most kernels run.
 
@@ -150,17 +153,21 @@ class RecordedLaunch:
         self._kernel = kernel
         self._block_dim = block_dim
         self._device = wp.get_device(device)
-        self._recorded: Any = None
-        self._dim: int | tuple[int, ...] = 0
-        self._arguments: Sequence[Any] = ()
+        self._recorded: dict[Hashable, tuple[Any, Any, Sequence[Any]]] = {}
 
-    def launch(self, dim: int | tuple[int, ...], arguments: Sequence[Any]) -> None:
+    def launch(
+        self, dim: int | tuple[int, ...], arguments: Sequence[Any], *, key: Hashable | None = None
+    ) -> None:
         """Launch `dim` threads, at least one, with all arguments of the kernel.
 
-        What is as it was the last time costs nothing: pass the same arrays, and round `dim` up.
+        What is as it was the last time with the same key costs nothing: pass the same arrays, and round `dim`
+        up.
         """
-        if self._recorded is None:
-            self._recorded = wp.launch(
+        recorded, last_dim, last_arguments = self._recorded.get(key, (None, None, ()))
+        if recorded is None:
+            if len(self._recorded) >= _RECORDED_COUNT_MAX:
+                self._recorded.clear()
+            recorded = wp.launch(
                 self._kernel,
                 dim=dim,
                 inputs=list(arguments),
@@ -169,14 +176,14 @@ class RecordedLaunch:
                 record_cmd=True,
             )
         else:
-            if dim != self._dim:
-                self._recorded.set_dim(dim)
-            for index, (value, last) in enumerate(zip(arguments, self._arguments, strict=True)):
+            if dim != last_dim:
+                recorded.set_dim(dim)
+            for index, (value, last) in enumerate(zip(arguments, last_arguments, strict=True)):
                 if value is not last:
                     packed = value.__ctype__() if hasattr(value, "__ctype__") else value
-                    self._recorded.set_param_at_index_from_ctype(index, packed)
-        self._recorded.launch()
-        self._dim, self._arguments = dim, arguments
+                    recorded.set_param_at_index_from_ctype(index, packed)
+        recorded.launch()
+        self._recorded[key] = (recorded, dim, arguments)
 
 
 class HostInput:

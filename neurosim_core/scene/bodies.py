@@ -26,7 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 
 from neurosim_core.frames import Vector3, quaternion_exp
-from neurosim_core.scene.body_shapes import BoxShape, ShapeConfig, Solid, SurfaceConfig, make_solid
+from neurosim_core.scene.body_shapes import BoxShape, ShapeConfig, SurfaceConfig, make_solid
+from neurosim_core.scene.scene import Scene
 from neurosim_core.settings import Settings
 
 wp.set_module_options({"enable_backward": False})
@@ -117,7 +118,8 @@ class Body:
 
     name: str
     config: BodyConfig
-    solid: Solid
+    solid: Scene
+    """Its triangles and materials, in its frame O."""
     corners_m: NDArray[np.float64]
     """Corners of the bounding box along the axes of O [m], shape [8, 3]."""
     center_m: NDArray[np.float64]

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.scene.scene import LinearRgb, Material, Texture
+from neurosim_core.scene.scene import LinearRgb, Material, Scene, Texture
 from neurosim_core.scene.solids import Part, grid_surface, merge, picture_quad, without_slivers
 from neurosim_core.scene.source import Axis, SceneError
 from neurosim_core.scene.srgb import linear_to_srgb8
@@ -107,27 +106,10 @@ SurfaceConfig = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Solid:
-    """Triangles with materials in the frame O of a body."""
+def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) -> Scene:
+    """Return a shape as one instance in the frame O of its body, without lights.
 
-    vertices: NDArray[np.float32]
-    """Positions [m], shape [V, 3]."""
-    normals: NDArray[np.float32]
-    """Unit shading normals, shape [V, 3]."""
-    uv: NDArray[np.float32]
-    """Texture coordinates, shape [V, 2]; v = 1 is the top row of the texture."""
-    faces: NDArray[np.int32]
-    """Vertex indices, shape [F, 3], counter-clockwise seen from outside."""
-    face_material: NDArray[np.int32]
-    """Index into `materials`, shape [F]."""
-    materials: tuple[Material, ...]
-    notes: tuple[str, ...] = ()
-    """What was assumed while a file was loaded, one sentence each; shown to the user."""
-
-
-def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) -> Solid:
-    """Return the triangles of a shape; without a surface it is grey, and a mesh as its file says.
+    Without a surface it is grey, and a mesh as its file says.
 
     Raises:
         SceneError: A file cannot be used, or a mesh is asked to wear a pattern.
@@ -136,12 +118,15 @@ def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) 
         return _mesh(shape, surface, name)
     material, period_m = _material(surface or PlainSurface(), name)
     part = _part(shape, period_m)
-    return Solid(
+    return Scene(
+        name=name,
         vertices=part.vertices.astype(np.float32),
         normals=part.normals.astype(np.float32),
         uv=part.uv.astype(np.float32),
         faces=part.faces.astype(np.int32),
         face_material=np.zeros(len(part.faces), dtype=np.int32),
+        face_instance=np.zeros(len(part.faces), dtype=np.int32),
+        instance_names=(name,),
         materials=(material,),
     )
 
@@ -236,7 +221,7 @@ def _cylinder(shape: CylinderShape, period_m: tuple[float, float]) -> Part:
     return merge([wall, *caps])
 
 
-def _mesh(shape: MeshShape, surface: SurfaceConfig | None, name: str) -> Solid:
+def _mesh(shape: MeshShape, surface: SurfaceConfig | None, name: str) -> Scene:
     if surface is not None and not isinstance(surface, PlainSurface):
         raise SceneError(
             f"body {name!r}: a mesh wears the surface of its file, or a plain one, not {surface.kind!r}"
@@ -248,13 +233,15 @@ def _mesh(shape: MeshShape, surface: SurfaceConfig | None, name: str) -> Solid:
             file=shape.file, unit_m=shape.unit_m, up_axis=shape.up_axis, position_m=shape.offset_m
         )
     )
-    plain = surface is not None
-    return Solid(
-        vertices=scene.vertices,
-        normals=scene.normals,
-        uv=scene.uv,
-        faces=scene.faces,
-        face_material=np.zeros_like(scene.face_material) if plain else scene.face_material,
-        materials=scene.materials if surface is None else (Material(name=name, base_color=surface.color),),
+    solid = replace(
+        scene,
+        name=name,
+        face_instance=np.zeros_like(scene.face_instance),
+        instance_names=(name,),
+        lights=(),
         notes=scene.notes[:-1],  # the last is about lights, which a body does not bring
     )
+    if surface is None:
+        return solid
+    plain = Material(name=name, base_color=surface.color)
+    return replace(solid, face_material=np.zeros_like(scene.face_material), materials=(plain,))

@@ -33,6 +33,7 @@ from neurosim_core.scene.source import (
 from neurosim_core.scene.srgb import srgb_to_linear
 
 _MAX_DEPTH = 256
+_REPEAT = 10497  # the code of a texture that wraps around
 _LABELS = ("semantic", "class", "category", "label")
 """Keys of extras that say what an object is."""
 
@@ -68,84 +69,64 @@ class _Reader:
         self.file = GltfFile(path)
         self.textures_required = textures_required
         self.pictures = pictures
+        self.textures: dict[int, Texture | None] = {}
+        self.pictures_read: dict[bytes, Texture] = {}
         self.source = Source(unit_reason="glTF is in metres by specification", up_default="y")
 
-    def _image_index(self, texture: dict[str, Any]) -> int:
-        """Return the index of the picture behind a texture reference, -1 if there is none."""
-        entry = self.file.entry("textures", texture["index"])
+    def _texture(self, reference: dict[str, Any] | None) -> Texture | None:
+        """Return what a texture reference stands for, the same for pictures of the same bytes; None: nothing.
+
+        See `read_gltf` for a picture whose file is not there.
+        """
+        if not reference:
+            return None
+        entry = self.file.entry("textures", reference["index"])
         webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
-        return int(entry.get("source", webp.get("source", -1)))
+        index = int(entry.get("source", webp.get("source", -1)))
+        if index >= 0 and index not in self.textures:
+            self.textures[index] = self._picture(index)
+        return self.textures.get(index)
 
-    def _image(self, index: int) -> tuple[str, bytes | None]:
-        """Return name and bytes of a picture; no bytes: its file is not there, and need not be."""
+    def _picture(self, index: int) -> Texture | None:
         image = self.file.entry("images", index)
-        name = image.get("name") or (
-            image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
-        )
-        data = (
-            bytes(self.file.view(image["bufferView"])[0])
-            if "bufferView" in image
-            else self.file.uri_bytes(image["uri"])
-        )
-        if data is None and self.textures_required:
-            raise SceneError(
-                f"{self.path}: texture file {image['uri']!r} is missing beside it; put it there, or "
-                "set missing_texture to 'ignore' to use the base colour alone"
-            )
-        return name, data
-
-    def _textures(self, wanted: set[int]) -> dict[int, Texture]:
-        """Return the textures of pictures, one for pictures of the same bytes; see `read_gltf`."""
-        found: dict[bytes, Texture] = {}
-        textures: dict[int, Texture] = {}
-        for index in sorted(wanted):
-            name, data = self._image(index)
-            if data is None:
-                continue
-            if data not in found:
-                decode = partial(decode_picture, data, file=str(self.path), name=name)
-                found[data] = Texture(name=name, srgb=decode)
-            textures[index] = found[data]
-        if len(textures) < len(wanted):
-            self.source.notes.append(
-                f"{len(wanted) - len(textures)} texture files are missing; base colours are used alone."
-            )
-        return textures
+        uri = image.get("uri")
+        name = image.get("name") or (uri if uri and not uri.startswith("data:") else f"image {index}")
+        if "bufferView" in image:
+            data: bytes | None = bytes(self.file.view(image["bufferView"])[0])
+        else:
+            data = self.file.uri_bytes(image["uri"])
+        if data is None:
+            if self.textures_required:
+                raise SceneError(
+                    f"{self.path}: texture file {uri!r} is missing beside it; put it there, or "
+                    "set missing_texture to 'ignore' to use the base colour alone"
+                )
+            return None
+        if data not in self.pictures_read:
+            decode = partial(decode_picture, data, file=str(self.path), name=name)
+            self.pictures_read[data] = Texture(name=name, srgb=decode)
+        return self.pictures_read[data]
 
     def _materials(self) -> list[dict[str, Any]]:
         """Fill the materials; return for each how its texture coordinates are found."""
-        entries = [
-            *self.file.tree.get("materials", []),
-            {},
-        ]  # the last one: the specification's default material
-        bases, emissives = [], []
-        for entry in entries:
-            glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-            pbr = entry.get("pbrMetallicRoughness", {})
-            bases.append(
-                (glossy.get("diffuseFactor", [1, 1, 1, 1]), glossy.get("diffuseTexture"))
-                if glossy is not None
-                else (pbr.get("baseColorFactor", [1, 1, 1, 1]), pbr.get("baseColorTexture"))
-            )
-            emissives.append(entry.get("emissiveTexture"))
-        index_of = {
-            id(info): self._image_index(info) for info in [*(base[1] for base in bases), *emissives] if info
-        }
-        textures = self._textures({index for index in index_of.values() if index >= 0})
+        # the last one: the specification's default material
+        entries = [*self.file.tree.get("materials", []), {}]
         taken: set[str] = set()
         coordinates = []
         see_through = metallic = glowing = transformed = clamped = 0
-        for index, (entry, (factor, info), emissive) in enumerate(
-            zip(entries, bases, emissives, strict=True)
-        ):
-            texture = textures.get(index_of.get(id(info), -1)) if info else None
-            glow = np.asarray(entry.get("emissiveFactor", [0, 0, 0]), dtype=np.float64)
-            glow = glow * entry.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get(
-                "emissiveStrength", 1.0
-            )
-            glowing_texture = textures.get(index_of.get(id(emissive), -1)) if emissive else None
-            if glowing_texture is not None and self.pictures and glow.any():
-                glow = glow * srgb_to_linear(glowing_texture.srgb).mean(axis=(0, 1), dtype=np.float64)
+        for index, entry in enumerate(entries):
+            extensions = entry.get("extensions", {})
+            glossy = extensions.get("KHR_materials_pbrSpecularGlossiness")
+            if glossy is not None:
+                factor, info = glossy.get("diffuseFactor", [1, 1, 1, 1]), glossy.get("diffuseTexture")
+            else:
+                pbr = entry.get("pbrMetallicRoughness", {})
+                factor, info = pbr.get("baseColorFactor", [1, 1, 1, 1]), pbr.get("baseColorTexture")
+            strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+            glow = np.asarray(entry.get("emissiveFactor", [0, 0, 0]), dtype=np.float64) * strength
+            texture, emissive = self._texture(info), self._texture(entry.get("emissiveTexture"))
+            if emissive is not None and self.pictures and glow.any():
+                glow = glow * srgb_to_linear(emissive.srgb).mean(axis=(0, 1), dtype=np.float64)
                 glowing += 1
             self.source.materials.append(
                 Material(
@@ -157,18 +138,14 @@ class _Reader:
             )
             see_through += entry.get("alphaMode", "OPAQUE") != "OPAQUE"
             metallic += bool(entry) and self._is_metal(entry)
-            transform = (info or {}).get("extensions", {}).get("KHR_texture_transform", {})
+            info = info or {}
+            transform = info.get("extensions", {}).get("KHR_texture_transform", {})
             transformed += bool(transform)
-            if (
-                info
-                and "samplers" in self.file.tree
-                and "sampler" in self.file.tree["textures"][info["index"]]
-            ):
-                sampler = self.file.entry("samplers", self.file.tree["textures"][info["index"]]["sampler"])
-                clamped += sampler.get("wrapS", 10497) != 10497 or sampler.get("wrapT", 10497) != 10497
-            coordinates.append(
-                {"set": transform.get("texCoord", (info or {}).get("texCoord", 0)), "transform": transform}
-            )
+            clamped += bool(info) and self._is_clamped(self.file.entry("textures", info["index"]))
+            where = transform.get("texCoord", info.get("texCoord", 0))
+            coordinates.append({"set": where, "transform": transform})
+        if missing := sum(texture is None for texture in self.textures.values()):
+            self.source.notes.append(f"{missing} texture files are missing; base colours are used alone.")
         for count, text in (
             (see_through, "materials with transparency are drawn opaque"),
             (metallic, "metallic materials are drawn as Lambertian surfaces of their base colour"),
@@ -179,6 +156,12 @@ class _Reader:
             if count:
                 self.source.notes.append(f"{count} {text}.")
         return coordinates
+
+    def _is_clamped(self, texture: dict[str, Any]) -> bool:
+        if "samplers" not in self.file.tree or "sampler" not in texture:
+            return False
+        sampler = self.file.entry("samplers", texture["sampler"])
+        return any(sampler.get(key, _REPEAT) != _REPEAT for key in ("wrapS", "wrapT"))
 
     @staticmethod
     def _is_metal(entry: dict[str, Any]) -> bool:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.components import connected_components
 from neurosim_core.scene.scene import Light, LinearRgb, extent
 from neurosim_core.scene.source import SceneError, Source, rgb
+from neurosim_core.scene.topology import connected_components
+from neurosim_core.scene.triangles import dot, double_areas
 
 LEVEL = 0.3
 """What the median bit of surface would reflect if it were white and faced its brightest lamp, alone."""
@@ -25,16 +26,14 @@ def surface_samples(triangles: NDArray[np.float64], count: int) -> NDArray[np.fl
 
     A low-discrepancy sequence: the same triangles give the same points.
     """
-    area = np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
     index = np.arange(count)
-    total = np.cumsum(area)
-    face = np.minimum(np.searchsorted(total, (index + 0.5) / count * total[-1]), len(area) - 1)
+    total = np.cumsum(double_areas(triangles.T))
+    face = np.minimum(np.searchsorted(total, (index + 0.5) / count * total[-1]), len(triangles) - 1)
     a = np.sqrt((index * 0.7548776662466927) % 1.0)  # Roberts' R2 sequence
     b = (index * 0.5698402909980532) % 1.0
-    weights = np.stack([1.0 - a, a * (1.0 - b), a * b], axis=1)
-    return np.asarray(np.einsum("nk,nkx->nx", weights, triangles[face]))
+    weights = 1.0 - a, a * (1.0 - b), a * b
+    columns = np.ascontiguousarray(triangles.T)  # [axis, corner, F]
+    return dot(weights, columns.take(face, axis=2).swapaxes(0, 1)).T
 
 
 def _level(
@@ -129,14 +128,11 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
         return _around(low, high), "placed above and around the scene, which is no room"
     cell = max(0.2, float((np.prod(size + 0.5) / _CELL_MAX) ** (1.0 / 3.0)))
     shape = np.ceil(size / cell).astype(int) + 2
-    area = np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
-    count = int(min(2.0 * area.sum() / cell**2 + len(triangles), 1_000_000))
-    points = np.concatenate([surface_samples(triangles, count), triangles[:, 0]])
-    index = np.clip(((points - low) / cell).astype(int) + 1, 0, shape - 1)
+    count = int(min(2.0 * double_areas(triangles.T).sum() / cell**2 + len(triangles), 1_000_000))
     full = np.zeros(shape, dtype=bool)
-    full[tuple(index.T)] = True
+    for points in (surface_samples(triangles, count).T, triangles[:, 0].T):
+        index = [((x - least) / cell).astype(int) + 1 for x, least in zip(points, low, strict=True)]
+        full[tuple(np.clip(i, 0, cells - 1) for i, cells in zip(index, shape, strict=True))] = True
     full[[0, -1]] = full[:, [0, -1]] = True  # nothing hangs outside
     room = _distance(full, (1.0, 1.0, 1.0)) * cell
     width = _distance(full, (1.0, 1.0, 4.0))  # counts walls, hardly the floor

@@ -44,7 +44,7 @@ def pack_textures(materials: Sequence[Material]) -> PackedTextures:
     """
     textures = list({id(m.texture): m.texture for m in materials if m.texture is not None}.values())
     with ThreadPoolExecutor() as pool:
-        chains = dict(zip(map(id, textures), pool.map(Texture.take_levels, textures), strict=True))
+        chains = dict(zip(map(id, textures), pool.map(Texture.pack_levels, textures), strict=True))
     chunks: list[NDArray[np.uint32]] = []
     levels: list[tuple[int, int, int]] = []
     rows: dict[int, tuple[int, int]] = {}

@@ -16,7 +16,6 @@ from neurosim_core.registry import register
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import lights_of
-from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture, extent
 from neurosim_core.scene.source import (
     Axis,
@@ -26,6 +25,8 @@ from neurosim_core.scene.source import (
     rgb,
 )
 from neurosim_core.scene.srgb import linear_to_srgb8
+from neurosim_core.scene.topology import smooth_normals
+from neurosim_core.scene.triangles import corner_columns, cross, dot, face_vectors
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
 
@@ -232,28 +233,27 @@ def _looks_up(parts: list[Part], unit_m: float) -> Axis | None:
     or more, which a lone box has not. Upright surface faces both other axes, at least half of one full wall
     each, which a stage set, a hill or a ball on a plane has not.
     """
-    triangles = unit_m * np.concatenate([part.positions.take(part.faces, axis=0) for part in parts])
-    lowest, highest = extent(triangles)
-    size = highest - lowest
+    corners = unit_m * np.concatenate([corner_columns(part.positions, part.faces) for part in parts], axis=2)
+    size = np.ptp(corners, axis=(1, 2))
     axis = int(np.argmin(size))
     first, second = (other for other in range(3) if other != axis)
     low, high = _STOREY_M
     if axis == 0 or not low <= size[axis] <= min(high, 0.6 * size[first], 0.6 * size[second]):
         return None
-    cross = 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    facing = np.abs(cross) > math.cos(_LEVEL_RAD) * area[:, None]
-    amount = area @ facing
-    upright = np.abs(cross[:, axis]) < math.sin(_LEVEL_RAD) * area
-    walls = (cross[upright] ** 2 / area[upright, None]).sum(axis=0)  # area times the squared cosine
+    normal = 0.5 * face_vectors(corners)
+    area = np.sqrt(dot(normal, normal))
+    facing = np.abs(normal) > math.cos(_LEVEL_RAD) * area
+    amount = facing @ area
+    upright = np.abs(normal[axis]) < math.sin(_LEVEL_RAD) * area
+    walls = (normal[:, upright] ** 2 / area[upright]).sum(axis=1)  # area times the squared cosine
     if (
         int(np.argmax(amount)) != axis
         or walls[first] < 0.5 * size[axis] * size[second]
         or walls[second] < 0.5 * size[axis] * size[first]
     ):
         return None
-    level = facing[:, axis]
-    height = triangles[level][:, :, axis].mean(axis=1)
+    level = facing[axis]
+    height = corners[axis][:, level].mean(axis=0)
     order = np.argsort(height)
     floor = np.cumsum(np.diff(height[order], prepend=height[order[0]]) > 0.05)  # 5 cm apart: another one
     floors = np.bincount(floor, weights=area[level][order])
@@ -286,7 +286,7 @@ def _place(part: Part, path: Path) -> NDArray[np.bool_]:
         raise SceneError(
             f"{path}: {part.name!r} has NaN or infinite numbers in {what}; finite ones are needed"
         )
-    thin, linear = _is_thin(part.positions.take(part.faces, axis=0)), part.matrix[:3, :3]
+    thin, linear = _is_thin(corner_columns(part.positions, part.faces)), part.matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # vertices in no face may be anything
         part.positions = part.positions @ linear.T + part.matrix[:3, 3]
     mirrored = np.linalg.det(linear) < 0.0
@@ -300,13 +300,12 @@ def _place(part: Part, path: Path) -> NDArray[np.bool_]:
     return thin
 
 
-def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which triangles [F, 3, 3] are lower than 1e-7 of their longest edge: lines to float32."""
-    edge = np.roll(corner, -1, axis=1) - corner
-    one, two, three = np.einsum("fcx,fcx->fc", edge, edge).T
-    longest_squared = np.maximum(np.maximum(one, two), three)
-    cross = np.cross(edge[:, 0], edge[:, 1])
-    return np.asarray(np.einsum("fx,fx->f", cross, cross) <= (1e-7 * longest_squared) ** 2)
+def _is_thin(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which triangles [axis, corner, F] are lower than 1e-7 of their longest edges: float32 lines."""
+    edge = np.roll(corners, -1, axis=1) - corners
+    longest_squared = dot(edge, edge).max(axis=0)
+    normal = cross(edge[:, 0], edge[:, 1])
+    return np.asarray(dot(normal, normal) <= (1e-7 * longest_squared) ** 2)
 
 
 def _joined(
@@ -317,7 +316,7 @@ def _joined(
     positions = np.concatenate([part.positions for part in parts]).astype(np.float32).astype(np.float64)
     faces = np.concatenate([part.faces + first for part, first in zip(parts, start, strict=False)])
     # in the file's numbers, where a line is still exactly one, and as the scene stores them
-    thin = np.concatenate(thin_of) | _is_thin(positions.take(faces, axis=0))
+    thin = np.concatenate(thin_of) | _is_thin(corner_columns(positions, faces))
     if thin.any():
         notes.append(f"{int(thin.sum())} of {len(faces)} faces have no area and are dropped.")
     if thin.all():

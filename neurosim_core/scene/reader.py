@@ -1,14 +1,15 @@
 """Reads a scene in a process of its own, while the one that asks imports its libraries.
 
-Both would hold Python's interpreter lock most of the time: threads take turns. Arrays come in a file without
-a name, which is mapped into memory.
+Both would hold Python's interpreter lock most of the time: threads take turns. So would those that decode
+pictures with the one that cuts triangles: the process forks for pictures. Arrays come in a file without a
+name, which is mapped into memory.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
+import fcntl
 import gc
 import json
 import mmap
@@ -20,7 +21,8 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from neurosim_core.scene.config import SceneConfig
     from neurosim_core.scene.scene import Scene
 
+_GEOMETRY, _SCENE, _PICTURES, _CONNECTIONS = range(4)
+"""What the process answers."""
 _ALIGNMENT = 64
 _KEEP_MEMORY = {
     "MALLOC_ARENA_MAX": "1",
@@ -55,9 +59,10 @@ class SceneReader:
                 working directory.
         """
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
-        self._answers: list[list[tuple[int, int]] | None] = []
-        """Where the parts of each answer are in the file, and how long they are; None: it gives no more."""
-        self._turn = threading.Lock()
+        self._places: list[Future[list[tuple[int, int]]]] = [Future() for _ in range(4)]
+        """Where the parts of each answer are in the file, and how long they are."""
+        self._answers: dict[int, Any] = {}
+        self._unpacking = threading.Lock()
         read = {key: settings.get(key, {}) for key in ("scene", "render")}
         with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
             # more than arguments may hold; nothing stays in a buffer
@@ -72,6 +77,8 @@ class SceneReader:
             env={**os.environ, **_KEEP_MEMORY},
             preexec_fn=end_with_parent(signal.SIGKILL),
         )
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
 
     def geometry(self, config: SceneConfig) -> Scene:
         """Wait for the triangles; return the scene without materials, some time before `scene` has all of it.
@@ -81,27 +88,56 @@ class SceneReader:
         Raises:
             NotReadError: The process could not read it, or read other settings.
         """
-        return self._answer(0, config)
+        return self._answer(_GEOMETRY, config)
 
     def scene(self, config: SceneConfig) -> Scene:
-        """Wait for the scene and return it, with its pictures decoded; argument and errors as above."""
-        return self._answer(1, config)
+        """Wait for the scene and return it; argument and errors as above.
 
-    def _answer(self, number: int, config: SceneConfig) -> Scene:
-        assert self._process.stdout is not None
-        with self._turn:
-            while len(self._answers) <= number:
-                line = self._process.stdout.readline()
-                self._answers.append(json.loads(line) if line.endswith(b"\n") else None)
-        places = self._answers[number]
-        if places is None:
-            raise NotReadError
-        data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
-        body, *buffers = (data[at : at + size] for at, size in places)
-        read, scene = pickle.loads(body, buffers=buffers)
+        Its pictures and its connections come later: who looks at them waits, and gets a NotReadError if the
+        process has ended before they were there.
+        """
+        from neurosim_core.scene.scene import Texture
+
+        scene, names, texture_of = self._answer(_SCENE, config)
+
+        def picture(k: int, part: int) -> Any:
+            return self._answer(_PICTURES, config)[k][part]
+
+        textures = {
+            k: Texture(name=name, srgb=partial(picture, k, 0), levels=partial(picture, k, 1))
+            for k, name in enumerate(names)
+        }
+        return dataclasses.replace(
+            scene,
+            materials=tuple(
+                dataclasses.replace(material, texture=textures.get(k))
+                for material, k in zip(scene.materials, texture_of, strict=True)
+            ),
+            connect=partial(self._answer, _CONNECTIONS, config),
+        )
+
+    def _answer(self, number: int, config: SceneConfig) -> Any:
+        places = self._places[number].result()
+        with self._unpacking:
+            if number not in self._answers:
+                data = memoryview(mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_COPY))
+                body, *buffers = (data[at : at + size] for at, size in places)
+                self._answers[number] = pickle.loads(body, buffers=buffers)
+        read, answer = self._answers[number]
         if read != config:
             raise NotReadError
-        return scene
+        return answer
+
+    def _listen(self) -> None:
+        """Note where answers are, until the process ends."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.endswith(b"\n"):  # else it was ended
+                number, places = json.loads(line)
+                self._places[number].set_result(places)
+        for missing in self._places:
+            if not missing.done():
+                missing.set_exception(NotReadError())
 
     def __enter__(self) -> SceneReader:
         return self
@@ -110,7 +146,10 @@ class SceneReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._process.kill()
-        self._process.communicate()  # closes the pipe
+        self._process.wait()
+        self._listener.join()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
         self._file.close()
 
 
@@ -122,12 +161,11 @@ def main() -> None:
     with open(0, "r+b") as file, open(os.dup(1), "w") as answers, open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)  # what libraries print is no answer
         settings = json.load(file)
-        file.seek(0)
-        _read(settings, functools.partial(_write, file=file, answers=answers))
+        _read(settings, partial(_write, file=file, answers=answers))
 
 
-def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
-    """Read a scene and write its triangles; compute what its light and its pictures need, and write all."""
+def _read(settings: Mapping[str, Any], write: Callable[[int, object], None]) -> None:
+    """Read a scene and write its triangles; compute what its light and its pictures need, and write that."""
     from neurosim_core.registry import find
     from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene, scene_kind
 
@@ -136,7 +174,18 @@ def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
     kind = scene_kind(given)
     config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
     scene = load_mesh_scene(config, decode=False) if isinstance(config, MeshSceneConfig) else config.load()
-    write((config, dataclasses.replace(scene, materials=())))
+    write(_GEOMETRY, (config, dataclasses.replace(scene, materials=())))
+    textures = list(dict.fromkeys(m.texture for m in scene.materials if m.texture is not None))
+    end_with_reader = end_with_parent(signal.SIGKILL)
+    child = os.fork()
+    if child == 0:
+        try:
+            if end_with_reader is not None:
+                end_with_reader()
+            with ThreadPoolExecutor() as threads:
+                write(_PICTURES, (config, list(threads.map(lambda t: (t.srgb, t.pack_levels()), textures))))
+        finally:
+            os._exit(0)
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
 
@@ -145,22 +194,26 @@ def _read(settings: Mapping[str, Any], write: Callable[[Any], None]) -> None:
     if (mesh := refine_within(scene, edge_m)) is not None:
         scene.refined[edge_m] = mesh
         _ = mesh.corner_groups, mesh.corner_normals
-    with ThreadPoolExecutor() as aside:  # at last: decoding and packing hold up the thread that does the rest
-        for texture in dict.fromkeys(m.texture for m in scene.materials if m.texture is not None):
-            aside.submit(texture.__getstate__)
-        if render.samples_per_pixel == "adaptive":
-            _ = scene.connections
-    write((config, scene))
+    plain = tuple(dataclasses.replace(material, texture=None) for material in scene.materials)
+    texture_of = [None if m.texture is None else textures.index(m.texture) for m in scene.materials]
+    names = [texture.name for texture in textures]
+    write(_SCENE, (config, (dataclasses.replace(scene, materials=plain), names, texture_of)))
+    if render.samples_per_pixel == "adaptive":
+        write(_CONNECTIONS, (config, scene.connections))
+    os.waitpid(child, 0)  # it ends with this one
 
 
-def _write(content: object, *, file: BinaryIO, answers: TextIO) -> None:
-    """Write an object and the arrays in it to a file, and print where each of them begins and its size."""
+def _write(number: int, content: object, *, file: BinaryIO, answers: TextIO) -> None:
+    """Add an answer and the arrays in it to a file, and print where each of them begins and its size."""
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(content, protocol=5, buffer_callback=buffers.append)
     places = []
+    fcntl.lockf(file, fcntl.LOCK_EX)  # two processes write
+    file.seek(0, os.SEEK_END)
     for view in (memoryview(body), *(buffer.raw() for buffer in buffers)):
         file.write(bytes(-file.tell() % _ALIGNMENT))
         places.append((file.tell(), view.nbytes))
         file.write(view)
     file.flush()
-    print(json.dumps(places), file=answers, flush=True)
+    print(json.dumps((number, places)), file=answers, flush=True)
+    fcntl.lockf(file, fcntl.LOCK_UN)

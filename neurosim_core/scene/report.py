@@ -20,8 +20,8 @@ from trimesh.intersections import slice_faces_plane
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
-from neurosim_core.render.warp_renderer import WarpRenderer
+from neurosim_core.render.renderer import make_renderer, take_picture, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Scene
@@ -139,7 +139,7 @@ def scene_picture(scene: Scene, space: FreeSpace | None) -> Image.Image:
     # under the ceiling of the storey that one flies in, over most furniture; things are whole
     cut_m = min(max(fly_m + 0.5, low + 0.5 * (high - low)), high - 0.15 * (high - low))
     opened = cut_open(scene, high if high - low < 1.8 else cut_m)
-    arrays = upload_scene(opened, RenderConfig(samples_per_pixel=4, lighting=lighting), "cpu")
+    arrays = upload_scene(opened, RenderConfig(samples_per_pixel=4, lighting=lighting), device="cpu")
     arrays.data.sky = wp.vec3(1.0 / arrays.exposure)  # white paper
     picture = Image.new("RGB", _SIZE, _PAPER)
     picture.paste(Image.fromarray(_look(arrays, *_view_from_above(opened.bounds_m), _VIEW)), (0, 0))
@@ -223,15 +223,8 @@ def _view_from_above(bounds: NDArray[np.float64]) -> tuple[Any, float]:
 
 def _look(arrays: SceneArrays, pose: Any, fov_rad: float, size: tuple[int, int]) -> NDArray[np.uint8]:
     lens = PinholeConfig(width=size[0], height=size[1], horizontal_fov_rad=fov_rad)
-    renderer = WarpRenderer(arrays, lens, outputs={"rgb"}, instant_count=1)
-    renderer.render(
-        wp.array(pose[0][None].astype(np.float32), dtype=wp.vec3, device=arrays.device),
-        wp.array(pose[1][None].astype(np.float32), dtype=wp.quat, device=arrays.device),
-        wp.zeros(1, dtype=int, device=arrays.device),
-        instant_count=1,
-    )
-    rgb: Any = renderer.rgb
-    return np.asarray(rgb.numpy()[0], dtype=np.uint8)
+    renderer = make_renderer(arrays, lens, outputs={"rgb"}, instant_count=1)
+    return take_picture(renderer, *pose, outputs={"rgb"})["rgb"]
 
 
 def _draw_plan(

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.connections import connect_faces
 from neurosim_core.scene.texels import packed_levels
+from neurosim_core.scene.topology import connect_faces
+from neurosim_core.scene.triangles import corner_columns, dot, double_areas, face_vectors
 
 LinearRgb = tuple[float, float, float]
 """Linear-light red, green, blue (Rec. 709 primaries)."""
@@ -32,11 +33,17 @@ def extent(points: NDArray[Any]) -> NDArray[Any]:
 class Texture:
     """A picture that is wrapped around a surface; painted when it is first looked at, if ever."""
 
-    def __init__(self, *, name: str, srgb: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]) -> None:
-        """Take texels as `srgb` has them, or what paints them."""
+    def __init__(
+        self,
+        *,
+        name: str,
+        srgb: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]],
+        levels: Callable[[], list[NDArray[np.uint32]]] | None = None,
+    ) -> None:
+        """Take texels as `srgb` has them, or what paints them; `levels`: what packs them elsewhere."""
         self.name = name
         self._source = srgb
-        self._levels: list[NDArray[np.uint32]] | None = None
+        self._levels = levels
 
     # No `cached_property`: before Python 3.12 it has one lock for all textures, so threads would take turns.
     @property
@@ -51,15 +58,9 @@ class Texture:
         """Look at the texels now: raises what is wrong with their picture."""
         self.srgb  # noqa: B018
 
-    def take_levels(self) -> list[NDArray[np.uint32]]:
+    def pack_levels(self) -> list[NDArray[np.uint32]]:
         """Return the packed texels of all mip levels, shape [H, W] each; they are not kept."""
-        levels, self._levels = self._levels, None
-        return packed_levels(self.srgb) if levels is None else levels
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what another process gets: the texels and their levels, in place of what paints them."""
-        self._levels = self._levels or packed_levels(self.srgb)
-        return {"name": self.name, "_source": self.srgb, "_levels": self._levels}
+        return packed_levels(self.srgb) if self._levels is None else self._levels()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,13 +108,17 @@ class RefinedMesh:
     """Face of the scene that each face is a part of, shape [F]."""
 
     @cached_property
+    def areas_m2(self) -> NDArray[np.float64]:
+        """Area of each face [m^2], shape [F]."""
+        return 0.5 * double_areas(corner_columns(self.vertices.astype(np.float64), self.faces))
+
+    @cached_property
     def corner_normals(self) -> NDArray[np.float32]:
         """Shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
-        tips = self.vertices.take(self.faces, axis=0)
-        front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
-        normals = self.normals.take(self.faces, axis=0)
-        sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
-        return np.asarray(normals * sign[..., None])
+        front = face_vectors(corner_columns(self.vertices, self.faces))
+        normals = corner_columns(self.normals, self.faces)
+        sign = np.where(dot(normals, front[:, None]) < 0.0, np.float32(-1.0), np.float32(1.0))
+        return np.ascontiguousarray((normals * sign).T)
 
     @cached_property
     def corner_groups(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -176,6 +181,8 @@ class Scene:
 
     refined: dict[float | None, RefinedMesh] = field(default_factory=dict)
     """Meshes that `render.refine` has made of it beforehand, by their longest edge [m]."""
+    connect: Callable[[], tuple[NDArray[np.int32], NDArray[np.int32]]] | None = None
+    """Returns what `connect_faces` has returned elsewhere; None: it is called here."""
 
     def __post_init__(self) -> None:
         """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""
@@ -185,7 +192,7 @@ class Scene:
     @cached_property
     def connections(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """What `connect_faces` returns."""
-        return connect_faces(self)
+        return connect_faces(self) if self.connect is None else self.connect()
 
     @cached_property
     def bounds_m(self) -> NDArray[np.float64]:

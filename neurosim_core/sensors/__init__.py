@@ -8,9 +8,13 @@ from neurosim_core.lazy import lazy_names
 
 if TYPE_CHECKING:  # isort: off
     from neurosim_core.sensors.base import (
+        FrameContext as FrameContext,
         FrameSensorConfig as FrameSensorConfig,
         ImageSensorConfig as ImageSensorConfig,
+        PictureContext as PictureContext,
+        PictureSensorConfig as PictureSensorConfig,
         RateHz as RateHz,
+        RenderRequest as RenderRequest,
         Sampler as Sampler,
         SamplerContext as SamplerContext,
         StateSensorConfig as StateSensorConfig,

@@ -3,7 +3,7 @@
 # ruff: noqa: UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
 """Corners of the geometry as a list: where they are in the picture, exactly, under numbers that stay.
 
-The corners are those of the meshes of the scene and of moving bodies (`scene.corners`), found once. Each is
+The corners are those of the meshes of the scene and of moving bodies (`scene.topology`), found once. Each is
 projected through the lens and is seen unless a ray to it hits something before. So positions have no
 resolution, a corner has the same number in all pictures, runs and worlds of a scene, and what looks like a
 corner because one thing ends behind another is none.
@@ -24,7 +24,7 @@ from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.render.projection import projector
-from neurosim_core.scene.corners import find_corners
+from neurosim_core.scene.topology import find_corners
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
 from neurosim_core.sensors.edges import EdgeLimits, make_edge_finder
 from neurosim_core.sensors.occlusion import NEAR_RATIO, Surroundings, is_hidden_by_bodies, make_surroundings

@@ -179,7 +179,7 @@ class DisplacementRule:
         """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
 
         Args:
-            states: Where the flight of world 0 is (`Trace.states`), float64, shape [slot, >= 1, >= 13].
+            states: Where the flight of world 0 is (`TraceArrays.states`), float64, shape [slot, >= 1, >= 13].
             slots: Slots of consecutive ticks of the clock.
             stamps_ns: Their stamps [ns], later than those of the call before.
             forced: Whether a tick is rendered in any case; the very first always is.

@@ -222,7 +222,7 @@ class EventLabels:
         if scene.bodies is not None:
             bodies = scene.bodies
             model.motions, model.body_mesh = context.motions, bodies.mesh
-            model.body_sphere, model.body_face = bodies.sphere, bodies.first_face
+            model.body_sphere, model.body_face = bodies.data.sphere, bodies.data.first_face
         if {"instance", "semantic"} & self._geometry:
             warn_of_patterns(context.name, [scene], classes)
             known = label_scenes([scene], classes)

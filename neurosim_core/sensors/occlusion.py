@@ -62,7 +62,7 @@ def make_surroundings(context: PictureContext) -> tuple[str, Any, list[Any]]:
     if context.motions is not None:
         scene = context.scenes[0]
         around.scene_instances = len(scene.scene.instance_names)
-        around.motions, around.body_mesh = context.motions, scene.bodies.mesh
+        around.motions, around.body_mesh = context.motions, scene.bodies.data.mesh
     return str(kinds.pop()), around, lenses
 
 

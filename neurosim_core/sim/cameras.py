@@ -1,56 +1,83 @@
-# mypy: disable-error-code="attr-defined"
-"""What the cameras see of one batch: which instants they render, in one launch each, and the packets."""
+# mypy: disable-error-code="attr-defined,call-overload"
+"""What the cameras see of a batch: which instants each group renders, in one launch each, and the packets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
 
-from neurosim_core.clock import Rate
-from neurosim_core.packets import Packet
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.packets import Image, Packet
+from neurosim_core.render.outputs import INSTANT_OUTPUTS
 from neurosim_core.runtime.cuda import use_stream
+from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.runtime.timing import timed
+from neurosim_core.scene.bodies import pose_bodies
+from neurosim_core.sensors.base import PictureViews
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.render_group import RenderGroupState
-from neurosim_core.sim.render_job import (
-    RenderJob,
-    acquire_room,
-    begin_frames,
-    choose_ticks,
-    disable_frame_sensors,
-    is_due,
-    launch_key,
-    plan_render,
-    read_images,
-    scan_frames,
-)
+from neurosim_core.sim.render_group import BatchBuffers, RenderGroupState
 from neurosim_core.sim.state import Batch, State
+from neurosim_core.sim.trace import Trace
+
+_SLOT_LISTS_MAX = 256
+
+
+@dataclass(kw_only=True, eq=False)
+class RenderJob:
+    """The instants of a batch that a group renders, at least one."""
+
+    group: RenderGroupState
+    buffers: BatchBuffers
+    """What is overwritten."""
+    trace: Trace
+    stamps_ns: Sequence[int]
+    """Stamps of the instants, of the clock that all worlds share [ns]."""
+    pictures: Sequence[tuple[int, int, str]]
+    """Stamp, image slot and camera of each picture."""
+    frames: Sequence[str]
+    """Frame sensors that see the instants."""
+    pose_count: int
+    """Instants of which poses are computed."""
+    image_count: int
+    """Image slots that are written."""
+    from_slots: wp.array[int]
+    """Slots of the trace, of the instants."""
+    to_slots: wp.array[int]
+    """Image slots of the instants of all worlds; -1: there is no picture."""
+    active: Any
+    """0 where a world is not rendered, device array of int32, shape [world]; None: all are."""
+    pattern: Hashable | None
+    """Same pattern, same launches; None: they do not come again, or more than launches is done."""
+    rooms: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
+    """Memory of the caller's that pictures are copied to, by camera and stamp."""
 
 
 def launch_cameras(model: Model, state: State, batch: Batch) -> None:
     """Let the cameras that are wanted see a batch, and launch the copies to the host."""
-    jobs = batch.jobs
-    due = choose(model, state, batch) if jobs is None else ()
+    chosen = choose(model, state, batch) if batch.jobs is None else ()
     stream = state.render_streams[batch.number % len(state.batch_done)]
     with timed(state.wall_s, "render"), use_stream(stream):
         state.flown[batch.number % state.render_backlog].wait_on_stream()
-        if jobs is None:
-            jobs = plan_jobs(state, batch, due)
-        for job in jobs:
+        for job in plan_jobs(state, batch, chosen):
             acquire_room(job)
-            if job.key is None:
-                job.render()
+            if (key := launch_key(job)) is None:
+                render(job)
             else:
-                state.graphs.run(launch_key(job), job.render)
+                state.graphs.run(key, partial(render, job))
         state.rendered.set()
     with use_stream(state.event_stream):
         state.rendered.wait_on_stream()
-        scan(state, batch, jobs)
+        scan(state, batch)
 
 
 def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
     """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight."""
     chosen: list[list[int]] = []
-    choices = []
     for index, group in enumerate(state.groups):
         disable_frame_sensors(group, batch.wanted)
         always = bool(group.world_frames) or any(name in batch.wanted for name in group.frames)
@@ -59,67 +86,188 @@ def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
             for place, boundary in enumerate(batch.boundaries)
             if index in boundary.groups and (always or is_due(group, boundary.stamp_ns, batch.wanted))
         ]
-        if group.rule is not None:
+        if group.rule is not None and due:
             with timed(state.wall_s, "choice of renders"), use_stream(state.choice_stream):
                 state.flown[batch.number % state.render_backlog].wait_on_stream()
-                choice = choose_ticks(
-                    group,
-                    state.trace,
-                    slots=[batch.slot + place for place in due],
-                    stamps_ns=[batch.boundaries[place].stamp_ns for place in due],
-                    end_ns=model.duration_ns,
-                    wanted=batch.wanted,
-                    required=_required_clocks(model, group),
-                )
-            choices.append(choice)
-            due = [due[place] for place in choice.places]
+                due = _choose_ticks(model, state, batch, group, due)
         chosen.append(due)
-    batch.choices = choices
     return chosen
 
 
-def _required_clocks(model: Model, group: RenderGroupState) -> dict[str, Rate]:
-    """Return the clocks whose ticks an adaptive group renders in any case, by frame sensor."""
-    return {name: model.config.sensors[name].packets for name in group.frames}
+def _choose_ticks(
+    model: Model, state: State, batch: Batch, group: RenderGroupState, due: Sequence[int]
+) -> list[int]:
+    """Return which boundaries an adaptive group renders of those that are due; wait until that is known.
+
+    These are the ticks that its rule asks for, the ends of the packets of its sensors, the last tick of the
+    run, and the first tick that a camera sees. The rule moves on to the end of the batch.
+    """
+    assert group.rule is not None
+    stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
+    looking = [name for name in group.frames if name in batch.wanted]
+    required = [model.config.sensors[name].packets for name in looking]
+    last_ns = group.rate.stamp_ns(group.rate.first_tick(model.duration_ns + 1) - 1)
+    forced = [s == last_ns or any(clock.has_tick(s) for clock in required) for s in stamps_ns]
+    forced[0] |= not all(group.frames[name].watching for name in looking)
+    slots = [batch.slot + place for place in due]
+    places = group.rule.choose(state.trace.arrays.states, slots, stamps_ns, forced)
+    batch.left_out_count += len(due) - len(places)
+    batch.coarse_count += group.rule.coarse_count
+    return [due[place] for place in places]
 
 
-def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> list[RenderJob]:
-    """Return what the groups have to render of a batch: at the boundaries chosen for each."""
-    return [
-        plan_render(
-            group,
-            state.trace,
-            slots=[batch.slot + place for place in places],
-            stamps_ns=[batch.boundaries[place].stamp_ns for place in places],
-            buffer_index=batch.number % len(state.batch_done),
-            wanted=batch.wanted,
-            active=state.fleet.active if state.world_count > 1 else None,
-        )
-        for group, places in zip(state.groups, chosen, strict=True)
-        if places
-    ]
+def is_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> bool:
+    """Return whether a camera that is wanted sees the tick of a group."""
+    return any(name in wanted for name in group.frames) or bool(pictures_due(group, stamp_ns, wanted))
 
 
-def scan(state: State, batch: Batch, jobs: Sequence[RenderJob]) -> None:
-    """Let event cameras see what was rendered; that is the end of a batch on the device."""
-    with timed(state.wall_s, "events"):
-        for job in jobs:
-            scan_frames(job.group, job.instants)
-        state.batch_done[batch.number % len(state.batch_done)].set()
-    batch.seen = [(job.group, job.instants) for job in jobs]
+def pictures_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> list[str]:
+    """Return the image sensors that are wanted and take a picture at a tick of a group."""
+    return [name for name, image in group.images.items() if name in wanted and image.rate.has_tick(stamp_ns)]
+
+
+def disable_frame_sensors(group: RenderGroupState, wanted: Collection[str]) -> None:
+    """Let frame sensors that are not wanted forget what they have seen."""
+    for name, sensor in group.frames.items():
+        sensor.watching = sensor.watching and name in wanted
+
+
+def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> Sequence[RenderJob]:
+    """Return what the groups render of a batch: at the boundaries chosen for each, if nothing is planned."""
+    if batch.jobs is None:
+        batch.jobs = [plan_job(state, batch, index, places) for index, places in enumerate(chosen) if places]
+    return batch.jobs
 
 
 def plan_ahead(model: Model, state: State, batch: Batch) -> None:
     """Plan what is rendered of a batch that is going to be flown, unless that depends on the flight."""
     if model.schedule.sparse or any(group.frames for group in state.groups):
         return
-    batch.jobs = plan_jobs(state, batch, choose(model, state, batch))
+    plan_jobs(state, batch, choose(model, state, batch))
+
+
+def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> RenderJob:
+    """Return how a group renders some boundaries of a batch, at least one."""
+    group, buffer_index = state.groups[index], batch.number % len(state.batch_done)
+    slots = tuple(batch.slot + place for place in places)
+    stamps_ns = [batch.boundaries[place].stamp_ns for place in places]
+    pictures = []
+    image_slots = []
+    used = 0
+    for instant, stamp_ns in enumerate(stamps_ns):
+        due = pictures_due(group, stamp_ns, batch.wanted) if group.images else ()
+        pictures += [
+            (stamp_ns, instant if group.images[name].output in INSTANT_OUTPUTS else used, name)
+            for name in due
+        ]
+        image_slots.append(used if due else -1)
+        used += bool(due)
+    posed, placed = slots, tuple(image_slots)
+    pattern: Hashable | None = (id(group), buffer_index, posed, placed) if group.only_launches else None
+    if group.world_count > 1:  # frustum candidate lists look at all instants of a world
+        posed += (slots[-1],) * (group.capacity - len(slots))
+    buffers = group.buffers[buffer_index]
+    if buffers.chosen_slots is None:
+        from_slots = _on_device(group, (buffer_index, "from", posed), lambda: posed)
+    else:
+        pattern, from_slots = None, buffers.chosen_slots.array
+        buffers.chosen_slots.rows[: len(slots)] = slots
+    return RenderJob(
+        group=group,
+        buffers=buffers,
+        trace=state.trace,
+        stamps_ns=stamps_ns,
+        pictures=pictures,
+        frames=[name for name in group.frames if name in batch.wanted],
+        pose_count=len(posed),
+        image_count=used,
+        from_slots=from_slots,
+        to_slots=_on_device(group, (buffer_index, "to", placed), lambda: _image_slots(group, placed)),
+        active=state.worlds.active if group.world_count > 1 else None,
+        pattern=pattern,
+    )
+
+
+def acquire_room(job: RenderJob) -> None:
+    """Ask for memory for the pictures of a job that have none yet, if a device copies them there."""
+    if job.group.make_room is None:
+        return
+    for stamp_ns, slot, name in job.pictures:
+        if (name, stamp_ns) not in job.rooms:
+            picture = job.buffers.copies[job.group.images[name].source].view(slot, 1)[0]
+            room = job.group.make_room(name, stamp_ns, picture)
+            if room is not None:
+                job.rooms[name, stamp_ns] = room
+
+
+def launch_key(job: RenderJob) -> Hashable | None:
+    """Return the key of the launches of a job: they copy pictures to where there is room now."""
+    if job.pattern is None or job.group.make_room is None:
+        return job.pattern
+    places = (job.rooms.get((name, stamp_ns)) for stamp_ns, _, name in job.pictures)
+    addresses = (0 if room is None else room.__array_interface__["data"][0] for room in places)
+    return job.pattern, PinnedMapping.made_count, *addresses
+
+
+def render(job: RenderJob) -> tuple[Any, Any]:
+    """Launch the rendering of a job and the copies of its pictures; return what a graph of it must keep."""
+    group, buffers, instant_count = job.group, job.buffers, len(job.stamps_ns)
+    p_WC, q_WC, stamps, bodies = buffers.p_WC, buffers.q_WC, buffers.stamps, buffers.bodies
+    if buffers.chosen_slots is not None:
+        buffers.chosen_slots.upload()
+    camera: dict[str, Any] = {"count": job.pose_count, "p_BC": group.p_BC, "q_BC": group.q_BC}
+
+    def pose(offsets_ns: Any, count: int, *, bodies: Any, **there: Any) -> None:
+        job.trace.camera_poses(job.from_slots, offsets_ns, **camera, **there)
+        if group.motions is not None and bodies is not None:
+            pose_bodies(group.motions, there["stamps"], group.instants, count=count, poses=bodies)
+
+    def pose_at(offsets_ns: Any, **there: Any) -> None:
+        pose(offsets_ns, there["stamps"].shape[0], **there)
+
+    def find_twists(twist: Any) -> None:
+        job.trace.camera_twists(job.from_slots, twist, **camera)
+
+    rows = instant_count * group.offsets_ns.shape[0] if group.world_count == 1 else stamps.shape[0]
+    pose(group.offsets_ns, rows, p_WC=p_WC, q_WC=q_WC, stamps=stamps, bodies=bodies)
+    buffers.renderer.render(
+        p_WC, q_WC, job.to_slots, instant_count=instant_count, bodies=bodies, active=job.active
+    )
+    views = PictureViews(
+        instant_count, job.to_slots, p_WC, q_WC, stamps, job.active, bodies, pose_at, find_twists
+    )
+    for name in dict.fromkeys(name for _, _, name in job.pictures):
+        if name in buffers.processes:
+            buffers.processes[name].launch(views)
+        if name in group.shared_pictures:
+            wp.copy(group.pictures[name], group.shared_pictures[name])
+    if group.make_room is None:
+        for source, copy in buffers.copies.items():
+            copy.fetch(0, instant_count if source in INSTANT_OUTPUTS else job.image_count)
+    else:
+        for stamp_ns, slot, name in job.pictures:
+            copy = buffers.copies[group.images[name].source]
+            room = job.rooms.get((name, stamp_ns))
+            if room is None:
+                copy.fetch(slot, 1)
+            else:
+                copy.fetch_into(room, slot)
+    return job.from_slots, job.to_slots
+
+
+def scan(state: State, batch: Batch) -> None:
+    """Let event cameras see what was rendered; that is the end of a batch on the device."""
+    with timed(state.wall_s, "events"):
+        for job in batch.jobs or ():
+            for name in job.frames:
+                job.group.frames[name].see(job.buffers.renderer.log_radiance, job.stamps_ns)
+        state.batch_done[batch.number % len(state.batch_done)].set()
 
 
 def _is_late(batch: Batch) -> bool:
     """Return whether all that cameras yield is pictures that go to room of the caller's, and all count."""
     return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
-        not instants.frames and len(instants.rooms) == len(instants.pictures) for _, instants in batch.seen
+        not job.frames and len(job.rooms) == len(job.pictures) for job in batch.jobs or ()
     )
 
 
@@ -132,63 +280,108 @@ def read_cameras(
     events; the next batch with the same buffers may be launched there.
     """
     packets: list[Packet] = []
+    jobs = batch.jobs or ()
     with timed(state.wall_s, "camera read-back"):
         if not (state.pictures_in_place and _is_late(batch)):
             state.batch_done[batch.number % len(state.batch_done)].wait()
-        seen = [begin_frames(*each, until_ns=batch.until_ns) for each in batch.seen]
-        for group, instants in batch.seen:
-            state.counts["renders"] += len(instants.stamps_ns)
-            packets += read_images(group, instants, borrow=borrow)
-    for choice in batch.choices:
-        state.counts["ticks left out"] += choice.left_out_count
-        state.counts["coarse ticks"] += choice.coarse_count
+        readings = [
+            job.group.frames[name].begin_read(job.stamps_ns, until_ns=batch.until_ns)
+            for job in jobs
+            for name in job.frames
+        ]
+        for job in jobs:
+            state.counts["renders"] += len(job.stamps_ns)
+            packets += _read_images(job, borrow=borrow)
+    state.counts["ticks left out"] += batch.left_out_count
+    state.counts["coarse ticks"] += batch.coarse_count
     if meanwhile is not None:
         meanwhile()
     with timed(state.wall_s, "events"):
-        events = [packet for sensors in seen for hand_out in sensors for packet in hand_out()]
+        events = [packet for hand_out in readings for packet in hand_out()]
         state.counts["events dropped"] += sum(getattr(packet, "dropped_count", 0) for packet in events)
     return packets + events
 
 
-def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:
-    """Let the frame sensors of many worlds see what was rendered; launches only.
+def _read_images(job: RenderJob, *, borrow: bool) -> list[Packet]:
+    """Return the pictures of a job that the device has finished with.
 
-    The clocks of the worlds are at the end of the batch; `last_seen_ns` leads for each group from its begin
-    to the instant before it, <= 0. What is returned has to be kept by a graph of these launches.
+    With `borrow` those for which the caller has no room are views that are valid until the buffers are
+    overwritten, not copies, if what their sensor yields is an `Image`: of other packets nobody knows whether
+    they keep a view.
     """
-    held: list[object] = []
-    for group, offsets_ns, parity in _frames_of_worlds(state, batch, last_seen_ns):
-        for sensor in group.world_frames.values():
-            held.append(sensor.offsets(offsets_ns))
-            sensor.find(state.fleet.clock_ns, offsets_ns, parity)
-    return held
+    copies: dict[tuple[str, int], NDArray[Any]] = {}
+    packets: list[Packet] = []
+    for stamp_ns, slot, name in job.pictures:
+        image = job.group.images[name]
+        picture = job.rooms.pop((name, stamp_ns), None)
+        if picture is None:
+            picture = job.buffers.copies[image.source].view(slot, 1)[0]
+            if not (borrow and image.gives_images):
+                key = (image.source, slot)  # cameras that take the same picture share the copy
+                picture = copies[key] if key in copies else copies.setdefault(key, np.array(picture))
+        header = {"stamp_ns": stamp_ns, "sequence": image.sequence, "sensor": name}
+        packet = image.config.packet(picture, **image.constants, **header)
+        packets.append(packet)
+        image.gives_images = isinstance(packet, Image)
+        image.sequence += 1
+    return packets
 
 
-def prepare_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> Hashable:
-    """Allocate what `find_in_worlds` needs for a batch, and return what its launches depend on."""
-    frames = _frames_of_worlds(state, batch, last_seen_ns)
-    for group, offsets_ns, _ in frames:
-        for sensor in group.world_frames.values():
-            sensor.offsets(offsets_ns)
-    return tuple((offsets_ns, parity) for _, offsets_ns, parity in frames)
+def _image_slots(group: RenderGroupState, image_slots: Sequence[int]) -> NDArray[Any]:
+    """Return where the images of the instants of all worlds go, shape [N K]."""
+    own = np.full(group.capacity, -1)
+    own[: len(image_slots)] = image_slots
+    first = group.picture_count * np.arange(group.world_count)[:, None]
+    return np.where(own < 0, -1, first + own).reshape(-1)
 
 
-def _frames_of_worlds(
-    state: State, batch: Batch, last_seen_ns: Sequence[int]
-) -> list[tuple[RenderGroupState, tuple[int, ...], int]]:
-    """Return for each group with frame sensors when they see a batch, from its end [ns], and the parity."""
+def _on_device(group: RenderGroupState, key: Hashable, slots: Callable[[], Any]) -> wp.array[int]:
+    """Return a list of slots on the device; the same key, which names a batch in flight, gives the same."""
+    if key not in group.slots:
+        if len(group.slots) >= _SLOT_LISTS_MAX:
+            del group.slots[next(iter(group.slots))]
+        group.slots[key] = wp.array(np.array(slots(), dtype=np.int32), dtype=int, device=group.device)
+    return group.slots[key]
+
+
+class WorldFrames(NamedTuple):
+    """What the frame sensors of a group see of a batch in many worlds."""
+
+    group: RenderGroupState
+    offsets_ns: tuple[int, ...]
+    """From the end of the batch to the instant before it and to those within it [ns]."""
+    parity: int
+    """Which of the two states of the sensors is the present one."""
+
+
+def plan_world_frames(state: State, batch: Batch) -> list[WorldFrames]:
+    """Return what frame sensors see of a batch in many worlds; groups that do are in their other state then.
+
+    What they need on the device is allocated.
+    """
     begin_ns, end_ns = batch.until_ns - sum(batch.elapsed_ns), batch.until_ns
     found = []
     for index, group in enumerate(state.groups):
+        seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
         if group.world_frames:
-            seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
-            last_ns = last_seen_ns[index] + begin_ns - end_ns
-            found.append((group, (last_ns, *seen), group.parity))
+            offsets_ns = (batch.last_seen_ns[index] + begin_ns - end_ns, *seen)
+            found.append(WorldFrames(group, offsets_ns, group.parity))
+            for sensor in group.world_frames.values():
+                sensor.offsets(offsets_ns)
+        if seen:
+            group.parity = 1 - group.parity
     return found
 
 
-def turn_parities(state: State, batch: Batch) -> None:
-    """Note that groups which saw a frame are in the other of their two states."""
-    for index, group in enumerate(state.groups):
-        if any(index in boundary.groups for boundary in batch.boundaries):
-            group.parity = 1 - group.parity
+def find_in_worlds(state: State, frames: Sequence[WorldFrames]) -> list[object]:
+    """Let the frame sensors of many worlds see what was rendered; launches only.
+
+    The clocks of the worlds are at the end of the batch. What is returned has to be kept by a graph of these
+    launches.
+    """
+    held: list[object] = []
+    for group, offsets_ns, parity in frames:
+        for sensor in group.world_frames.values():
+            held.append(sensor.offsets(offsets_ns))
+            sensor.find(state.worlds.clock_ns, offsets_ns, parity)
+    return held

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined"
+# mypy: disable-error-code="attr-defined,index,misc"
 """What users hand to many worlds: commands, seeds and masks, from the host or on the device."""
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from neurosim_core.frames import as_rows, normalised
 from neurosim_core.runtime.cuda import Fence, HostInput
 
 
@@ -88,8 +89,37 @@ def check_rows(rows: Any, out: Any, name: str) -> None:
         raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
 
 
+def checked_rows(value: Any, out: Any, name: str) -> Any:
+    """Return rows for an array of the device, on the device, float64; quaternions have unit length then."""
+    given, is_orientation = as_device_array(value, out.device), name == "orientation"
+    if given is None:
+        on_host = as_rows(value, name=name, count=out.shape[0], width=out.shape[1])
+        on_host = normalised(on_host) if is_orientation else on_host
+        return wp.array(on_host, dtype=wp.float64, device=out.device)
+    check_rows(given, out, name)
+    rows = wp.zeros(out.shape, dtype=wp.float64, device=out.device)
+    wp.utils.array_cast(given, rows)
+    if is_orientation:
+        wp.launch(_normalise, dim=rows.shape[0], outputs=[rows], device=out.device)
+    return rows
+
+
+@wp.kernel(enable_backward=False)
+def _normalise(
+    # In/out:
+    orientation: wp.array2d[wp.float64],
+) -> None:
+    """Give quaternions unit length."""
+    world = wp.tid()
+    total = wp.float64(0.0)
+    for part in range(4):
+        total += orientation[world, part] * orientation[world, part]
+    for part in range(4):
+        orientation[world, part] = orientation[world, part] / wp.sqrt(total)
+
+
 def checked_mask(mask: Any, count: int, device: Any) -> Any:
-    """Return a mask of the right shape and type: an array of the device, or int32 on the host."""
+    """Return a mask of the right shape: an array of the device, of any of the types that it may have."""
     given = as_device_array(mask, device)
     kinds: tuple[Any, ...] = (wp.bool, wp.uint8, wp.int32)
     if given is None:
@@ -100,7 +130,9 @@ def checked_mask(mask: Any, count: int, device: Any) -> Any:
             f"mask must be bool, uint8 or int32 of shape [{count}], "
             f"got {getattr(given.dtype, '__name__', given.dtype)} of shape {list(given.shape)}"
         )
-    return (given != 0).astype(np.int32) if isinstance(given, np.ndarray) else given
+    if isinstance(given, np.ndarray):
+        return wp.array((given != 0).astype(np.int32), dtype=wp.int32, device=device)
+    return given
 
 
 def checked_seeds(seed: Any, count: int, device: Any) -> Any:

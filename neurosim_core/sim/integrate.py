@@ -16,15 +16,13 @@ from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sensors.sampler_checks import sample_packet
-from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
 from neurosim_core.vehicle import DynamicsError, Multirotor
-from neurosim_core.vehicle.host_vehicle import Vehicle
-from neurosim_core.vehicle.status import STATUS_COLLISION
+from neurosim_core.vehicle.arrays import STATUS_COLLISION, check_status
 
 logger = logging.getLogger(__name__)
 
@@ -103,13 +101,20 @@ def refuse_commands(model: Model) -> None:
 
 
 def plan_batch(
-    state: State, stretch: Sequence[Boundary], *, closed_loop: bool, begin_ns: int | None = None
+    state: State,
+    stretch: Sequence[Boundary],
+    *,
+    closed_loop: bool,
+    begin_ns: int | None = None,
+    last_seen_ns: Sequence[int] = (),
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
     It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
-    controller commands; otherwise the last command is held.
+    controller commands; otherwise the last command is held. Of many worlds `last_seen_ns` is for each group
+    the instant before the stretch, from its begin [ns], <= 0.
     """
+    closed_loop = closed_loop and state.path_controller is not None
     number, max_step_ns = state.launched_count, state.vehicle.max_step_ns
     at_ns = state.launched_ns if begin_ns is None else begin_ns
     elapsed_ns, pattern, step_count = [], [], 0
@@ -118,17 +123,17 @@ def plan_batch(
         elapsed_ns.append(span_ns)
         pattern.append((span_ns, boundary.control, boundary.samplers))
         step_count += -(-span_ns // max_step_ns)
-    commands = closed_loop and not isinstance(state.vehicle, Carrier)
     return Batch(
         boundaries=stretch,
         elapsed_ns=elapsed_ns,
         pattern=tuple(pattern),
         closed_loop=closed_loop,
         step_count=step_count,
-        command_count=sum(boundary.control for boundary in stretch) if commands else 0,
+        command_count=sum(boundary.control for boundary in stretch) if closed_loop else 0,
         number=number,
-        slot=number % state.render_backlog * (state.trace.states.shape[0] // state.render_backlog),
+        slot=number % state.render_backlog * (state.trace.arrays.states.shape[0] // state.render_backlog),
         wanted=state.wanted,
+        last_seen_ns=last_seen_ns,
         until_ns=at_ns,
     )
 
@@ -172,16 +177,16 @@ def integrate(state: State, batch: Batch) -> None:
         end = slot + count
         record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
         if isinstance(vehicle, Multirotor) and span_ns > 0:
-            trace.fly(vehicle, state.surfaces, state.fleet, slot, elapsed_ns, span_ns, count, **record)
+            trace.fly(vehicle, slot, elapsed_ns, span_ns, count, **record)
         else:
             if span_ns > 0:
                 vehicle.advance(span_ns)
-            trace.record(state.surfaces, state.fleet, slot, elapsed_ns + span_ns, **record)
+            trace.record(slot, elapsed_ns + span_ns, **record)
         slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
             taken[index] += 1
-        if batch.closed_loop and boundary.control and not isinstance(vehicle, Carrier):
+        if batch.closed_loop and boundary.control and state.path_controller is not None:
             state.path_controller.update(vehicle.arrays)
 
 
@@ -216,7 +221,7 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     state.counts["commands"] += batch.command_count
     _count_redone(state, sum(rows.redone[-1].tolist()))  # of few vehicles: ufuncs take ten times as long
     if any(status not in (0, int(STATUS_COLLISION)) for status in rows.status[-1].tolist()):
-        state.failure = _failure(state.vehicle)
+        state.failure = _failure(state)
         state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
     packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
     batch.until_ns = state.stamp_ns
@@ -224,7 +229,15 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]
-        state.last = _odometry(row, reached[-1])
+        state.last = Odometry(
+            stamp_ns=reached[-1],
+            sensor="odometry",
+            position=row[POSITION],
+            orientation=row[ORIENTATION],
+            velocity=row[VELOCITY],
+            body_rate=row[BODY_RATE],
+            rotor_speed=row[ROTOR_SPEED],
+        )
     return packets
 
 
@@ -237,26 +250,13 @@ def _count_redone(state: State, redone_count: int) -> None:
     state.counts["redone intervals"] = redone_count
 
 
-def _failure(vehicle: Vehicle) -> DynamicsError:
+def _failure(state: State) -> DynamicsError:
     """Return why a vehicle is held."""
     try:
-        vehicle.check()
+        check_status(state.vehicle.arrays)
     except DynamicsError as error:
         return error
     raise AssertionError("the status of a vehicle that is held does not change")
-
-
-def _odometry(row: Any, stamp_ns: int) -> Odometry:
-    """Return a row of a trace as the packet that `observe` gives."""
-    return Odometry(
-        stamp_ns=stamp_ns,
-        sensor="odometry",
-        position=row[POSITION],
-        orientation=row[ORIENTATION],
-        velocity=row[VELOCITY],
-        body_rate=row[BODY_RATE],
-        rotor_speed=row[ROTOR_SPEED],
-    )
 
 
 def _read_samplers(state: State, batch: Batch) -> list[Packet]:

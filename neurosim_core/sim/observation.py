@@ -43,7 +43,7 @@ class Observation:
     collided: wp.array[wp.int32]
     """1: the vehicle touched the scene in this step, or is held because it did; shape [N]."""
     status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `vehicle.status.STATUS_TERMS`, shape [N]."""
+    """0, or why a vehicle is held: index into `vehicle.arrays.STATUS_TERMS`, shape [N]."""
 
     @property
     def events(self) -> Mapping[str, Any]:
@@ -63,12 +63,12 @@ def make_observation(state: State, period: Period) -> Observation:
         )
     return Observation(
         state=arrays,
-        clock_ns=state.fleet.clock_ns,
+        clock_ns=state.worlds.clock_ns,
         frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
         images={name: picture for group in state.groups for name, picture in group.pictures.items()},
         fresh=frozenset(name for names in period.pictures for name in names),
         samples=samples,
-        collided=state.fleet.collided,
+        collided=state.worlds.collided,
         status=arrays.status,
     )
 

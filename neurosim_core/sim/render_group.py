@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""The device buffers of one render group, in all worlds; `render_job.py` takes batches through them.
+"""The device buffers of one render group, in all worlds; `cameras.py` takes batches through them.
 
 Several batches may be in flight. Each has a renderer of its own: what a batch saw stays until it has been
 read. Instants are [world, K] in this order in all arrays.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -48,7 +48,6 @@ from neurosim_core.sensors.base import (
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings, lens_tables
-from neurosim_core.sim.scene_table import SceneTable
 
 if TYPE_CHECKING:
     from neurosim_core.sensors.displacement import DisplacementRule
@@ -102,6 +101,7 @@ class BatchBuffers:
 class RenderGroupState:
     """The device buffers of one group, for batches of at most `capacity` instants."""
 
+    plan: RenderGroup
     device: str
     world_count: int
     capacity: int
@@ -109,16 +109,20 @@ class RenderGroupState:
     picture_count: int
     """M, the most pictures of one batch in each world."""
     rate: Rate
-    buffers: Sequence[BatchBuffers]
-    """One for each batch in flight."""
-    frames: dict[str, FrameSensor]
-    """The frame sensors, where packets go to the host."""
+    worlds: RenderWorlds
+    """Who is rendered together."""
+    times: RayTimes | None
+    """When rays are cast; None: at the instant."""
     images: dict[str, ImageChannel]
-    world_frames: dict[str, WorldFrameSensor]
+    buffers: Sequence[BatchBuffers] = ()
+    """One for each batch in flight."""
+    frames: dict[str, FrameSensor] = field(default_factory=dict)
+    """The frame sensors, where packets go to the host."""
+    world_frames: dict[str, WorldFrameSensor] = field(default_factory=dict)
     """The frame sensors, where results stay on the device."""
-    pictures: dict[str, Any]
+    pictures: dict[str, Any] = field(default_factory=dict)
     """The last picture of each image sensor, where they stay on the device: arrays [N, H, W, ...]."""
-    shared_pictures: dict[str, Any]
+    shared_pictures: dict[str, Any] = field(default_factory=dict)
     """What the renderer wrote, for image sensors whose last picture another one of the group replaces."""
     parity: int = 0
     """Which of the two states of `world_frames` is the present one."""
@@ -126,12 +130,10 @@ class RenderGroupState:
     """Position of the camera on the body in each world [m], vec3d, shape [N]."""
     q_BC: Any
     """Its orientation there, xyzw, quatd, shape [N]."""
-    lens_of_world: Any
-    """Which of its lenses a world has, int32, shape [N]."""
     offsets_ns: Any
-    """From an instant to its J rays [ns], device array; None: all are cast at the instant."""
+    """From an instant to its J rays [ns], device array; [0] where all are cast at the instant."""
     instants: Any
-    """0, 1, ... N K - 1: the instants in order."""
+    """0, 1, ... N K J - 1: the rows of the poses of a batch in order."""
     motions: wp.array[Motion] | None
     """Of the bodies; None: nothing moves but the vehicle."""
     slots: dict[Hashable, wp.array[int]] = field(default_factory=dict)
@@ -139,24 +141,10 @@ class RenderGroupState:
     its stream is not there yet for another, whose stream does not wait for it."""
     rule: DisplacementRule | None
     """Chooses the ticks that are rendered; None: all are."""
+    only_launches: bool
+    """See `RendererConfig.only_launches`."""
     make_room: MakeRoom | None
     """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
-
-
-class _Plan(NamedTuple):
-    """What the buffers of a group are made for."""
-
-    group: RenderGroup
-    model: Model
-    worlds: RenderWorlds
-    images: Mapping[str, ImageChannel]
-    capacity: int
-    picture_count: int
-    """As in `RenderGroupState`."""
-    times: RayTimes | None
-    motions: Any
-    seeds: Any
-    scenes: SceneTable
 
 
 def make_render_groups(
@@ -180,134 +168,153 @@ def make_render_groups(
             adaptive group, is not for many worlds.
     """
     groups: list[RenderGroupState] = []
-    for index, group in enumerate(model.groups if model.scene_on_device is not None else ()):
-        if not on_host and group.max_displacement_px is not None:
+    for index, plan in enumerate(model.groups if model.scene_on_device is not None else ()):
+        if not on_host and plan.max_displacement_px is not None:
             raise ValueError(
-                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses "
+                f"max_displacement_px of {', '.join(plan.frame_sensors)} is for single runs: it chooses "
                 "what to render for one vehicle, on the host"
             )
         capacity = model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count
-        images = _image_channels(group, model.config.sensors, on_host=on_host)
-        bodies = model.config.bodies
-        plan = _Plan(
-            group=group,
-            model=model,
-            worlds=_render_worlds(group, worlds, model.device),
-            images=images,
-            capacity=capacity,
-            picture_count=_picture_count(group, images, capacity) if on_host else 1,
-            times=_ray_times(group, model.scene_on_device),
-            motions=upload_motions(bodies, model.device, world_count=len(worlds.seeds)) if bodies else None,
-            seeds=seeds,
-            scenes=worlds.scenes,
-        )
-        groups.append(_make_group(plan, worlds, history, in_flight, make_room, on_host=on_host))
+        sensors = {name: model.config.sensors[name] for name in plan.frame_sensors}
+        frames = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, FrameSensorConfig)}
+        rooms = {  # checked before anything is allocated
+            name: 0 if on_host else sensor.world_capacity(len(worlds.seeds), worlds.event_capacity)
+            for name, sensor in frames.items()
+        }
+        group = _make_group(plan, model, worlds, capacity, make_room, on_host=on_host)
+        group.buffers = [
+            _make_buffers(group, model, worlds, seeds, on_host=on_host) for _ in range(in_flight)
+        ]
+        if on_host:
+            seed = worlds.seeds[0]
+            group.frames = _make_frames(group, model, frames, history, in_flight=in_flight, seed=seed)
+        else:
+            group.pictures, group.shared_pictures = _picture_arrays(group)
+            group.world_frames = _make_world_frames(group, frames, worlds, rooms)
+        groups.append(group)
     return groups
 
 
 def _make_group(
-    plan: _Plan,
+    plan: RenderGroup,
+    model: Model,
     worlds: WorldSettings,
-    history: Any,
-    in_flight: int,
+    capacity: int,
     make_room: MakeRoom | None,
     *,
     on_host: bool,
 ) -> RenderGroupState:
-    group, model, count, device = plan.group, plan.model, plan.worlds.count, plan.model.device
-    seeing = {name: model.config.sensors[name] for name in group.frame_sensors}
-    sensors = {name: sensor for name, sensor in seeing.items() if isinstance(sensor, FrameSensorConfig)}
-    rooms = {  # checked before anything is allocated
-        name: 0 if on_host else sensor.world_capacity(count, worlds.event_capacity)
-        for name, sensor in sensors.items()
-    }
-    buffers = [_make_buffers(plan, on_host=on_host) for _ in range(in_flight)]
-    first = buffers[0]
-    pictures, shared = ({}, {}) if on_host else _picture_arrays(plan.images, first.renderer, first.processes)
-    p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
-    rule = _make_rule(group, model.scene_on_device, p_BC, q_BC, plan.motions)
-    frames, world_frames = {}, {}
-    for name, sensor in sensors.items():
-        if on_host:
-            frames[name] = sensor.make(
-                FrameContext(
-                    name=name,
-                    width=group.lens.width,
-                    height=group.lens.height,
-                    lens=group.lens,
-                    device=device,
-                    in_flight=in_flight,
-                    seed=worlds.seeds[0],
-                    scene=model.scene_on_device,
-                    motions=plan.motions,
-                    history=history,
-                    p_BC=p_BC,
-                    q_BC=q_BC,
-                )
-            )
-        else:  # they read log radiance [N, K, H W]
-            seen: Any = first.renderer.log_radiance
-            shape = (count, plan.capacity, seen.shape[1] * seen.shape[2])
-            world_frames[name] = sensor.make_worlds(
-                WorldFrameContext(
-                    name=name,
-                    configs=[rig[name] for rig in worlds.rigs],
-                    frames=seen.reshape(shape),
-                    capacity=rooms[name],
-                    seeds=worlds.seeds,
-                    ordered=worlds.ordered,
-                )
-            )
-    offsets_ns = None if plan.times is None else plan.times.offsets_ns
+    """Return a group without buffers and frame sensors."""
+    device, count, scene, bodies = model.device, len(worlds.seeds), model.scene_on_device, model.config.bodies
+    images = _image_channels(plan, model.config.sensors, on_host=on_host)
+    times = _ray_times(plan, scene)
+    offsets_ns = [0] if times is None else times.offsets_ns
+    row_count = count * capacity * len(offsets_ns)
+    motions = upload_motions(bodies, device, world_count=count) if bodies else None
+    p_BC, q_BC = wp.vec3d(*plan.mount.position_m), wp.quatd(*plan.mount.optical_quaternion())
     return RenderGroupState(
+        plan=plan,
         device=device,
         world_count=count,
-        capacity=plan.capacity,
-        picture_count=plan.picture_count,
-        rate=group.rate,
-        buffers=buffers,
-        frames=frames,
-        images=dict(plan.images),
-        world_frames=world_frames,
-        pictures=pictures,
-        shared_pictures=shared,
+        capacity=capacity,
+        picture_count=_picture_count(plan, images, capacity) if on_host else 1,
+        rate=plan.rate,
+        worlds=_render_worlds(plan, worlds, device),
+        times=times,
+        images=images,
         p_BC=wp.full(count, p_BC, dtype=wp.vec3d, device=device),
         q_BC=wp.full(count, q_BC, dtype=wp.quatd, device=device),
-        lens_of_world=plan.worlds.lens_of_world,
-        offsets_ns=None if offsets_ns is None else wp.array(offsets_ns, dtype=wp.int64, device=device),
-        instants=wp.array(np.arange(first.stamps.shape[0], dtype=np.int32), dtype=int, device=device),
-        motions=plan.motions,
-        rule=rule,
+        offsets_ns=wp.array(offsets_ns, dtype=wp.int64, device=device),
+        instants=wp.array(np.arange(row_count, dtype=np.int32), dtype=int, device=device),
+        motions=motions,
+        rule=_make_rule(plan, scene, p_BC, q_BC, motions),
+        only_launches=model.config.renderer.only_launches,
         make_room=make_room,
     )
 
 
-def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
+def _make_frames(
+    group: RenderGroupState,
+    model: Model,
+    sensors: Mapping[str, FrameSensorConfig],
+    history: Any,
+    *,
+    in_flight: int,
+    seed: int,
+) -> dict[str, FrameSensor]:
+    """Return the frame sensors of one world whose packets go to the host."""
+    lens, mount = group.plan.lens, group.plan.mount
+    return {
+        name: sensor.make(
+            FrameContext(
+                name=name,
+                width=lens.width,
+                height=lens.height,
+                lens=lens,
+                device=group.device,
+                in_flight=in_flight,
+                seed=seed,
+                scene=model.scene_on_device,
+                motions=group.motions,
+                history=history,
+                p_BC=wp.vec3d(*mount.position_m),
+                q_BC=wp.quatd(*mount.optical_quaternion()),
+            )
+        )
+        for name, sensor in sensors.items()
+    }
+
+
+def _make_world_frames(
+    group: RenderGroupState,
+    sensors: Mapping[str, FrameSensorConfig],
+    worlds: WorldSettings,
+    rooms: Mapping[str, int],
+) -> dict[str, WorldFrameSensor]:
+    """Return the frame sensors of many worlds, which read log radiance [N, K, H W]."""
+    seen: Any = group.buffers[0].renderer.log_radiance
+    return {
+        name: sensor.make_worlds(
+            WorldFrameContext(
+                name=name,
+                configs=[rig[name] for rig in worlds.rigs],
+                frames=seen.reshape((group.world_count, group.capacity, seen.shape[1] * seen.shape[2])),
+                capacity=rooms[name],
+                seeds=worlds.seeds,
+                ordered=worlds.ordered,
+            )
+        )
+        for name, sensor in sensors.items()
+    }
+
+
+def _make_buffers(
+    group: RenderGroupState, model: Model, worlds: WorldSettings, seeds: Any, *, on_host: bool
+) -> BatchBuffers:
     """Allocate what one batch writes; constants and sources of the images are set."""
-    device, instant_count = plan.model.device, plan.worlds.count * plan.capacity
     renderer = make_renderer(
-        plan.model.scene_on_device,
-        plan.group.lens,
-        outputs=plan.group.outputs,
-        instant_count=plan.capacity,
-        image_count=plan.worlds.count * plan.picture_count,
-        worlds=plan.worlds,
-        times=plan.times,
+        model.scene_on_device,
+        group.plan.lens,
+        outputs=group.plan.outputs,
+        instant_count=group.capacity,
+        image_count=group.world_count * group.picture_count,
+        worlds=group.worlds,
+        times=group.times,
     )
     processes: dict[str, PictureProcess] = {}
-    for name, image in plan.images.items():
+    for name, image in group.images.items():
         context = PictureContext(
             name=name,
             source=getattr(renderer, image.output),
             sources={output: getattr(renderer, output) for output in image.config.outputs},
-            lenses=plan.worlds.lenses,
-            lens_of_world=plan.worlds.lens_of_world,
-            scenes=[model.scene_on_device for model in plan.scenes.models],
-            scene_of_world=plan.scenes.scene,
-            motions=plan.motions,
-            times=plan.times,
-            stride=plan.capacity,
-            seeds=plan.seeds,
+            lenses=group.worlds.lenses,
+            lens_of_world=group.worlds.lens_of_world,
+            scenes=[scene.scene_on_device for scene in worlds.scenes.models],
+            scene_of_world=worlds.scenes.scene,
+            motions=group.motions,
+            times=group.times,
+            stride=group.capacity,
+            seeds=seeds,
         )
         image.constants = image.config.constants(context)
         if (process := image.config.make_process(context)) is not None:
@@ -315,21 +322,20 @@ def _make_buffers(plan: _Plan, *, on_host: bool) -> BatchBuffers:
             image.source = f"{name}/processed"
     sources = {
         image.source: processes[name].picture if name in processes else getattr(renderer, image.output)
-        for name, image in plan.images.items()
+        for name, image in group.images.items()
     }
-    body_count = len(plan.model.config.bodies)
-    rows = instant_count * (1 if plan.times is None else len(plan.times.offsets_ns))
-    timed_rows = rows if body_count or processes else 0
-    slots = None if plan.group.max_displacement_px is None else wp.zeros(plan.capacity, int, device=device)
+    device, body_count, row_count = group.device, len(model.config.bodies), group.instants.shape[0]
+    timed_rows = row_count if body_count or processes else 0
+    adaptive = group.plan.max_displacement_px is not None
     return BatchBuffers(
         renderer=renderer,
         copies={source: HostCopy(array) for source, array in sources.items()} if on_host else {},
         processes=processes,
-        p_WC=wp.zeros(rows, dtype=wp.vec3, device=device),
-        q_WC=wp.zeros(rows, dtype=wp.quat, device=device),
+        p_WC=wp.zeros(row_count, dtype=wp.vec3, device=device),
+        q_WC=wp.zeros(row_count, dtype=wp.quat, device=device),
         stamps=wp.zeros((timed_rows, 1), dtype=wp.int64, device=device),
-        bodies=make_body_poses(rows, body_count, device) if body_count else None,
-        chosen_slots=None if slots is None else HostInput(slots),
+        bodies=make_body_poses(row_count, body_count, device) if body_count else None,
+        chosen_slots=HostInput(wp.zeros(group.capacity, int, device=device)) if adaptive else None,
     )
 
 
@@ -374,13 +380,12 @@ def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
     return ray_times_of(group.timing, group.lens, scene)
 
 
-def _picture_arrays(
-    images: Mapping[str, ImageChannel], renderer: Renderer, processes: Mapping[str, PictureProcess]
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def _picture_arrays(group: RenderGroupState) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return where the last picture of each image sensor is, and what has to be copied there from where."""
+    images, buffers = group.images, group.buffers[0]
     fastest_hz = max((image.rate.rate_hz for image in images.values()), default=0.0)
-    pictures = {name: getattr(renderer, image.output) for name, image in images.items()}
-    pictures |= {name: process.picture for name, process in processes.items()}
+    pictures = {name: getattr(buffers.renderer, image.output) for name, image in images.items()}
+    pictures |= {name: process.picture for name, process in buffers.processes.items()}
     shared = {n: pictures[n] for n, image in images.items() if image.rate.rate_hz < fastest_hz}
     return pictures | {name: wp.empty_like(array) for name, array in shared.items()}, shared
 

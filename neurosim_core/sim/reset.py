@@ -1,9 +1,7 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type"
-"""Where vehicles begin, and the kernels that put them there and take masks and rows of any type."""
+"""Where vehicles begin, and the kernels that put them there."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -11,8 +9,8 @@ from numpy.typing import NDArray
 
 from neurosim_core.frames import normalised
 from neurosim_core.sim.scene_table import SceneTable
-from neurosim_core.sim.trace import Fleet
-from neurosim_core.vehicle.status import STATUS_OK
+from neurosim_core.sim.trace import WorldArrays
+from neurosim_core.vehicle.arrays import STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,77 +53,31 @@ def restart(
     mask: wp.array[wp.int32],
     start: Start,
     # Out:
-    fleet: Fleet,
+    worlds: WorldArrays,
 ) -> None:
     """Put the vehicles of some worlds where they begin, with rotors at hover, at time 0."""
     world = wp.tid()
     if mask[world] == 0:
         return
-    fleet.position[world] = _row3(start.position, world)
-    fleet.velocity[world] = _row3(start.velocity, world)
-    fleet.orientation[world] = wp.quatd(
+    vehicles = worlds.vehicles
+    vehicles.position[world] = _row3(start.position, world)
+    vehicles.velocity[world] = _row3(start.velocity, world)
+    vehicles.orientation[world] = wp.quatd(
         start.orientation[world, 0],
         start.orientation[world, 1],
         start.orientation[world, 2],
         start.orientation[world, 3],
     )
-    fleet.body_rate[world] = _row3(start.body_rate, world)
-    for rotor in range(fleet.rotor_speed.shape[1]):
-        fleet.rotor_speed[world, rotor] = hover_rad_s
-        fleet.rotor_speed_command[world, rotor] = hover_rad_s
-    fleet.stamp_ns[world] = wp.int64(0)
-    fleet.status[world] = STATUS_OK
-    fleet.redone_count[world] = wp.int64(0)
-    fleet.evaluation_count[world] = wp.int64(0)
-    fleet.clock_ns[world] = wp.int64(0)
-    fleet.collided[world] = 0
-
-
-@wp.kernel
-def normalise(
-    # In/out:
-    orientation: wp.array2d[wp.float64],
-) -> None:
-    """Give quaternions unit length."""
-    world = wp.tid()
-    total = wp.float64(0.0)
-    for part in range(4):
-        total += orientation[world, part] * orientation[world, part]
-    for part in range(4):
-        orientation[world, part] = orientation[world, part] / wp.sqrt(total)
-
-
-@wp.kernel
-def take_rows(
-    # In:
-    rows: wp.array2d[Any],
-    # Out:
-    rows_out: wp.array2d[wp.float64],
-) -> None:
-    """Copy numbers of any floating type."""
-    row, column = wp.tid()
-    rows_out[row, column] = wp.float64(rows[row, column])
-
-
-wp.overload(take_rows, {"rows": wp.array2d[wp.float32]})
-wp.overload(take_rows, {"rows": wp.array2d[wp.float64]})
-
-
-@wp.kernel
-def take_mask(
-    # In:
-    mask: wp.array[Any],
-    # Out:
-    mask_out: wp.array[wp.int32],
-) -> None:
-    """Copy a mask: not 0 is 1."""
-    world = wp.tid()
-    mask_out[world] = wp.where(wp.int32(mask[world]) != 0, 1, 0)
-
-
-wp.overload(take_mask, {"mask": wp.array[wp.bool]})
-wp.overload(take_mask, {"mask": wp.array[wp.uint8]})
-wp.overload(take_mask, {"mask": wp.array[wp.int32]})
+    vehicles.body_rate[world] = _row3(start.body_rate, world)
+    for rotor in range(vehicles.rotor_speed.shape[1]):
+        vehicles.rotor_speed[world, rotor] = hover_rad_s
+        vehicles.rotor_speed_command[world, rotor] = hover_rad_s
+    vehicles.stamp_ns[world] = wp.int64(0)
+    vehicles.status[world] = STATUS_OK
+    vehicles.redone_count[world] = wp.int64(0)
+    vehicles.evaluation_count[world] = wp.int64(0)
+    worlds.clock_ns[world] = wp.int64(0)
+    worlds.collided[world] = 0
 
 
 @wp.kernel

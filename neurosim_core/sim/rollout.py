@@ -19,7 +19,15 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
-from neurosim_core.sim.cameras import launch_cameras, plan_ahead, read_cameras
+from neurosim_core.sim.cameras import (
+    acquire_room,
+    disable_frame_sensors,
+    is_due,
+    launch_cameras,
+    pictures_due,
+    plan_ahead,
+    read_cameras,
+)
 from neurosim_core.sim.integrate import (
     Command,
     in_order,
@@ -30,10 +38,10 @@ from neurosim_core.sim.integrate import (
     set_command,
 )
 from neurosim_core.sim.model import Model, make_model
-from neurosim_core.sim.render_job import acquire_room, disable_frame_sensors, flush_frames, is_due, leave_out
 from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
 from neurosim_core.sim.state import Batch, PlannedStep, State, make_state
 from neurosim_core.sim.step import launch, read
+from neurosim_core.vehicle.arrays import read_state
 
 
 def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = None) -> Iterator[Packet]:
@@ -262,9 +270,10 @@ def skip_batch(model: Model, state: State, batch: Batch) -> int:
     for index, group in enumerate(state.groups):
         disable_frame_sensors(group, batch.wanted)
         stamps = [b.stamp_ns for b in batch.boundaries if index in b.groups]
-        due = [stamp_ns for stamp_ns in stamps if is_due(group, stamp_ns, batch.wanted)]
-        leave_out(group, due, batch.wanted)
-        count += len(due)
+        for stamp_ns in stamps:
+            count += is_due(group, stamp_ns, batch.wanted)
+            for name in pictures_due(group, stamp_ns, batch.wanted):
+                group.images[name].sequence += 1
     state.rendered_count += 1
     return count
 
@@ -292,15 +301,8 @@ def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
 def observe(state: State) -> Odometry:
     """Return the true state of the vehicle at the end of what was flown, as a packet named `odometry`."""
     if state.last is None:
-        now = state.vehicle.state
-        state.last = Odometry(
-            sensor="odometry",
-            position=now.position[0],
-            orientation=now.orientation[0],
-            velocity=now.velocity[0],
-            body_rate=now.body_rate[0],
-            rotor_speed=now.rotor_speed[0],
-        )
+        now = read_state(state.vehicle.arrays)._asdict()
+        state.last = Odometry(sensor="odometry", **{name: rows[0] for name, rows in now.items()})
     return state.last
 
 
@@ -349,7 +351,8 @@ def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool =
 
 def finish(state: State) -> list[Packet]:
     """Return the packets whose windows have begun and not ended; for the end of a run."""
-    return [packet for group in state.groups for packet in flush_frames(group, until_ns=state.stamp_ns)]
+    sensors = [sensor for group in state.groups for sensor in group.frames.values()]
+    return [packet for sensor in sensors for packet in sensor.flush(until_ns=state.stamp_ns)]
 
 
 def _check_all_read(state: State) -> None:

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.render.config import CandidateListConfig
-from neurosim_core.render.render_terms import RenderTerms
+from neurosim_core.render.kernel_data import RenderTerms, SceneData
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.freespace import DistanceField
 from neurosim_core.sim.model import Model, find_device, make_model, refit
 
@@ -126,8 +125,19 @@ def make_scene_table(
         raise ValueError(
             f"scene_of_world must be in [0, {len(made) - 1}], got {chosen.min()} to {chosen.max()}"
         )
-    device = made[0].device
-    arrays = [m.scene_on_device for m in made if isinstance(m.scene_on_device, SceneArrays)]
+    return _table(made, chosen, own_light=own_light)
+
+
+def single_scene(model: Model) -> SceneTable:
+    """Return the table of one world in the scene of a model."""
+    return _table((model,), np.zeros(1, dtype=np.int64), own_light=False)
+
+
+def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) -> SceneTable:
+    """Bring what worlds need of their scenes to the device; `chosen` is the scene of each world."""
+    count = len(chosen)
+    device = models[0].device
+    arrays = [m.scene_on_device for m in models if isinstance(m.scene_on_device, SceneArrays)]
     terms = None
     if arrays:
         terms = RenderTerms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
@@ -141,30 +151,14 @@ def make_scene_table(
         completed = tuple(completed[index] for index in chosen)
         row = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     return SceneTable(
-        models=made,
+        models=models,
         scene_of_world=tuple(int(scene) for scene in chosen),
-        fields=wp.array([m.free_space.arrays for m in made], dtype=DistanceField, device=device),
+        fields=wp.array([m.free_space.arrays for m in models], dtype=DistanceField, device=device),
         scene=scene,
         row=row,
         data=wp.array(list(completed), dtype=SceneData, device=device) if completed else None,
         completed=completed,
         terms=terms,
-    )
-
-
-def single_scene(model: Model) -> SceneTable:
-    """Return the table of one world in the scene of a model."""
-    arrays = model.scene_on_device
-    scene: Any = wp.zeros(1, dtype=int, device=model.device)
-    return SceneTable(
-        models=(model,),
-        scene_of_world=(0,),
-        fields=wp.array([model.free_space.arrays], dtype=DistanceField, device=model.device),
-        scene=scene,
-        row=scene,
-        data=None,
-        completed=(),
-        terms=arrays.terms if isinstance(arrays, SceneArrays) else None,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
@@ -15,7 +14,6 @@ TICKS_PER_INSTANT = 4
 """How many times as many ticks a batch takes of a group that renders only some of them."""
 PERIOD_COUNT_MAX = 4096
 """Most periods that are remembered; where clocks hardly ever tick together, no two are alike."""
-_KIND_COUNT_MAX = 64
 _COMMON_MAX_NS = 10**13
 
 
@@ -34,6 +32,11 @@ class Schedule:
     """Indices of the groups that render only some of their ticks."""
     poses: tuple[Rate, ...] = ()
     """Clocks at which nothing is due but the pose is recorded, for rays with times of their own."""
+
+    @property
+    def clocks(self) -> tuple[Rate, ...]:
+        """All of them."""
+        return (self.control, *self.samplers, *self.groups, *self.poses)
 
     def ticks_per_batch(self, group: int) -> int:
         """Return the most ticks of a group in one batch."""
@@ -66,8 +69,7 @@ def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
 def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:
     """Return the boundaries in (start_ns, end_ns] in order of time; the last is always at `end_ns`."""
     marks = {end_ns: 0}
-    clocks = (schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses)
-    for place, rate in enumerate(clocks):
+    for place, rate in enumerate(schedule.clocks):
         mark = 1 << place
         for stamp_ns in rate.stamps(start_ns + 1, end_ns + 1):
             marks[stamp_ns] = marks.get(stamp_ns, 0) | mark
@@ -77,18 +79,12 @@ def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]
     ]
 
 
-def boundary_count_max(schedule: Schedule) -> int:
-    """Return a bound on the number of boundaries in any batch."""
-    rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
-    shortest = schedule.groups or (schedule.control,)
-    span_s = min(schedule.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
-    return sum(int(span_s * rate.rate_hz) + 2 for rate in rates) + 1
-
-
-def boundary_count_within(schedule: Schedule, span_ns: int) -> int:
-    """Return a bound on the number of boundaries in any stretch of a length."""
-    rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
-    return sum(int(span_ns * 1e-9 * rate.rate_hz) + 2 for rate in rates)
+def boundary_count_max(schedule: Schedule, span_s: float | None = None) -> int:
+    """Return a bound on the number of boundaries in any stretch of a length [s]; None: in any batch."""
+    if span_s is None:
+        shortest = schedule.groups or (schedule.control,)
+        span_s = min(schedule.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
+    return sum(int(span_s * rate.rate_hz) + 2 for rate in schedule.clocks) + 1
 
 
 def _tick_after(rate: Rate, stamp_ns: int, count: int) -> int:
@@ -140,9 +136,8 @@ class Timetable:
         self._schedule = schedule
         self._images = images
         self._periods: dict[int, Period] = {}
-        rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
-        rates += [rate for cameras in images for rate in cameras.values()]
-        self.common_ns = _common_period_ns(rates)
+        rates = [rate for cameras in images for rate in cameras.values()]
+        self.common_ns = _common_period_ns([*schedule.clocks, *rates])
 
     def at(self, begin_ns: int) -> Period:
         """Return the period that begins at a tick of the control clock."""
@@ -162,26 +157,13 @@ class Timetable:
         )
 
     def instant_count_max(self) -> int:
-        """Return the most instants of any group in a period; a bound where periods are of many kinds."""
-        period_s = 1.0 / self._schedule.control.rate_hz
-        groups = range(len(self._schedule.groups))
-        if 0 < self.common_ns <= _KIND_COUNT_MAX * 1e9 * period_s:
-            return max([1, *(len(kind.offsets_ns(g)) - 1 for kind in self._kinds() for g in groups)])
-        return max((int(period_s * rate.rate_hz) + 2 for rate in self._schedule.groups), default=1)
+        """Return the most instants of any group in a period, at least 1."""
+        control = self._schedule.control
+        return max((rate.ticks_within(control) for rate in self._schedule.groups), default=1) or 1
 
     def boundary_count_max(self) -> int:
         """Return a bound on the number of boundaries in a period."""
-        period_s = 1.0 / self._schedule.control.rate_hz
-        rates = (*self._schedule.samplers, *self._schedule.groups, *self._schedule.poses)
-        return 1 + sum(int(period_s * rate.rate_hz) + 2 for rate in rates)
-
-    def _kinds(self) -> Iterator[Period]:
-        """Yield all periods until all clocks tick together."""
-        now_ns = 0
-        while now_ns < self.common_ns:
-            period = self.at(now_ns)
-            yield period
-            now_ns += period.duration_ns
+        return boundary_count_max(self._schedule, 1.0 / self._schedule.control.rate_hz)
 
     def _make(self, begin_ns: int) -> Period:
         control = self._schedule.control

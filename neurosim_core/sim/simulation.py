@@ -21,16 +21,21 @@ from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
-from neurosim_core.frames import as_rows, normalised
 from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
-from neurosim_core.sim.carrier import Carrier
-from neurosim_core.sim.inputs import as_device_array, check_rows, checked_mask, checked_seeds, make_seeds
+from neurosim_core.sim.inputs import (
+    as_device_array,
+    check_rows,
+    checked_mask,
+    checked_rows,
+    checked_seeds,
+    make_seeds,
+)
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, make_observation
 from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
-from neurosim_core.sim.reset import begin_of_paths, normalise, take_mask, take_rows, take_seeds
+from neurosim_core.sim.reset import Start, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, make_state, reset_vehicles
@@ -133,8 +138,7 @@ class Simulation:
             ),
         )
         self._mask = wp.ones(worlds, dtype=wp.int32, device=self.device)
-        self._begin = begin_of_paths(self._scenes)
-        self._as_configured = set(self._begin)
+        self._begin = {name: wp.clone(getattr(self._state.start, name)) for name in Start.vars}
         self._warned = False
         self._observations: dict[Period, Observation] = {}
         self._now_ns: int | None = None
@@ -176,7 +180,7 @@ class Simulation:
         """
         for group, plan in zip(self._state.groups, self._model.groups, strict=True):
             if camera in plan.names:
-                return group.p_BC, group.q_BC, group.lens_of_world
+                return group.p_BC, group.q_BC, group.worlds.lens_of_world
         raise ValueError(f"there is no camera {camera!r}")
 
     def light(self, name: str) -> Any:
@@ -288,14 +292,21 @@ class Simulation:
             self._check_partial()
         seeds = None if seed is None else checked_seeds(seed, self.count, self.device)
         chosen = None if mask is None else checked_mask(mask, self.count, self.device)
-        start = self._checked_start(**given)
-        self._take_mask(chosen)  # all is checked: nothing is half done
+        state, period = self._state, self._timetable.first()
+        begin = {
+            name: self._begin[name] if value is None else checked_rows(value, self._begin[name], name)
+            for name, value in given.items()
+        }
+        if chosen is None:  # all is checked: nothing is half done
+            self._mask.fill_(1)
+        else:
+            wp.utils.array_cast(chosen, self._mask)
         if seeds is not None:
             self._reseed(seeds)
-        self._take_start(start)
-        state, period = self._state, self._timetable.first()
+        for name, rows in begin.items():
+            wp.copy(getattr(state.start, name), rows)
         reset_vehicles(self._model, state, self._mask)
-        wp.copy(state.fleet.active, self._mask)  # sensors of the others do not see this
+        wp.copy(state.worlds.active, self._mask)  # sensors of the others do not see this
         now_ns = state.launched_ns
         self._launch_reset(state, period)
         state.launched_ns = 0 if mask is None else now_ns
@@ -347,7 +358,7 @@ class Simulation:
         self._require_reset()
         if periods < 1:
             raise ValueError(f"periods must be 1 at least, got {periods}")
-        if not isinstance(self._state.vehicle, Carrier):  # after a reset or a step there is no command of it
+        if self._state.path_controller is not None:  # after a reset or a step there is no command of it
             self._state.path_controller.update(self._state.vehicle.arrays)
         for _ in range(periods):
             observation = self._advance(closed_loop=True)
@@ -364,8 +375,10 @@ class Simulation:
         period = self._timetable.at(now_ns)
         state = self._state
         stretch = [b._replace(stamp_ns=b.stamp_ns + now_ns) for b in period.boundaries]
-        batch = plan_batch(state, stretch, closed_loop=closed_loop, begin_ns=now_ns)
-        launch(self._model, state, batch, last_seen_ns=period.last_seen_ns)
+        batch = plan_batch(
+            state, stretch, closed_loop=closed_loop, begin_ns=now_ns, last_seen_ns=period.last_seen_ns
+        )
+        launch(self._model, state, batch)
         self._now_ns = now_ns + period.duration_ns
         self.duration_ns = period.duration_ns
         if state.graphs.dropped_count > 0 and not self._warned:
@@ -385,7 +398,7 @@ class Simulation:
         for group in state.groups:
             for sensor in group.world_frames.values():
                 sensor.begin(self._mask, group.parity)
-        state.fleet.active.fill_(1)
+        state.worlds.active.fill_(1)
 
     def _observe(self, period: Period) -> Observation:
         """Return the views of what a period yields: the same arrays each time."""
@@ -401,53 +414,11 @@ class Simulation:
         buffer = command_buffer(self._model, self._state, mode)
         on_device = as_device_array(commands, self.device)
         if on_device is not None:
-            self._take_rows(on_device, buffer.array, "commands")
+            check_rows(on_device, buffer.array, "commands")
+            wp.utils.array_cast(on_device, buffer.array)
         else:
             buffer.write(checked_command(self._model, self._state, commands, mode))
         self._state.command_mode = mode
-
-    def _take_rows(self, rows: Any, out: Any, name: str) -> None:
-        check_rows(rows, out, name)
-        wp.launch(take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
-
-    def _take_mask(self, mask: Any) -> None:
-        if mask is None:
-            self._mask.fill_(1)
-        elif isinstance(mask, np.ndarray):
-            self._mask.assign(mask)
-        else:
-            self._launch(take_mask, [mask], [self._mask])
-
-    def _checked_start(self, **given: Any) -> dict[str, Any]:
-        """Return where vehicles are to begin: arrays of the device, rows on the host, None: by default."""
-        checked: dict[str, Any] = {}
-        for name, value in given.items():
-            array = getattr(self._state.start, name)
-            if (on_device := as_device_array(value, self.device)) is not None:
-                check_rows(on_device, array, name)
-                checked[name] = on_device
-            elif value is None:
-                checked[name] = None
-            else:
-                rows = as_rows(value, name=name, count=self.count, width=array.shape[1])
-                checked[name] = normalised(rows) if name == "orientation" else rows
-        return checked
-
-    def _take_start(self, checked: Mapping[str, Any]) -> None:
-        for name, value in checked.items():
-            array = getattr(self._state.start, name)
-            if value is None:
-                if name not in self._as_configured:
-                    array.assign(self._begin[name])
-                    self._as_configured.add(name)
-                continue
-            self._as_configured.discard(name)
-            if isinstance(value, np.ndarray):
-                array.assign(value)
-                continue
-            self._take_rows(value, array, name)
-            if name == "orientation":
-                self._launch(normalise, [], [array])
 
     def _check_partial(self) -> None:
         if self._now_ns is None:
@@ -463,15 +434,13 @@ class Simulation:
 
     def _reseed(self, seeds: Any) -> None:
         """Give the worlds of the mask other seeds."""
-        self._launch(take_seeds, [self._mask, seeds], [self._state.seeds])
+        inputs, outputs = [self._mask, seeds], [self._state.seeds]
+        wp.launch(take_seeds, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
         sensors = [sensor for group in self._state.groups for sensor in group.world_frames.values()]
         if any(sensor.terms for sensor in sensors):
             worlds = set(np.flatnonzero(self._mask.numpy()).tolist())
             for sensor in sensors:
                 sensor.seed(self.seeds, worlds)
-
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _one_vehicle(
@@ -479,7 +448,9 @@ def _one_vehicle(
 ) -> SimulationConfig:
     chosen = config if isinstance(config, SimulationConfig) else load_config(config)
     if len(chosen.vehicles) > 1:
-        raise ValueError(f"a world holds one vehicle, got {', '.join(chosen.vehicles)}")
+        raise ValueError(
+            f"a world holds one vehicle, got {', '.join(chosen.vehicles)}: `neurosim serve` flies several"
+        )
     chosen = chosen.of(next(iter(chosen.vehicles)))
     return chosen if device is None else chosen.model_copy(update={"device": device})
 

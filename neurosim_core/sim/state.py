@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -25,26 +25,24 @@ from neurosim_core.sensors.base import (
     StateSensorConfig,
 )
 from neurosim_core.sensors.sampler_checks import make_sampler
-from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
-from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, restart
 from neurosim_core.sim.scene_table import single_scene
-from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
-from neurosim_core.sim.trace import Fleet, Trace, make_surfaces
+from neurosim_core.sim.schedule import Boundary, boundary_count_max
+from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.config import VehicleContext
 from neurosim_core.vehicle.host_vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from neurosim_core.sim.cameras import RenderJob
+
 _IN_FLIGHT_ON_CUDA = 5
 """With three, one batch is flown and one rendered while the host reads a third."""
-_FLEET_ARRAYS = (
-    "position", "velocity", "orientation", "body_rate", "rotor_speed", "rotor_speed_command", "stamp_ns",
-    "status", "redone_count", "evaluation_count",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +79,16 @@ class Batch:
     """Slot of the first boundary in the trace, and of its first sample in the arrays of each sampler."""
     wanted: frozenset[str]
     """Cameras that look."""
+    last_seen_ns: Sequence[int]
+    """Of many worlds, for each group the instant before the batch, from its begin [ns], <= 0."""
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     jobs: Sequence[RenderJob] | None = None
-    """What groups render of it, if that was planned ahead."""
-    seen: Sequence[tuple[RenderGroupState, Instants]] = ()
-    choices: Sequence[Choice] = ()
-    """What adaptive groups render of it."""
+    """What groups render of it; None: that was not planned yet."""
+    left_out_count: int = 0
+    """Ticks that adaptive groups do not render."""
+    coarse_count: int = 0
+    """Renders after which something moves further by the next tick than it should between renders."""
 
 
 class PlannedStep(NamedTuple):
@@ -107,13 +108,12 @@ class State:
     on_host: bool
     """Packets go to the host; else results stay on the device."""
     vehicle: Vehicle
-    fleet: Any
-    """The vehicles and the clocks of their worlds as kernels see them (`trace.Fleet`)."""
-    surfaces: Any
-    """What they can touch (`trace.Surfaces`)."""
+    worlds: Any
+    """The vehicles and the clocks of their worlds as kernels see them (`trace.WorldArrays`)."""
     start: Any
     """Where vehicles begin, one row for each world (`integrate.Start`)."""
-    path_controller: PathController
+    path_controller: PathController | None
+    """None: the path prescribes the motion."""
     trace: Trace
     groups: list[RenderGroupState]
     samplers: dict[str, Sampler]
@@ -220,24 +220,24 @@ def make_state(
     slot_count = render_backlog * worlds.slot_count
     seeds: Any = wp.array(np.array(worlds.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
     vehicle: Any = _make_vehicle(model, worlds, seeds)
-    carried = isinstance(vehicle, Carrier)
-    if carried and start is not None:
+    is_prescribed = model.path.attitude is not None
+    if is_prescribed and start is not None:
         raise ValueError("path.kind poses says where an episode starts: give no start")
-    fleet = _make_fleet(vehicle)
+    world_arrays = _make_world_arrays(vehicle)
     ground = model.airframe.ground
     surfaces = make_surfaces(
         worlds.scenes.fields,
         worlds.scenes.scene,
-        radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
+        radius_m=-math.inf if is_prescribed else config.vehicle.collision_radius_m,  # it touches nothing
         ground_height_m=None if ground is None else ground.height_m,
-        holds=config.vehicle.on_collision == "end",
+        stop_on_contact=config.vehicle.on_collision == "end",
     )
     context = partial(
         SamplerContext,
         vehicle=vehicle,
         slot_count=slot_count,
         seeds=seeds,
-        active=fleet.active,
+        active=world_arrays.active,
         surfaces=surfaces,
     )
     samplers = {
@@ -246,28 +246,25 @@ def make_state(
         if isinstance(sensor, StateSensorConfig)
     }
     trace = Trace(
+        surfaces,
+        world_arrays,
         capacity=slot_count,
-        world_count=count,
-        rotor_count=model.airframe.rotor_count,
-        device=device,
         history_length=_history_length(model, slot_count + worlds.slot_count),
+        on_host=on_host,
     )
-    if on_host:
-        trace.bring_to_host()
     state = State(
         world_count=count,
         on_host=on_host,
         vehicle=vehicle,
-        fleet=fleet,
-        surfaces=surfaces,
+        worlds=world_arrays,
         start=_make_start(worlds, start, device),
-        path_controller=_path_controller(model, worlds),
+        path_controller=None if is_prescribed else _path_controller(model, worlds),
         trace=trace,
         groups=make_render_groups(
             model,
             worlds,
             seeds=seeds,
-            history=trace.history,
+            history=trace.arrays.history,
             in_flight=in_flight,
             on_host=on_host,
             make_room=make_room,
@@ -279,8 +276,7 @@ def make_state(
             if on_host
         },
         seeds=seeds,
-        overlaps=on_host
-        and (in_flight > 1 or make_room is not None or not _is_cuda(model) or bool(model.schedule.sparse)),
+        overlaps=on_host and (in_flight > 1 or make_room is not None or not _is_one_graph(model)),
         batch_done=[Fence(device) for _ in range(in_flight)],
         render_backlog=render_backlog,
         borrow_pictures=borrow_pictures,
@@ -306,8 +302,13 @@ def _in_flight(model: Model, asked: int | None, *, on_host: bool) -> int:
         return 1
     if asked is not None:
         return asked
-    overlap = on_host and _is_cuda(model) and model.config.renderer.kind != "pyrender"
+    overlap = on_host and _is_cuda(model) and model.config.renderer.only_launches
     return _IN_FLIGHT_ON_CUDA if overlap else 1
+
+
+def _is_one_graph(model: Model) -> bool:
+    """Return whether all launches of a batch can be one CUDA graph, if nothing else is in flight."""
+    return _is_cuda(model) and not model.schedule.sparse and model.config.renderer.only_launches
 
 
 def _is_cuda(model: Model) -> bool:
@@ -337,16 +338,16 @@ def _single_world(model: Model, seed: int | None) -> WorldSettings:
 
 
 def _history_length(model: Model, slot_count: int) -> int:
-    """Return how many boundaries are kept for rays with times of their own, whatever is flown ahead."""
+    """Return how many boundaries are kept for cameras, whatever is flown ahead."""
     window_ns = max((group.window_ns for group in model.groups), default=0)
-    return boundary_count_within(model.schedule, window_ns) + slot_count + 1 if window_ns else 0
+    return boundary_count_max(model.schedule, 1e-9 * window_ns) + slot_count
 
 
 def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
-    """Return the vehicles of all worlds, or what carries the sensors along a motion that is prescribed."""
+    """Return the vehicles of all worlds."""
     max_step_ns = to_ns(model.config.vehicle.max_step_s)
     if model.path.attitude is not None:
-        return Carrier(
+        return KinematicVehicle(
             model.airframe,
             [each.path for each in worlds.scenes.models],
             path_of_world=worlds.scenes.scene_of_world,
@@ -372,14 +373,13 @@ def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -
     return start
 
 
-def _make_fleet(vehicle: Vehicle) -> Any:
-    fleet = Fleet()
-    for name in _FLEET_ARRAYS:
-        setattr(fleet, name, getattr(vehicle.arrays, name))
-    fleet.clock_ns = wp.zeros(vehicle.count, dtype=wp.int64, device=vehicle.device)
-    fleet.collided = wp.zeros(vehicle.count, dtype=wp.int32, device=vehicle.device)
-    fleet.active = wp.ones(vehicle.count, dtype=wp.int32, device=vehicle.device)
-    return fleet
+def _make_world_arrays(vehicle: Vehicle) -> Any:
+    arrays = WorldArrays()
+    arrays.vehicles = vehicle.arrays
+    arrays.clock_ns = wp.zeros(vehicle.count, dtype=wp.int64, device=vehicle.device)
+    arrays.collided = wp.zeros(vehicle.count, dtype=wp.int32, device=vehicle.device)
+    arrays.active = wp.ones(vehicle.count, dtype=wp.int32, device=vehicle.device)
+    return arrays
 
 
 def reset_vehicles(model: Model, state: State, mask: Any) -> None:
@@ -391,10 +391,11 @@ def reset_vehicles(model: Model, state: State, mask: Any) -> None:
         restart,
         dim=state.world_count,
         inputs=[model.airframe.hover_rotor_speed_rad_s, mask, state.start],
-        outputs=[state.fleet],
+        outputs=[state.worlds],
         device=model.device,
     )
     state.vehicle.begin(mask)
-    state.path_controller.begin(mask)
+    if state.path_controller is not None:
+        state.path_controller.begin(mask)
     for sampler in state.samplers.values():
         sampler.reset(mask)

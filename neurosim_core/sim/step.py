@@ -5,8 +5,8 @@
 What does not change is in `model.py`, what does in `state.py`: arrays with a leading axis of worlds, of which
 a single run has one. A run is cut into batches (`schedule.py`). Within a batch the vehicles are integrated
 from boundary to boundary, and their states stay on the device (`integrate.py`, `trace.py`). Then every render
-group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`,
-`render_job.py`), and what goes to the host is read back once.
+group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`), and
+what goes to the host is read back once.
 
 How parts of a batch share a device (streams, graphs, several batches in flight) is in `runtime/cuda.py`; it
 changes no result.
@@ -14,32 +14,32 @@ changes no result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
+    acquire_room,
     choose,
     find_in_worlds,
     launch_cameras,
+    launch_key,
     plan_jobs,
-    prepare_worlds,
+    plan_world_frames,
     read_cameras,
+    render,
     scan,
-    turn_parities,
 )
 from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.render_job import acquire_room, launch_key
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.warp_start import refuse_forked_process
 
 
-def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[int] = ()) -> None:
+def launch(model: Model, state: State, batch: Batch) -> None:
     """Launch one batch, from the command to the events, without waiting for a device.
 
-    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`). Of many
-    worlds `last_seen_ns` is for each group the instant before it, from its begin [ns], <= 0.
+    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
     """
     refuse_forked_process()
     # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
@@ -49,21 +49,19 @@ def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[i
         launch_cameras(model, state, batch)
     else:
         # poses of the cameras -> one render of all their instants
-        jobs = batch.jobs
-        if jobs is None:
-            jobs = plan_jobs(state, batch, choose(model, state, batch))
+        jobs = plan_jobs(state, batch, choose(model, state, batch) if batch.jobs is None else ())
         for job in jobs:
             acquire_room(job)
-        worlds_key = prepare_worlds(state, batch, last_seen_ns)
+        frames = plan_world_frames(state, batch)
 
         def everything() -> tuple[object, ...]:
-            held = flight(), *(job.render() for job in jobs)
-            return *held, find_in_worlds(state, batch, last_seen_ns)  # log radiance -> events, in many worlds
+            held = flight(), *(render(job) for job in jobs)
+            return *held, find_in_worlds(state, frames)  # log radiance -> events, in many worlds
 
         with timed(state.wall_s, "flight and render"):
-            state.graphs.run((flight_key, worlds_key, *map(launch_key, jobs)), everything)
-        turn_parities(state, batch)
-        scan(state, batch, jobs)  # log radiance -> events, in a world whose packets go to the host
+            seen_key = tuple((each.offsets_ns, each.parity) for each in frames)
+            state.graphs.run((flight_key, seen_key, *map(launch_key, jobs)), everything)
+        scan(state, batch)  # log radiance -> events, in a world whose packets go to the host
     if state.on_host:
         state.in_flight.append(batch)
 
@@ -73,7 +71,7 @@ def launch_first(model: Model, state: State, batch: Batch) -> None:
     _, flight = plan_flight(state, batch)
     flight()
     for job in plan_jobs(state, batch, choose(model, state, batch)):
-        job.render()
+        render(job)
 
 
 def read(

@@ -52,6 +52,14 @@ class Airframe:
     rotor_speed_max: wp.float64
 
 
+@wp.struct
+class Rotors:
+    """What each rotor weighs in the sums over the rotors, [R]."""
+
+    quadratic_weight: wp.array[wp.vec4d]  # see `quadratic_weights`
+    linear_weight: wp.array[vec10d]  # see `linear_weights`
+
+
 def quadratic_weights(
     position: NDArray[np.float64],
     direction: NDArray[np.float64],

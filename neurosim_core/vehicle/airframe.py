@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import warp as wp
@@ -16,6 +16,7 @@ from neurosim_core.tables import read_table
 from neurosim_core.vehicle.aerodynamics import (
     AIR_TERMS,
     Airframe,
+    Rotors,
     lift_moments,
     linear_weights,
     quadratic_weights,
@@ -210,18 +211,8 @@ def preset(name: str, **overrides: Any) -> MultirotorConfig:
     return MultirotorConfig(**{**airframes[name], **overrides})
 
 
-class AirframeArrays(NamedTuple):
-    """Parameters of a multirotor as the kernels read them."""
-
-    airframe: Airframe
-    quadratic_weight: wp.array[wp.vec4d]
-    """See `aerodynamics.quadratic_weights`, [R]."""
-    linear_weight: wp.array[vec10d]
-    """See `aerodynamics.linear_weights`, [R]."""
-
-
-def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
-    """Put the parameters of a multirotor on a device.
+def make_airframe(config: MultirotorConfig, device: Any) -> tuple[Airframe, Rotors]:
+    """Return the parameters of a multirotor, and of its rotors on a device, as the kernels read them.
 
     Raises:
         ValueError: There is no such device.
@@ -252,11 +243,10 @@ def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
     airframe.wind = wp.vec3d(*config.wind_m_s)
     airframe.rotor_speed_min = config.rotor_speed_min_rad_s
     airframe.rotor_speed_max = config.rotor_speed_max_rad_s
-    return AirframeArrays(
-        airframe,
-        wp.array(quadratic, dtype=wp.vec4d, device=device),
-        wp.array(linear_weights(position, drag), dtype=vec10d, device=device),
-    )
+    rotors = Rotors()
+    rotors.quadratic_weight = wp.array(quadratic, dtype=wp.vec4d, device=device)
+    rotors.linear_weight = wp.array(linear_weights(position, drag), dtype=vec10d, device=device)
+    return airframe, rotors
 
 
 def alike(airframe: Airframe, count: int, device: Any) -> Any:

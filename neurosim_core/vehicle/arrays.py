@@ -1,23 +1,30 @@
-# mypy: disable-error-code="valid-type"
-"""The state of a batch of vehicles as it lies on the device."""
+# mypy: disable-error-code="valid-type,attr-defined,misc"
+"""The state of a batch of vehicles: as it lies on the device, as it is read, and why a vehicle is held."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-_VECTORS = ("position", "velocity", "body_rate", "acceleration", "angular_acceleration", "air_velocity")
-_ROTORS = ("rotor_speed", "rotor_speed_command")
-_OTHERS = {"orientation": wp.quatd, "status": wp.int32}
+STATUS_OK = wp.constant(wp.int32(0))
+STATUS_COMMAND = wp.constant(wp.int32(1))
+STATUS_VELOCITY = wp.constant(wp.int32(2))
+STATUS_BODY_RATE = wp.constant(wp.int32(3))
+STATUS_COLLISION = wp.constant(wp.int32(4))
+
+STATUS_TERMS = ("ok", "rotor_speed_command", "velocity", "body_rate", "collision")
+"""What each status code means: the quantity that was not finite or that cannot be integrated; "collision":
+whoever flies the vehicles holds this one, because it has touched something."""
 
 BLOCK_DIM = 32
 """Threads of a block on CUDA where a thread is a vehicle: a few thousand vehicles then reach every
 multiprocessor, and the block of a single one fits beside those of a renderer."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@wp.struct
 class MultirotorArrays:
     """What lives on the device of a batch. Write `rotor_speed_command`; the rest is read-only."""
 
@@ -42,22 +49,80 @@ class MultirotorArrays:
     stamp_ns: wp.array[wp.int64]
     """Time of each vehicle's state [ns], [N]; stops where a vehicle is held."""
     status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `status.STATUS_TERMS`, [N]."""
+    """0, or why a vehicle is held: index into `STATUS_TERMS`, [N]."""
     redone_count: wp.array[wp.int64]
     """Intervals redone with adaptive steps since the reset, [N]."""
     evaluation_count: wp.array[wp.int64]
     """Evaluations of the right-hand side in adaptive steps since the reset, [N]."""
 
 
+class MultirotorState(NamedTuple):
+    """State of vehicles on the host, float64: of a batch with a leading [N], of one vehicle without it."""
+
+    position: NDArray[np.float64]
+    """p_WB [m], [N, 3]."""
+    velocity: NDArray[np.float64]
+    """v_WB in W [m/s], [N, 3]."""
+    orientation: NDArray[np.float64]
+    """q_WB, xyzw, [N, 4]."""
+    body_rate: NDArray[np.float64]
+    """w_WB in B [rad/s], [N, 3]."""
+    rotor_speed: NDArray[np.float64]
+    """Speed of each rotor [rad/s], [N, R]."""
+
+
+class DynamicsError(ArithmeticError):
+    """The motion of a vehicle cannot be integrated, or its command was not finite.
+
+    The vehicle is held at its last good state, the beginning of the interval that failed (in turbulence: of
+    its part from tick to tick), until it is reset; other vehicles of the batch are not affected.
+
+    Attributes:
+        stamp_ns: Time of the last good state [ns].
+        vehicle: Index in the batch.
+        term: What failed: "velocity", "body_rate" or "rotor_speed_command".
+        state: The last good state, without the leading axis.
+    """
+
+    def __init__(self, stamp_ns: int, vehicle: int, term: str, state: MultirotorState) -> None:
+        super().__init__(stamp_ns, vehicle, term, state)
+        self.stamp_ns = stamp_ns
+        self.vehicle = vehicle
+        self.term = term
+        self.state = state
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: {self.term} cannot be integrated after {self.stamp_ns} ns; "
+            "last good state: "
+            + ", ".join(
+                f"{name} {np.array2string(v, precision=6)}" for name, v in self.state._asdict().items()
+            )
+        )
+
+
 def allocate_arrays(count: int, rotor_count: int, device: Any) -> MultirotorArrays:
     """Return the state of vehicles, all zero."""
-    dtypes = dict.fromkeys(_VECTORS, wp.vec3d) | _OTHERS
-    arrays: dict[str, Any] = {
-        name: wp.zeros(
-            (count, rotor_count) if name in _ROTORS else count,
-            dtype=wp.float64 if name in _ROTORS else dtypes.get(name, wp.int64),
-            device=device,
-        )
-        for name in MultirotorArrays.__annotations__
-    }
-    return MultirotorArrays(**arrays)
+    arrays = MultirotorArrays()
+    for name, member in MultirotorArrays.vars.items():
+        shape = (count, rotor_count)[: member.type.ndim]
+        setattr(arrays, name, wp.zeros(shape, dtype=member.type.dtype, device=device))
+    return arrays
+
+
+def read_state(arrays: Any) -> MultirotorState:
+    """Return a copy of the states of all vehicles on the host; waits for the device."""
+    return MultirotorState(*(np.array(getattr(arrays, name).numpy()) for name in MultirotorState._fields))
+
+
+def check_status(arrays: Any) -> None:
+    """Wait for the device and raise if a vehicle is held.
+
+    Raises:
+        DynamicsError: For the first vehicle that is held.
+    """
+    status = arrays.status.numpy()
+    for vehicle in np.flatnonzero(status)[:1].tolist():
+        state = MultirotorState(*(rows[vehicle] for rows in read_state(arrays)))
+        stamp_ns = int(arrays.stamp_ns.numpy()[vehicle])
+        raise DynamicsError(stamp_ns, vehicle, STATUS_TERMS[status[vehicle]], state)

@@ -45,6 +45,13 @@ def rotation_series(u: wp.vec3d) -> wp.vec2d:
 
 
 @wp.func
+def turned_back(u: wp.vec3d, series: wp.vec2d, x: wp.vec3d) -> wp.vec3d:
+    """Return exp(-u) x; the series is that of u."""
+    turn = wp.cross(u, x)
+    return x - series[0] * turn + series[1] * wp.cross(u, turn)
+
+
+@wp.func
 def chart_rate_4(u: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
     """Return dexp^-1_u(w) with as many terms as order 4 needs."""
     turn = wp.cross(u, w)

@@ -17,11 +17,9 @@ import warp as wp
 
 from neurosim_core.frames import quaternion_exp
 from neurosim_core.vehicle.aerodynamics import Airframe
+from neurosim_core.vehicle.arrays import STATUS_BODY_RATE, STATUS_OK, STATUS_VELOCITY
 from neurosim_core.vehicle.chart import chart_rate
-from neurosim_core.vehicle.equations import Equations
-from neurosim_core.vehicle.rotors import RotorSums
-from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_OK, STATUS_VELOCITY
-from neurosim_core.vehicle.surroundings import Surroundings
+from neurosim_core.vehicle.equations import Equations, Interval, RotorSums, Surroundings
 
 _PROPORTIONAL = wp.constant(wp.float64(0.2 - 0.75 * 0.04))
 _INTEGRAL = wp.constant(wp.float64(0.04))
@@ -31,7 +29,28 @@ _GROWTH = wp.constant(wp.float64(10.0))
 _STEP_MIN = wp.constant(wp.float64(1e-14))  # as a share of the duration
 _ROTATION_MAX_RAD = wp.constant(wp.float64(2.0))  # in one step; the chart ends at 2 pi
 
+_vec7d = wp.types.vector(length=7, dtype=wp.float64)
 _vec12d = wp.types.vector(length=12, dtype=wp.float64)
+_mat7d = wp.types.matrix(shape=(7, 7), dtype=wp.float64)
+_stages = wp.types.matrix(shape=(7, 12), dtype=wp.float64)
+
+_TABLEAU = wp.constant(
+    _mat7d(
+        [
+            [0, 0, 0, 0, 0, 0, 0],
+            [1 / 5, 0, 0, 0, 0, 0, 0],
+            [3 / 40, 9 / 40, 0, 0, 0, 0, 0],
+            [44 / 45, -56 / 15, 32 / 9, 0, 0, 0, 0],
+            [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0, 0],
+            [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0, 0],
+            [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0],
+        ]
+    )
+)
+"""Weights of the slopes of the stages before, for each stage; the last one is the solution of order 5."""
+_NODES = wp.constant(_vec7d(0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0))
+_ERROR = wp.constant(_vec7d(71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40))
+"""Weights of the slopes in the difference of the solutions of orders 5 and 4."""
 
 
 @wp.func
@@ -41,20 +60,12 @@ def _part(y: _vec12d, first: wp.int32) -> wp.vec3d:
 
 @wp.func
 def _joined(displacement: wp.vec3d, v: wp.vec3d, u: wp.vec3d, w: wp.vec3d) -> _vec12d:
-    return _vec12d(
-        displacement[0],
-        displacement[1],
-        displacement[2],
-        v[0],
-        v[1],
-        v[2],
-        u[0],
-        u[1],
-        u[2],
-        w[0],
-        w[1],
-        w[2],
-    )
+    y = _vec12d()
+    y[0:3] = displacement
+    y[3:6] = v
+    y[6:9] = u
+    y[9:12] = w
+    return y
 
 
 @wp.func
@@ -78,11 +89,9 @@ def _scaled_error(
 def make_dormand_prince(equations: Equations) -> Any:
     """Return the device function that moves one vehicle by a duration.
 
-    Its arguments: the airframe; what surrounds it; the sums over the rotors; index of the vehicle and time at
-    the beginning [ns]; duration and first trial step [s]; relative and absolute tolerance, the latter in [m,
-    m/s, rad, rad/s]; the most evaluations of the right-hand side; position [m] and velocity [m/s] in W,
-    attitude, body rate [rad/s]. It returns the last four, the number of evaluations, and why it failed or
-    STATUS_OK.
+    Its arguments: the airframe; what surrounds it; the interval; the sums over the rotors; index of the
+    vehicle and time at the beginning [ns]; position [m] and velocity [m/s] in W, attitude, body rate [rad/s].
+    It returns the last four, the number of evaluations, and why it failed or STATUS_OK.
     """
     wind, changing_wind = equations.wind, equations.changing_wind
     near_ground = equations.ground or equations.ground_effect
@@ -128,14 +137,10 @@ def make_dormand_prince(equations: Equations) -> Any:
     def fly_adaptive(
         airframe: Airframe,
         around: Surroundings,
+        interval: Interval,
         sums: RotorSums,
         vehicle: wp.int32,
         start_ns: wp.int64,
-        duration_s: wp.float64,
-        first_step_s: wp.float64,
-        rtol: wp.float64,
-        atol: wp.float64,
-        evaluation_count_max: wp.int32,
         x_0: wp.vec3d,
         v_0: wp.vec3d,
         q_0: wp.quatd,
@@ -146,67 +151,35 @@ def make_dormand_prince(equations: Equations) -> Any:
         q = q_0
         y = _joined(zero, v_0, zero, w_0)
         t = wp.float64(0.0)
-        h = wp.min(first_step_s, duration_s)
+        rtol = interval.rtol
+        atol = interval.atol
+        duration_s = wp.float64(interval.step_count) * interval.step_s
+        h = wp.min(interval.step_s, duration_s)
         error_before = wp.float64(1e-4)
         growth = _GROWTH
         failure = STATUS_OK
-        k1 = derivative(airframe, around, sums, vehicle, start_ns, t, x[2], q, y)
+        k = _stages()
+        k[0] = derivative(airframe, around, sums, vehicle, start_ns, t, x[2], q, y)
         evaluation_count = wp.int32(1)
         while t < duration_s:
             h = wp.min(h, _ROTATION_MAX_RAD / (wp.length(_part(y, 9)) + wp.float64(1e-9)))
             last = bool(t + wp.float64(1.01) * h >= duration_s)
             if last:
                 h = duration_s - t
-            y2 = y + h * wp.static(wp.float64(1 / 5)) * k1
-            k2 = derivative(
-                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(1 / 5)) * h, x[2], q, y2
-            )
-            y3 = y + h * (wp.static(wp.float64(3 / 40)) * k1 + wp.static(wp.float64(9 / 40)) * k2)
-            k3 = derivative(
-                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(3 / 10)) * h, x[2], q, y3
-            )
-            y4 = y + h * (
-                wp.static(wp.float64(44 / 45)) * k1
-                - wp.static(wp.float64(56 / 15)) * k2
-                + wp.static(wp.float64(32 / 9)) * k3
-            )
-            k4 = derivative(
-                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(4 / 5)) * h, x[2], q, y4
-            )
-            y5 = y + h * (
-                wp.static(wp.float64(19372 / 6561)) * k1
-                - wp.static(wp.float64(25360 / 2187)) * k2
-                + wp.static(wp.float64(64448 / 6561)) * k3
-                - wp.static(wp.float64(212 / 729)) * k4
-            )
-            k5 = derivative(
-                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(8 / 9)) * h, x[2], q, y5
-            )
-            y6 = y + h * (
-                wp.static(wp.float64(9017 / 3168)) * k1
-                - wp.static(wp.float64(355 / 33)) * k2
-                + wp.static(wp.float64(46732 / 5247)) * k3
-                + wp.static(wp.float64(49 / 176)) * k4
-                - wp.static(wp.float64(5103 / 18656)) * k5
-            )
-            k6 = derivative(airframe, around, sums, vehicle, start_ns, t + h, x[2], q, y6)
-            y7 = y + h * (
-                wp.static(wp.float64(35 / 384)) * k1
-                + wp.static(wp.float64(500 / 1113)) * k3
-                + wp.static(wp.float64(125 / 192)) * k4
-                - wp.static(wp.float64(2187 / 6784)) * k5
-                + wp.static(wp.float64(11 / 84)) * k6
-            )
-            k7 = derivative(airframe, around, sums, vehicle, start_ns, t + h, x[2], q, y7)
+            y7 = y + h * _TABLEAU[1, 0] * k[0]
+            k[1] = derivative(airframe, around, sums, vehicle, start_ns, t + _NODES[1] * h, x[2], q, y7)
+            for stage in range(2, 7):
+                slope = _TABLEAU[stage, 0] * k[0]
+                for before in range(1, stage):
+                    slope += _TABLEAU[stage, before] * k[before]
+                y7 = y + h * slope
+                now = t + _NODES[stage] * h
+                k[stage] = derivative(airframe, around, sums, vehicle, start_ns, now, x[2], q, y7)
             evaluation_count += 6
-            difference = h * (
-                wp.static(wp.float64(71 / 57600)) * k1
-                - wp.static(wp.float64(71 / 16695)) * k3
-                + wp.static(wp.float64(71 / 1920)) * k4
-                - wp.static(wp.float64(17253 / 339200)) * k5
-                + wp.static(wp.float64(22 / 525)) * k6
-                - wp.static(wp.float64(1 / 40)) * k7
-            )
+            slope = _ERROR[0] * k[0]
+            for stage in range(1, 7):
+                slope += _ERROR[stage] * k[stage]
+            difference = h * slope
             v_size = wp.length(_part(y, 3))
             w_size = wp.length(_part(y, 9))
             none = wp.float64(0.0)
@@ -228,7 +201,7 @@ def make_dormand_prince(equations: Equations) -> Any:
                 q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
                 y = _joined(zero, _part(y7, 3), zero, _part(y7, 9))
                 # the last stage is the first of the next step, where u' = w
-                k1 = _joined(_part(y7, 3), _part(k7, 3), _part(y7, 9), _part(k7, 9))
+                k[0] = _joined(_part(y7, 3), _part(k[6], 3), _part(y7, 9), _part(k[6], 9))
                 scaled = wp.pow(wp.max(error, wp.float64(1e-10)), _PROPORTIONAL)
                 h *= wp.clamp(_SAFETY * wp.pow(error_before, _INTEGRAL) / scaled, _SHRINK, growth)
                 error_before = wp.max(error, wp.float64(1e-4))
@@ -241,10 +214,12 @@ def make_dormand_prince(equations: Equations) -> Any:
                     shrink = wp.max(_SHRINK, _SAFETY / wp.pow(error, _PROPORTIONAL))
                 h *= shrink
                 growth = wp.float64(1.0)
-            if t < duration_s and (evaluation_count >= evaluation_count_max or h < _STEP_MIN * duration_s):
+            if t < duration_s and (
+                evaluation_count >= interval.evaluation_count_max or h < _STEP_MIN * duration_s
+            ):
                 failure = STATUS_VELOCITY
-                spins = w_error > v_error or not wp.isfinite(wp.length(_part(k1, 9)))
-                if spins and wp.isfinite(wp.length(_part(k1, 3))):
+                spins = w_error > v_error or not wp.isfinite(wp.length(_part(k[0], 9)))
+                if spins and wp.isfinite(wp.length(_part(k[0], 3))):
                     failure = STATUS_BODY_RATE
                 break
         return x, _part(y, 3), q, _part(y, 9), evaluation_count, failure

@@ -10,6 +10,8 @@ the error is h^4 / 384 times the fourth derivative. At an entry the state is tha
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and kernels as objects.
 
+from typing import Any
+
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
@@ -29,11 +31,11 @@ class History:
     body_rate: wp.array2d[wp.vec3d]
 
 
-def make_history(world_count: int, length: int, device: str) -> History:
-    """Allocate a ring of `length` entries for each world; 0: nothing is kept."""
+def make_history(world_count: int, length: int, device: Any) -> History:
+    """Allocate a ring of `length` entries for each world."""
     history = History()
     shape = (world_count, length)
-    history.count = wp.zeros(world_count if length else 0, dtype=wp.int64, device=device)
+    history.count = wp.zeros(world_count, dtype=wp.int64, device=device)
     history.stamp_ns = wp.zeros(shape, dtype=wp.int64, device=device)
     for name in ("position", "velocity", "body_rate"):
         setattr(history, name, wp.zeros(shape, dtype=wp.vec3d, device=device))
@@ -132,6 +134,8 @@ def motion_at(history: History, world: int, last: wp.int64, stamp_ns: wp.int64) 
     length = wp.int64(history.stamp_ns.shape[1])
     low = wp.max(last - length + wp.int64(1), wp.int64(0))
     high = last
+    if history.stamp_ns[world, int(last % length)] <= stamp_ns:
+        low = last
     while low < high:  # the last entry that is not later
         middle = (low + high + wp.int64(1)) / wp.int64(2)
         if history.stamp_ns[world, int(middle % length)] <= stamp_ns:

@@ -9,19 +9,20 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.vehicle.arrays import MultirotorArrays, allocate_arrays
-from neurosim_core.vehicle.config import VehicleContext
-from neurosim_core.vehicle.multirotor import (
-    Acceleration,
-    DynamicsError,
-    MultirotorConfig,
+from neurosim_core.vehicle.airframe import MultirotorConfig
+from neurosim_core.vehicle.arrays import (
+    STATUS_BODY_RATE,
+    STATUS_VELOCITY,
+    MultirotorArrays,
     MultirotorState,
+    allocate_arrays,
 )
-from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_TERMS, STATUS_VELOCITY
+from neurosim_core.vehicle.config import VehicleContext
+from neurosim_core.vehicle.multirotor import Acceleration
 
 
 class Vehicle(Protocol):
-    """The vehicles of all worlds. Everything but `check` and `state` only launches, on a device."""
+    """The vehicles of all worlds. What they do only launches, on a device."""
 
     config: MultirotorConfig
     """What planners, controllers and IMUs take it for."""
@@ -44,13 +45,6 @@ class Vehicle(Protocol):
 
     def accelerate(self) -> None:
         """Compute the accelerations at the present state."""
-
-    def check(self) -> None:
-        """Raise `DynamicsError` for the first vehicle that is held."""
-
-    @property
-    def state(self) -> MultirotorState:
-        """A copy of the state on the host, with a leading axis of worlds."""
 
 
 class HostVehicle:
@@ -77,7 +71,7 @@ class HostVehicle:
         if self.device.is_cuda:
             raise ValueError(f"{type(self).__name__} is computed in Python: it needs device: cpu")
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
-        self._views = {name: getattr(self.arrays, name).numpy() for name in MultirotorArrays.__annotations__}
+        self._views = {name: getattr(self.arrays, name).numpy() for name in MultirotorArrays.vars}
 
     def move(
         self, state: MultirotorState, command: NDArray[np.float64], duration_s: float
@@ -125,17 +119,6 @@ class HostVehicle:
             found = self.acceleration(self._row(world), self._views["rotor_speed_command"][world])
             self._views["acceleration"][world] = found.linear
             self._views["angular_acceleration"][world] = found.angular
-
-    def check(self) -> None:
-        """Raise `DynamicsError` for the first vehicle that is held."""
-        for world in np.flatnonzero(self._views["status"] > 0).tolist():
-            term = STATUS_TERMS[self._views["status"][world]]
-            raise DynamicsError(int(self._views["stamp_ns"][world]), world, term, self._row(world))
-
-    @property
-    def state(self) -> MultirotorState:
-        """A copy of the state on the host, with a leading axis of worlds."""
-        return MultirotorState(*(self._views[name].copy() for name in MultirotorState._fields))
 
     def _row(self, world: int) -> MultirotorState:
         return MultirotorState(*(self._views[name][world].copy() for name in MultirotorState._fields))

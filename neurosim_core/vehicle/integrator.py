@@ -8,51 +8,12 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.arrays import STATUS_COMMAND, STATUS_OK, MultirotorArrays
 from neurosim_core.vehicle.dormand_prince import make_dormand_prince
-from neurosim_core.vehicle.equations import make_equations
+from neurosim_core.vehicle.equations import Interval, RotorSums, Surroundings, held_command, make_equations
 from neurosim_core.vehicle.motor import projected_exponential
 from neurosim_core.vehicle.rkmk4 import make_rkmk4
-from neurosim_core.vehicle.rotors import RotorSums, held_command
-from neurosim_core.vehicle.status import STATUS_COMMAND, STATUS_OK
-from neurosim_core.vehicle.surroundings import Surroundings
 from neurosim_core.vehicle.wind import draw_turbulence, start_turbulence, time_to_tick
-
-
-@wp.struct
-class Interval:
-    """What a batch is moved by. One parameter: on a CPU each costs a quarter of a microsecond a launch."""
-
-    duration_ns: wp.int64
-    max_step_ns: wp.int64
-    step_s: wp.float64
-    step_count: wp.int32
-    speed_nodes: wp.vec3d  # see `motor.LagConstants`
-    square_nodes: wp.vec3d
-    decay: wp.float64
-    lag_rate: wp.float64
-    is_adaptive: wp.bool  # take no fixed steps
-    rtol: wp.float64  # of adaptive steps
-    atol: wp.float64
-    evaluation_count_max: wp.int32
-
-
-@wp.struct
-class Batch:
-    """The arrays of a batch, as in `multirotor.MultirotorArrays`."""
-
-    position: wp.array(dtype=wp.vec3d)
-    velocity: wp.array(dtype=wp.vec3d)
-    orientation: wp.array(dtype=wp.quatd)
-    body_rate: wp.array(dtype=wp.vec3d)
-    rotor_speed: wp.array2d(dtype=wp.float64)
-    rotor_speed_command: wp.array2d(dtype=wp.float64)
-    acceleration: wp.array(dtype=wp.vec3d)
-    angular_acceleration: wp.array(dtype=wp.vec3d)
-    air_velocity: wp.array(dtype=wp.vec3d)
-    stamp_ns: wp.array(dtype=wp.int64)
-    status: wp.array(dtype=wp.int32)
-    redone_count: wp.array(dtype=wp.int64)
-    evaluation_count: wp.array(dtype=wp.int64)
 
 
 class Kernels(NamedTuple):
@@ -106,101 +67,99 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
     module = _module(terms)
 
     @wp.func
-    def fly(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
+    def fly(
+        airframe: Airframe,
+        around: Surroundings,
+        interval: Interval,
+        arrays: MultirotorArrays,
+        vehicle: wp.int32,
+    ):
         """Move one vehicle by an interval, or set its status and leave it where it is."""
-        rotor_count = batch.rotor_speed_command.shape[1]
+        rotor_count = arrays.rotor_speed_command.shape[1]
         # sums over the rotors of Omega^2 = c^2 + 2 c d + d^2 and Omega = c + d, where d = Omega_0 - c decays
-        quadratic_cc = wp.vec4d()
-        quadratic_cd = wp.vec4d()
-        quadratic_dd = wp.vec4d()
-        linear_c = vec10d()
-        linear_d = vec10d()
+        sums = RotorSums()
+        sums.rate = interval.lag_rate
         for rotor in range(rotor_count):
-            c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
-            d = batch.rotor_speed[vehicle, rotor] - c
-            quadratic_cc += c * c * around.rotors.quadratic_weight[rotor]
+            c = held_command(airframe, arrays.rotor_speed_command, vehicle, rotor)
+            d = arrays.rotor_speed[vehicle, rotor] - c
+            sums.quadratic_cc += c * c * around.rotors.quadratic_weight[rotor]
             if wp.static(motor_lag):
-                quadratic_cd += wp.float64(2.0) * c * d * around.rotors.quadratic_weight[rotor]
-                quadratic_dd += d * d * around.rotors.quadratic_weight[rotor]
+                sums.quadratic_cd += wp.float64(2.0) * c * d * around.rotors.quadratic_weight[rotor]
+                sums.quadratic_dd += d * d * around.rotors.quadratic_weight[rotor]
             if wp.static(air_terms):
-                linear_c += c * around.rotors.linear_weight[rotor]
+                sums.linear_c += c * around.rotors.linear_weight[rotor]
                 if wp.static(motor_lag):
-                    linear_d += d * around.rotors.linear_weight[rotor]
+                    sums.linear_d += d * around.rotors.linear_weight[rotor]
 
-        x = batch.position[vehicle]
-        v = batch.velocity[vehicle]
-        q = batch.orientation[vehicle]
-        w = batch.body_rate[vehicle]
-        start_ns = batch.stamp_ns[vehicle]
+        x = arrays.position[vehicle]
+        v = arrays.velocity[vehicle]
+        q = arrays.orientation[vehicle]
+        w = arrays.body_rate[vehicle]
+        start_ns = arrays.stamp_ns[vehicle]
         remaining = wp.float64(0.0)
         redo = wp.bool(True)
         if not interval.is_adaptive:
             x, v, q, w, remaining, redo = fly_fixed(
-                airframe, around, vehicle, start_ns,
-                quadratic_cc, quadratic_cd, quadratic_dd, linear_c, linear_d,
-                interval.speed_nodes, interval.square_nodes, interval.decay,
-                interval.step_s, interval.step_count, x, v, q, w,
-            )  # fmt: skip
+                airframe, around, interval, sums, vehicle, start_ns, x, v, q, w
+            )
         if redo:
-            sums = RotorSums()
-            sums.quadratic_cc = quadratic_cc
-            sums.quadratic_cd = quadratic_cd
-            sums.quadratic_dd = quadratic_dd
-            sums.linear_c = linear_c
-            sums.linear_d = linear_d
-            sums.rate = interval.lag_rate
-            duration_s = wp.float64(interval.step_count) * interval.step_s
             x, v, q, w, used, failure = fly_adaptive(
-                airframe, around, sums, vehicle, start_ns,
-                duration_s, interval.step_s, interval.rtol, interval.atol, interval.evaluation_count_max,
-                batch.position[vehicle], batch.velocity[vehicle],
-                batch.orientation[vehicle], batch.body_rate[vehicle],
+                airframe, around, interval, sums, vehicle, start_ns,
+                arrays.position[vehicle], arrays.velocity[vehicle],
+                arrays.orientation[vehicle], arrays.body_rate[vehicle],
             )  # fmt: skip
-            batch.evaluation_count[vehicle] += wp.int64(used)
+            arrays.evaluation_count[vehicle] += wp.int64(used)
             if not interval.is_adaptive:
-                batch.redone_count[vehicle] += wp.int64(1)
+                arrays.redone_count[vehicle] += wp.int64(1)
             if failure != STATUS_OK:
-                batch.status[vehicle] = failure
+                arrays.status[vehicle] = failure
                 return
             if wp.static(motor_lag):
+                duration_s = wp.float64(interval.step_count) * interval.step_s
                 remaining = wp.exp(-interval.lag_rate * duration_s)
 
-        batch.position[vehicle] = x
-        batch.velocity[vehicle] = v
-        batch.orientation[vehicle] = q
-        batch.body_rate[vehicle] = w
+        arrays.position[vehicle] = x
+        arrays.velocity[vehicle] = v
+        arrays.orientation[vehicle] = q
+        arrays.body_rate[vehicle] = w
         for rotor in range(rotor_count):
-            c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
+            c = held_command(airframe, arrays.rotor_speed_command, vehicle, rotor)
             if wp.static(motor_lag):
-                batch.rotor_speed[vehicle, rotor] = c + remaining * (batch.rotor_speed[vehicle, rotor] - c)
+                arrays.rotor_speed[vehicle, rotor] = c + remaining * (arrays.rotor_speed[vehicle, rotor] - c)
             else:
-                batch.rotor_speed[vehicle, rotor] = c
-        batch.stamp_ns[vehicle] += interval.duration_ns
+                arrays.rotor_speed[vehicle, rotor] = c
+        arrays.stamp_ns[vehicle] += interval.duration_ns
         if wp.static(windy):
-            batch.air_velocity[vehicle] = wind_at(
-                airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0)
+            arrays.air_velocity[vehicle] = wind_at(
+                airframe, around.wind, vehicle, arrays.stamp_ns[vehicle], wp.float64(0.0)
             )
 
     @wp.func
-    def move(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
+    def move(
+        airframe: Airframe,
+        around: Surroundings,
+        interval: Interval,
+        arrays: MultirotorArrays,
+        vehicle: wp.int32,
+    ):
         """Move one vehicle by an interval, unless it is held."""
-        if batch.status[vehicle] != STATUS_OK:
+        if arrays.status[vehicle] != STATUS_OK:
             return
-        for rotor in range(batch.rotor_speed_command.shape[1]):
-            if not wp.isfinite(batch.rotor_speed_command[vehicle, rotor]):
-                batch.status[vehicle] = STATUS_COMMAND
+        for rotor in range(arrays.rotor_speed_command.shape[1]):
+            if not wp.isfinite(arrays.rotor_speed_command[vehicle, rotor]):
+                arrays.status[vehicle] = STATUS_COMMAND
                 return
         if wp.static(not turbulence):
-            fly(airframe, around, interval, batch, vehicle)
+            fly(airframe, around, interval, arrays, vehicle)
         else:
             left_ns = wp.int64(interval.duration_ns)
-            while left_ns > wp.int64(0) and batch.status[vehicle] == STATUS_OK:
-                now_ns = batch.stamp_ns[vehicle]
+            while left_ns > wp.int64(0) and arrays.status[vehicle] == STATUS_OK:
+                now_ns = arrays.stamp_ns[vehicle]
                 draw_turbulence(
-                    around.wind, airframe, vehicle, now_ns, batch.position[vehicle], batch.velocity[vehicle]
+                    around.wind, airframe, vehicle, now_ns, arrays.position[vehicle], arrays.velocity[vehicle]
                 )
                 part = part_of(interval, wp.min(left_ns, time_to_tick(around.wind, now_ns)))
-                fly(airframe, around, part, batch, vehicle)
+                fly(airframe, around, part, arrays, vehicle)
                 left_ns -= part.duration_ns
 
     @wp.kernel(module=module, enable_backward=False)
@@ -209,37 +168,37 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         airframes: wp.array[Airframe],
         around: Surroundings,
         # In/out:
-        batch: Batch,
+        arrays: MultirotorArrays,
     ):
         vehicle = wp.tid()
         airframe = airframes[vehicle]
         quadratic = wp.vec4d()
         linear = vec10d()
-        for rotor in range(batch.rotor_speed.shape[1]):
-            speed = batch.rotor_speed[vehicle, rotor]
+        for rotor in range(arrays.rotor_speed.shape[1]):
+            speed = arrays.rotor_speed[vehicle, rotor]
             quadratic += speed * speed * around.rotors.quadratic_weight[rotor]
             if wp.static(air_terms):
                 linear += speed * around.rotors.linear_weight[rotor]
-        q = batch.orientation[vehicle]
-        w = batch.body_rate[vehicle]
-        v = batch.velocity[vehicle]
+        q = arrays.orientation[vehicle]
+        w = arrays.body_rate[vehicle]
+        v = arrays.velocity[vehicle]
         air = v
         if wp.static(air_terms):
             if wp.static(changing_wind):
-                air -= wind_at(airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0))
+                air -= wind_at(airframe, around.wind, vehicle, arrays.stamp_ns[vehicle], wp.float64(0.0))
             elif wp.static(wind):
                 air -= airframe.wind
             air = wp.quat_rotate_inv(q, air)
         up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-        height = batch.position[vehicle][2] - around.ground.height
+        height = arrays.position[vehicle][2] - around.ground.height
         if wp.static(near_ground):
             v = wp.quat_rotate_inv(q, v)
             up = wp.quat_rotate_inv(q, up)
             quadratic = lift(around.ground, height, quadratic)
         force, spin = forces(airframe, around.ground, quadratic, linear, air, v, up, height, w)
         down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
-        batch.acceleration[vehicle] = down + airframe.mass_inverse * wp.quat_rotate(q, force)
-        batch.angular_acceleration[vehicle] = spin
+        arrays.acceleration[vehicle] = down + airframe.mass_inverse * wp.quat_rotate(q, force)
+        arrays.angular_acceleration[vehicle] = spin
 
     @wp.kernel(module=module, enable_backward=False)
     def begin(
@@ -249,59 +208,51 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         # In:
         mask: wp.array[wp.int32],
         # In/out:
-        batch: Batch,
+        arrays: MultirotorArrays,
     ):
         vehicle = wp.tid()
         if mask.shape[0] == 0 or mask[vehicle] != 0:
             if wp.static(turbulence):
-                start_turbulence(around.wind, vehicle, batch.position[vehicle])
-            batch.air_velocity[vehicle] = wind_at(
+                start_turbulence(around.wind, vehicle, arrays.position[vehicle])
+            arrays.air_velocity[vehicle] = wind_at(
                 airframes[vehicle], around.wind, vehicle, wp.int64(0), wp.float64(0.0)
             )
 
     return Kernels(move, accelerate, begin if windy else None)
 
 
-@functools.cache
-def make_advance(terms: frozenset[str]) -> Any:
-    """Return the kernel that moves every vehicle by an interval."""
-    move = make_kernels(terms).move
-
-    @wp.kernel(module=_module(terms, "advance"), enable_backward=False)
-    def advance(
-        # Model:
-        airframes: wp.array[Airframe],
-        around: Surroundings,
-        interval: Interval,
-        # In/out:
-        batch: Batch,
-    ):
-        vehicle = wp.tid()
-        move(airframes[vehicle], around, interval, batch, vehicle)
-
-    return advance
+@wp.func
+def record_nothing(
+    log: wp.int32,
+    vehicle: wp.int32,
+    slot: wp.int32,
+    elapsed_ns: wp.int64,
+    is_first: wp.bool,
+    is_last: wp.bool,
+) -> None:
+    """Record no state, in place of a function that does."""
 
 
 @functools.cache
-def make_flight(terms: frozenset[str], note: Any) -> Any:
-    """Return the kernel that moves every vehicle by equal intervals, and notes its state after each.
+def make_flight(terms: frozenset[str], record: Any) -> Any:
+    """Return the kernel that moves every vehicle by equal intervals, and records its state after each.
 
     Args:
         terms: As of `make_kernels`.
-        note: Warp function of a `log` of any type; the vehicle; the slot; time since the beginning of the
+        record: Warp function of a `log` of any type; the vehicle; the slot; time since the beginning of the
             batch [ns]; whether the state is the first and the last of the batch.
     """
     move = make_kernels(terms).move
-    log_type = next(iter(note.input_types.values()))
+    log_type = next(iter(record.input_types.values()))
 
-    @wp.kernel(module=_module(terms, note.key), enable_backward=False)
+    @wp.kernel(module=_module(terms, record.key), enable_backward=False)
     def fly(
         # Model:
         airframes: wp.array[Airframe],
         around: Surroundings,
         interval: Interval,
         # In/out:
-        batch: Batch,
+        arrays: MultirotorArrays,
         log: log_type,
         # In:
         interval_count: wp.int32,
@@ -313,8 +264,8 @@ def make_flight(terms: frozenset[str], note: Any) -> Any:
         vehicle = wp.tid()
         airframe = airframes[vehicle]
         for index in range(interval_count):
-            move(airframe, around, interval, batch, vehicle)
-            note(
+            move(airframe, around, interval, arrays, vehicle)
+            record(
                 log,
                 vehicle,
                 slot + index,

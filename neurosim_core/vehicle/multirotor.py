@@ -11,36 +11,20 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.frames import as_rows, normalised
+from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
-from neurosim_core.vehicle.arrays import BLOCK_DIM, allocate_arrays
+from neurosim_core.vehicle.arrays import BLOCK_DIM, MultirotorState, allocate_arrays, check_status, read_state
+from neurosim_core.vehicle.equations import Interval, Surroundings
 from neurosim_core.vehicle.ground import make_ground
-from neurosim_core.vehicle.integrator import Batch, Interval, make_advance, make_flight, make_kernels
+from neurosim_core.vehicle.integrator import make_flight, make_kernels, record_nothing
 from neurosim_core.vehicle.motor import lag_constants
-from neurosim_core.vehicle.rotors import Rotors
-from neurosim_core.vehicle.status import STATUS_TERMS
-from neurosim_core.vehicle.surroundings import Surroundings
 from neurosim_core.vehicle.wind import make_wind
 
 Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
 
 _STEP_MAX_NS = 10**12
-_LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
-
-
-class MultirotorState(NamedTuple):
-    """State of vehicles on the host, float64: of a batch with a leading [N], of one vehicle without it."""
-
-    position: NDArray[np.float64]
-    """p_WB [m], [N, 3]."""
-    velocity: NDArray[np.float64]
-    """v_WB in W [m/s], [N, 3]."""
-    orientation: NDArray[np.float64]
-    """q_WB, xyzw, [N, 4]."""
-    body_rate: NDArray[np.float64]
-    """w_WB in B [rad/s], [N, 3]."""
-    rotor_speed: NDArray[np.float64]
-    """Speed of each rotor [rad/s], [N, R]."""
+_INTERVAL_COUNT_MAX = 256  # that are kept, one for each duration
 
 
 class Acceleration(NamedTuple):
@@ -59,37 +43,6 @@ class Effort(NamedTuple):
     """Intervals that fixed steps could not resolve and that were redone, [N]."""
     evaluation_count: NDArray[np.int64]
     """Evaluations of the right-hand side in adaptive steps, [N]; fixed steps take 4 each, not counted."""
-
-
-class DynamicsError(ArithmeticError):
-    """The motion of a vehicle cannot be integrated, or its command was not finite.
-
-    The vehicle is held at its last good state, the beginning of the interval that failed (in turbulence: of
-    its part from tick to tick), until it is reset;
-    other vehicles of the batch are not affected.
-
-    Attributes:
-        stamp_ns: Time of the last good state [ns].
-        vehicle: Index in the batch.
-        term: What failed: "velocity", "body_rate" or "rotor_speed_command".
-        state: The last good state, without the leading axis.
-    """
-
-    def __init__(self, stamp_ns: int, vehicle: int, term: str, state: MultirotorState) -> None:
-        super().__init__(stamp_ns, vehicle, term, state)
-        self.stamp_ns = stamp_ns
-        self.vehicle = vehicle
-        self.term = term
-        self.state = state
-
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: {self.term} cannot be integrated after {self.stamp_ns} ns; "
-            "last good state: "
-            + ", ".join(
-                f"{name} {np.array2string(v, precision=6)}" for name, v in self.state._asdict().items()
-            )
-        )
 
 
 class Multirotor:
@@ -167,8 +120,8 @@ class Multirotor:
         self.arrays = allocate_arrays(count, config.rotor_count, self.device)
         self._kernels = make_kernels(frozenset(self.terms))
         self._adaptive = (integrator == "dormand_prince", rtol, atol, evaluation_count_max)
-        self._model = make_airframe(config, self.device)
-        self.airframes = alike(self._model.airframe, count, self.device)
+        airframe, rotors = make_airframe(config, self.device)
+        self.airframes = alike(airframe, count, self.device)
         """Parameters of each vehicle, [N], which may be written between steps."""
         if seeds is None:
             own = np.arange(count, dtype=np.uint64) + np.uint64(seed)
@@ -187,18 +140,11 @@ class Multirotor:
             Surroundings,
             wind=wind,
             ground=make_ground(config.ground, config.rotor_position_m, self.device),
-            rotors=_struct(
-                Rotors,
-                quadratic_weight=self._model.quadratic_weight,
-                linear_weight=self._model.linear_weight,
-            ),
+            rotors=rotors,
         )
-        self._batch = _struct(Batch, **vars(self.arrays))
-        self._begin: wp.Launch | None = None
-        if self._kernels.begin is not None:
-            self._begin = self._record(self._kernels.begin, self.airframes, self._around, None, self._batch)
-        self._launches: dict[int, wp.Launch] = {}
-        self._acceleration_launch: wp.Launch | None = None
+        self._intervals: dict[int, Any] = {}
+        self._advance = RecordedLaunch(self.flight_kernel(record_nothing), self.device, block_dim=BLOCK_DIM)
+        self._accelerate = RecordedLaunch(self._kernels.accelerate, self.device, block_dim=BLOCK_DIM)
         self.reset()
 
     def reset(
@@ -244,8 +190,7 @@ class Multirotor:
             array.assign(value)
         for counter in (arrays.stamp_ns, arrays.status, arrays.redone_count, arrays.evaluation_count):
             counter.zero_()
-        if self._begin is not None:
-            self._begin.launch()
+        self.begin(None)
         self._stamp_ns = 0
 
     def step(self, rotor_speed_command: ArrayLike, duration_ns: int) -> None:
@@ -285,44 +230,40 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        launch = self._launches.get(duration_ns)
-        if launch is None:
-            launch = self._record_advance(duration_ns)
-        launch.launch()
+        kernel_inputs = [*self.flight_inputs(duration_ns), 0, 1, 0, 0, 0, 0]
+        self._advance.launch(self.count, kernel_inputs, key=duration_ns)
         self._stamp_ns += duration_ns
 
-    def flight(self, duration_ns: int, note: Any) -> tuple[Any, list[Any]]:
-        """Return the kernel that moves all vehicles by equal intervals, and its first parameters.
+    def flight_kernel(self, record: Any) -> Any:
+        """Return the kernel that moves all vehicles by equal intervals, and records the state after each.
 
         Args:
-            duration_ns: Length of an interval [ns].
-            note: Notes the state of a vehicle after each; see `integrator.make_flight`.
+            record: Warp function that records the state of a vehicle; see `integrator.make_flight`.
         """
-        model = [self.airframes, self._around, self._interval(duration_ns), self._batch]
-        return make_flight(frozenset(self.terms), note), model
+        return make_flight(frozenset(self.terms), record)
+
+    def flight_inputs(self, duration_ns: int) -> list[Any]:
+        """Return the first inputs of `flight_kernel` for intervals of a length [ns]; see `advance`."""
+        return [self.airframes, self._around, self._interval(duration_ns), self.arrays]
 
     def begin(self, mask: Any) -> None:
         """Take up the wind at time 0 for some vehicles, whose state was set in `arrays`; device form.
 
         Args:
-            mask: Not 0 for those vehicles, device array of int32, shape [N].
+            mask: Not 0 for those vehicles, device array of int32, shape [N]; None: all.
         """
         if self._kernels.begin is not None:
             wp.launch(
                 self._kernels.begin,
                 dim=self.count,
-                inputs=[self.airframes, self._around, mask, self._batch],
+                inputs=[self.airframes, self._around, mask, self.arrays],
                 device=self.device,
                 block_dim=BLOCK_DIM,
             )
 
     def accelerate(self) -> None:
         """Evaluate `arrays.acceleration` and `.angular_acceleration` at the current state; device form."""
-        if self._acceleration_launch is None:
-            self._acceleration_launch = self._record(
-                self._kernels.accelerate, self.airframes, self._around, self._batch
-            )
-        self._acceleration_launch.launch()
+        self._accelerate.launch(self.count, [self.airframes, self._around, self.arrays])
 
     def check(self) -> None:
         """Wait for the device and raise if a vehicle is held.
@@ -330,15 +271,7 @@ class Multirotor:
         Raises:
             DynamicsError: For the first vehicle that is held.
         """
-        status = self.arrays.status.numpy()
-        if status.any():
-            vehicle = int(np.flatnonzero(status)[0])
-            raise DynamicsError(
-                int(self.arrays.stamp_ns.numpy()[vehicle]),
-                vehicle,
-                STATUS_TERMS[status[vehicle]],
-                MultirotorState(*(rows[vehicle] for rows in self.state)),
-            )
+        check_status(self.arrays)
 
     @property
     def stamp_ns(self) -> int:
@@ -351,13 +284,7 @@ class Multirotor:
     @property
     def state(self) -> MultirotorState:
         """A copy of the state on the host; waits for the device."""
-        a = self.arrays
-        return MultirotorState(
-            *(
-                np.array(x.numpy())
-                for x in (a.position, a.velocity, a.orientation, a.body_rate, a.rotor_speed)
-            )
-        )
+        return read_state(self.arrays)
 
     @property
     def acceleration(self) -> Acceleration:
@@ -375,36 +302,21 @@ class Multirotor:
     def _rows(self, value: ArrayLike, name: str, width: int) -> NDArray[np.float64]:
         return as_rows(value, name=name, count=self.count, width=width)
 
-    def _record(self, kernel: Any, *parameters: Any) -> wp.Launch:
-        launch: wp.Launch = wp.launch(
-            kernel,
-            dim=self.count,
-            inputs=parameters,
-            device=self.device,
-            block_dim=BLOCK_DIM,
-            record_cmd=True,
-        )
-        return launch
-
-    def _record_advance(self, duration_ns: int) -> wp.Launch:
-        """Prepare the launch for one duration, and keep it."""
+    def _interval(self, duration_ns: int) -> Any:
+        """Return the parameters of an interval: the same struct each time, so that launches know it again."""
+        if duration_ns in self._intervals:
+            return self._intervals[duration_ns]
         if duration_ns <= 0:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
         if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
             raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
-        model = (self.airframes, self._around, self._interval(duration_ns), self._batch)
-        launch = self._record(make_advance(frozenset(self.terms)), *model)
-        if len(self._launches) >= _LAUNCH_COUNT_MAX:
-            del self._launches[next(iter(self._launches))]
-        self._launches[duration_ns] = launch
-        return launch
-
-    def _interval(self, duration_ns: int) -> Any:
+        if len(self._intervals) >= _INTERVAL_COUNT_MAX:
+            self._intervals.clear()
         step_count = -(-duration_ns // self.max_step_ns)
         step_s = duration_ns / step_count * 1e-9
         lag = lag_constants(step_s, self.config.motor_time_constant_s)
         is_adaptive, rtol, atol, evaluation_count_max = self._adaptive
-        return _struct(
+        self._intervals[duration_ns] = interval = _struct(
             Interval,
             duration_ns=duration_ns,
             max_step_ns=self.max_step_ns,
@@ -419,6 +331,7 @@ class Multirotor:
             atol=atol,
             evaluation_count_max=evaluation_count_max,
         )
+        return interval
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

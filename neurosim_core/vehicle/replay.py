@@ -22,7 +22,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.vehicle.airframe import MultirotorConfig
-from neurosim_core.vehicle.multirotor import Multirotor, MultirotorState
+from neurosim_core.vehicle.arrays import MultirotorState
+from neurosim_core.vehicle.multirotor import Multirotor
 
 Array = NDArray[np.float64]
 

@@ -16,11 +16,10 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
-from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.aerodynamics import Airframe
 from neurosim_core.vehicle.chart import chart_rate_4
-from neurosim_core.vehicle.equations import Equations
+from neurosim_core.vehicle.equations import Equations, Interval, RotorSums, Surroundings
 from neurosim_core.vehicle.ground import touches
-from neurosim_core.vehicle.surroundings import Surroundings
 
 GUARD_ABSOLUTE = 1e-3
 """Guard: largest embedded error estimate of one step at rest [m/s, rad/s]."""
@@ -33,10 +32,10 @@ GUARD_CONTACT = 1e4
 def make_rkmk4(equations: Equations) -> Any:
     """Return the device function that moves one vehicle by a number of equal steps.
 
-    Its arguments: the airframe; what surrounds it; index of the vehicle and time at the beginning [ns]; of
-    the sums over the rotors (`rotors.RotorSums`) the five parts; `LagConstants`; length [s] and number of
-    steps; position [m] and velocity [m/s] in W, attitude, body rate [rad/s]. It returns the last four, what
-    is left of the decaying part, and whether the guard tripped; then the others mean nothing.
+    Its arguments: the airframe; what surrounds it; the interval; the sums over the rotors; index of the
+    vehicle and time at the beginning [ns]; position [m] and velocity [m/s] in W, attitude, body rate [rad/s].
+    It returns the last four, what is left of the decaying part, and whether the guard tripped; then the
+    others mean nothing.
     """
     motor_lag, air_terms = equations.motor_lag, equations.air_terms
     wind, changing_wind = equations.wind, equations.changing_wind
@@ -78,18 +77,10 @@ def make_rkmk4(equations: Equations) -> Any:
     def fly_fixed(
         airframe: Airframe,
         around: Surroundings,
+        interval: Interval,
+        sums: RotorSums,
         vehicle: wp.int32,
         start_ns: wp.int64,
-        quadratic_cc: wp.vec4d,
-        quadratic_cd_0: wp.vec4d,
-        quadratic_dd_0: wp.vec4d,
-        linear_c: vec10d,
-        linear_d_0: vec10d,
-        speed_nodes: wp.vec3d,
-        square_nodes: wp.vec3d,
-        decay: wp.float64,
-        step_s: wp.float64,
-        step_count: wp.int32,
         x_0: wp.vec3d,
         v_0: wp.vec3d,
         q_0: wp.quatd,
@@ -99,12 +90,15 @@ def make_rkmk4(equations: Equations) -> Any:
         v = v_0
         q = q_0
         w = w_0
-        quadratic_cd = quadratic_cd_0
-        quadratic_dd = quadratic_dd_0
-        linear_d = linear_d_0
+        quadratic_cd = sums.quadratic_cd
+        quadratic_dd = sums.quadratic_dd
+        linear_d = sums.linear_d
+        speed_nodes = interval.speed_nodes
+        square_nodes = interval.square_nodes
+        decay = interval.decay
         down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
 
-        h = step_s
+        h = interval.step_s
         half = wp.float64(0.5) * h
         sixth = h / wp.float64(6.0)
         two = wp.float64(2.0)
@@ -113,14 +107,14 @@ def make_rkmk4(equations: Equations) -> Any:
 
         remaining = wp.float64(1.0)
         tripped = wp.bool(False)
-        for step in range(step_count):
+        for step in range(interval.step_count):
             t = wp.float64(step) * h
-            quadratic_1 = quadratic_cc
-            quadratic_2 = quadratic_cc
-            quadratic_4 = quadratic_cc
-            linear_1 = linear_c
-            linear_2 = linear_c
-            linear_4 = linear_c
+            quadratic_1 = sums.quadratic_cc
+            quadratic_2 = sums.quadratic_cc
+            quadratic_4 = sums.quadratic_cc
+            linear_1 = sums.linear_c
+            linear_2 = sums.linear_c
+            linear_4 = sums.linear_c
             if wp.static(motor_lag):
                 quadratic_1 += speed_nodes[0] * quadratic_cd + square_nodes[0] * quadratic_dd
                 quadratic_2 += speed_nodes[1] * quadratic_cd + square_nodes[1] * quadratic_dd

@@ -26,7 +26,7 @@ that have twice, hence the same spectra.
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import warp as wp
 from pydantic import Field, field_validator
@@ -304,17 +304,11 @@ def time_to_tick(wind: Wind, now_ns: wp.int64) -> wp.int64:
     return wind.tick_ns - now_ns % wind.tick_ns
 
 
-class WindFunctions(NamedTuple):
-    """What depends on the terms."""
+def make_wind_at(terms: frozenset[str]) -> Any:
+    """Return the function of the wind of the given terms: of wind, gusts and turbulence.
 
-    changes: bool
-    """Wind changes in time."""
-    at: Any
-    """(airframe, wind, vehicle, start_ns, t) -> velocity of the air in W [m/s] at t [s] after `start_ns`."""
-
-
-def make_wind_functions(terms: frozenset[str]) -> WindFunctions:
-    """Return the wind of the given terms: of wind, gusts and turbulence."""
+    (airframe, wind, vehicle, start_ns, t) -> velocity of the air in W [m/s] at t [s] after `start_ns`.
+    """
     constant = "wind" in terms
     gusts = "gusts" in terms
     turbulence = "turbulence" in terms
@@ -332,4 +326,4 @@ def make_wind_functions(terms: frozenset[str]) -> WindFunctions:
             velocity += _turbulence_at(wind, vehicle, start_ns, t)
         return velocity
 
-    return WindFunctions(gusts or turbulence, wind_at)
+    return wind_at

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.packets import EventArrays, Events, FieldSchema, Packet, as_numpy, join_events, schema_of
+from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, join_events, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.view.pictures import picture_of
 from neurosim_core.view.rerun_layout import PICTURES
@@ -23,33 +24,17 @@ _STEP_PX = 4
 """Every so many rows and columns tell how much there is to see in a picture."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EventView:
-    """The events that an event camera saw in a window of time."""
-
-    events: EventArrays
-    width: int
-    """Columns of the camera [px]."""
-    height: int
-    """Rows of the camera [px]."""
-    window_ns: int
-    """Length of the window [ns]."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Snapshot:
+class Snapshot(NamedTuple):
     """What the sensors of a vehicle saw at one moment."""
 
     stamp_ns: int
     """The moment [ns]."""
-    packets: dict[str, Packet] = field(default_factory=dict)
-    """The last packet of each sensor that sends pictures, points or bars, by its name."""
-    events: dict[str, EventView] = field(default_factory=dict)
-    """The window that ends at the moment, by the name of the event camera."""
+    packets: dict[str, Packet]
+    """By sensor, of those that send pictures, points or bars: the last packet, and of an event camera the
+    events of a window that ends at the moment."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class Track(NamedTuple):
     """Where the vehicle was, by time."""
 
     stamp_ns: NDArray[np.int64]
@@ -62,8 +47,7 @@ class Track:
     """Horizontal part of the direction in which the first camera looks, in W, shape [n, 2]."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Series:
+class Series(NamedTuple):
     """A field of the packets of a sensor, by time."""
 
     sensor: str
@@ -98,7 +82,7 @@ class FlightSummary:
         self._waiting_ns: int | None = None
         self._next_ns = 0
         self._best_interest = -np.inf
-        self._best: _Moment | None = None
+        self._best: tuple[Snapshot, dict[str, list[Events]]] | None = None
         self._series: dict[str, list[tuple[FieldSchema, _Rows]]] = {}
         self._pose = _Rows()
         self._pose_sensor = ""
@@ -140,7 +124,10 @@ class FlightSummary:
         if self._waiting_ns is not None:
             self._next_ns = 0
             self._consider(self._waiting_ns)
-        return (self._best or self._moment(self._stamp_ns)).snapshot(self._window_ns)
+        snapshot, recent = self._best or self._moment(self._stamp_ns)
+        begin_ns = snapshot.stamp_ns - self._window_ns
+        windows = {name: _window(packets, begin_ns, snapshot.stamp_ns) for name, packets in recent.items()}
+        return Snapshot(snapshot.stamp_ns, snapshot.packets | windows)
 
     def track(self) -> Track:
         """Return where the vehicle was so far, at no more than 20 000 times."""
@@ -150,16 +137,15 @@ class FlightSummary:
         if len(stamp_ns):
             R_WC = Rotation.from_quat(orientation) * Rotation.from_quat(self._q_BC)
             heading = R_WC.apply([0.0, 0.0, 1.0])[:, :2]
-        return Track(stamp_ns=stamp_ns, position=position, velocity=velocity, heading=heading)
+        return Track(stamp_ns, position, velocity, heading)
 
     def series(self) -> list[Series]:
         """Return the numbers that sensors measured so far, at no more than 20 000 times each."""
-        found = []
-        for sensor, plotted in self._series.items():
-            for number, rows in plotted:
-                stamp_ns, values = rows.arrays()
-                found.append(Series(sensor=sensor, field=number, stamp_ns=stamp_ns, values=values))
-        return found
+        return [
+            Series(sensor, number, *rows.arrays())
+            for sensor, plotted in self._series.items()
+            for number, rows in plotted
+        ]
 
     def _log_pose(self, packet: Any) -> None:
         self._pose_sensor = self._pose_sensor or packet.sensor
@@ -167,9 +153,10 @@ class FlightSummary:
             row = np.concatenate([packet.position, packet.velocity, packet.orientation])
             self._pose.add(packet.stamp_ns, row)
 
-    def _moment(self, stamp_ns: int) -> _Moment:
-        recent = {name: tuple(packets) for name, packets in self._recent.items()}
-        return _Moment(stamp_ns, dict(self._latest), recent)
+    def _moment(self, stamp_ns: int) -> tuple[Snapshot, dict[str, list[Events]]]:
+        """Return the present packets, and those of events: few moments are shown, so they are cut later."""
+        recent = {name: list(packets) for name, packets in self._recent.items()}
+        return Snapshot(stamp_ns, dict(self._latest)), recent
 
     def _consider(self, stamp_ns: int) -> None:
         """Keep the moment if there is more to see than at the best one so far."""
@@ -197,27 +184,12 @@ class FlightSummary:
             self._best_interest, self._best = interest, self._moment(stamp_ns)
 
 
-class _Moment(NamedTuple):
-    """The packets of which a snapshot is made: most moments are given up for better ones before that."""
-
-    stamp_ns: int
-    packets: dict[str, Packet]
-    recent: dict[str, tuple[Events, ...]]
-    """Packets of events, by camera, of at least the window before."""
-
-    def snapshot(self, window_ns: int) -> Snapshot:
-        begin_us, end_us = (self.stamp_ns - window_ns) // 1000, self.stamp_ns // 1000
-        views = {}
-        for name, packets in self.recent.items():
-            joined = join_events([packet.numpy() for packet in packets])
-            begin, end = np.searchsorted(joined.t, [begin_us + 1, end_us + 1])
-            views[name] = EventView(
-                events=joined.rows(slice(begin, end)),
-                width=packets[-1].width,
-                height=packets[-1].height,
-                window_ns=window_ns,
-            )
-        return Snapshot(stamp_ns=self.stamp_ns, packets=self.packets, events=views)
+def _window(packets: Sequence[Events], begin_ns: int, end_ns: int) -> Events:
+    """Return the events of a window of time as one packet."""
+    joined = join_events([packet.numpy() for packet in packets])
+    begin, end = np.searchsorted(joined.t, [begin_ns // 1000 + 1, end_ns // 1000 + 1])
+    events = joined.rows(slice(begin, end))._asdict()
+    return dataclasses.replace(packets[-1], start_ns=begin_ns, stamp_ns=end_ns, **events)
 
 
 class _Rows:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.install import need
-from neurosim_core.packets import Packet, as_numpy, schema_of
+from neurosim_core.packets import Events, Packet, as_numpy, schema_of
 from neurosim_core.scene.scene import Scene
-from neurosim_core.view.overview import EventView, FlightSummary, Snapshot, Track
+from neurosim_core.view.overview import FlightSummary, Snapshot, Track
 from neurosim_core.view.pictures import OFF_SRGB, ON_SRGB, color_picture, event_picture, picture_of
 from neurosim_core.view.plan import cut_plan
 from neurosim_core.view.rerun_layout import PICTURES, title
@@ -59,7 +59,7 @@ def save_overview(
     snapshot = summary.snapshot()
     track = summary.track() if track is None else track
     strips = _strips(summary, track)
-    sensors = sorted([*snapshot.packets, *snapshot.events], key=lambda name: _rank(snapshot, name))
+    sensors = sorted(snapshot.packets, key=lambda name: _rank(snapshot.packets[name]))
     others = len(sensors) + bool(summary.texts)
     more_rows = max(0, -(-(others + -(-len(strips) // _STRIPS_MAX) - 4) // 3))
     together = max(1, -(-len(strips) // max(1, min(4 + 3 * more_rows - others, len(strips) // 2))))
@@ -84,10 +84,9 @@ def save_overview(
         figure.savefig(path)
 
 
-def _rank(snapshot: Snapshot, name: str) -> int:
-    if name in snapshot.events:
+def _rank(packet: Packet) -> int:
+    if isinstance(packet, Events):
         return PICTURES.index("events")
-    packet = snapshot.packets[name]
     shown = schema_of(type(packet)).display in PICTURES
     return PICTURES.index(picture_of(packet)[0]) if shown else len(PICTURES)
 
@@ -131,10 +130,10 @@ def _short(count: int) -> str:
 
 
 def _draw_sensor(axes: Any, name: str, snapshot: Snapshot) -> None:
-    if name in snapshot.events:
-        _draw_events(axes, name, snapshot.events[name])
-        return
     packet = snapshot.packets[name]
+    if isinstance(packet, Events):
+        _draw_events(axes, packet)
+        return
     schema = schema_of(type(packet))
     axes.set_title(f"at {snapshot.stamp_ns * 1e-9:.2f} s", loc="right", color=_FAINT)
     if schema.display in PICTURES:
@@ -156,13 +155,12 @@ def _draw_sensor(axes: Any, name: str, snapshot: Snapshot) -> None:
         axes.margins(x=0.0)
 
 
-def _draw_events(axes: Any, name: str, view: EventView) -> None:
-    on = int(view.events.polarity.sum())
-    axes.set_title(f"{name}, {view.window_ns * 1e-6:g} ms", loc="left", fontweight="bold")
+def _draw_events(axes: Any, window: Events) -> None:
+    on, length_ms = int(window.polarity.sum()), (window.stamp_ns - window.start_ns) * 1e-6
+    axes.set_title(f"{window.sensor}, {length_ms:g} ms", loc="left", fontweight="bold")
     axes.set_title(f"{_short(on)} on", loc="center", color=np.array(ON_SRGB) / 255.0)
-    off = len(view.events.polarity) - on
-    axes.set_title(f"{_short(off)} off", loc="right", color=np.array(OFF_SRGB) / 255.0)
-    _show(axes, event_picture(view.events, width=view.width, height=view.height))
+    axes.set_title(f"{_short(len(window) - on)} off", loc="right", color=np.array(OFF_SRGB) / 255.0)
+    _show(axes, event_picture(window.numpy(), width=window.width, height=window.height))
 
 
 def _draw_picture(axes: Any, packet: Packet) -> None:

@@ -17,9 +17,8 @@ _SAMPLES = np.array([[i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3] for i in range(4)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """A scene cut by the plane z = height_m. Coordinates are those of the world."""
+    """A scene cut at a height. Coordinates are those of the world."""
 
-    height_m: float
     outlines: NDArray[np.float64]
     """Where the plane cuts surfaces [m], shape [n, 2, 2]: segments of two points (x, y)."""
     low_outlines: NDArray[np.float64]
@@ -50,7 +49,6 @@ def cut_plan(scene: Scene, *, height_m: float) -> Plan:
     if not len(shown):
         shown = scene.bounds_m[:, :2]
     return Plan(
-        height_m=height_m,
         outlines=outlines,
         low_outlines=_slice(scene, floor_m + 0.3 * (height_m - floor_m)),
         triangles=triangles,

@@ -38,7 +38,6 @@ from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
 from neurosim_core.view.event_views import EventViews
 from neurosim_core.view.pictures import picture_of
-from neurosim_core.view.rerun_batches import RateLimit, Table
 from neurosim_core.view.rerun_layout import (
     PICTURES,
     Panel,
@@ -49,7 +48,7 @@ from neurosim_core.view.rerun_layout import (
     picture_panel,
     sensor_panels,
 )
-from neurosim_core.view.rerun_sdk import TIMELINE, RerunStream, import_rerun
+from neurosim_core.view.rerun_sdk import TIMELINE, RateLimit, RerunStream, Table, import_rerun
 from neurosim_core.view.rerun_shapes import (
     SceneShapes,
     body_entity,
@@ -107,7 +106,7 @@ class RerunLogger:
         """Log what does not change, and the layout of the viewer.
 
         Args:
-            stream: Where to log: `open_rerun`.
+            stream: Where to log.
             vehicles: Descriptions of the sensors of each vehicle; packets of other sensors are shown without
                 frustum.
             scene: The scene to show.
@@ -152,7 +151,10 @@ class RerunLogger:
             recording.log(body(name), self._rr.TransformAxes3D(_AXES_M), static=True)
             for sensor in sensors:
                 self._log_description(name, sensor)
-        self._log_meshes()
+        if scene is not None:
+            self._bodies = scene.bodies
+            for entity, mesh in scene.meshes:
+                recording.log(entity, mesh, static=True)
         self._send_blueprint()
 
     def log(self, packet: Packet, *, vehicle: str | None = None) -> None:
@@ -245,12 +247,6 @@ class RerunLogger:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _log_meshes(self) -> None:
-        if self._scene is not None:
-            self._bodies = self._scene.bodies
-            for entity, mesh in self._scene.meshes:
-                self._recording.log(entity, mesh, static=True)
 
     def _show_sensor(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
         """Give the packets of a sensor their places in the layout, when the first comes."""
@@ -412,7 +408,9 @@ class RerunLogger:
                 rate_m_s = 1e3 * len(events.t) / length_ns
                 self._plot(f"plots/{vehicle}/{packet.sensor}/rate", end_ns, rate_m_s, ("events",))
                 if not self._live:
-                    self._recording.log(cloud_entity(vehicle, packet.sensor), views.points(events, end_ns))
+                    points, colors = views.points(events, end_ns)
+                    cloud = self._rr.Points3D(points, colors=colors)
+                    self._recording.log(cloud_entity(vehicle, packet.sensor), cloud)
 
     def _log_contact(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         self._set_time(packet.stamp_ns)

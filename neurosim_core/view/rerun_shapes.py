@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import Packet
 from neurosim_core.scene.bodies import Body, BodyConfig
-from neurosim_core.scene.body_shapes import Solid
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.srgb import linear_to_srgb8
 from neurosim_core.view.pictures import color_picture, picture_of
@@ -150,27 +149,18 @@ def body_entity(name: str) -> str:
     return f"world/bodies/{name}"
 
 
-def _mesh(source: Scene | Solid, faces: NDArray[np.int32], material: Material) -> Any:
+def _mesh(source: Scene, faces: NDArray[np.int32], material: Material) -> Any:
     used, triangles = np.unique(faces, return_inverse=True)
     texture = _texture(material)
+    albedo = np.array(material.base_color) + np.array(material.emission)
     return import_rerun().Mesh3D(
         vertex_positions=source.vertices[used],
         vertex_normals=source.normals[used],
         triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
-        vertex_texcoords=None if texture is None else _image_coordinates(source.uv[used]),
+        vertex_texcoords=None if texture is None else [0.0, 1.0] + [1.0, -1.0] * source.uv[used],  # v: down
         albedo_texture=texture,
-        albedo_factor=[*linear_to_srgb8(_albedo(material)), 255],
+        albedo_factor=[*linear_to_srgb8(albedo.clip(0.0, 1.0)), 255],
     )
-
-
-def _albedo(material: Material) -> NDArray[np.float64]:
-    color: NDArray[np.float64] = np.array(material.base_color) + np.array(material.emission)
-    return color.clip(0.0, 1.0)
-
-
-def _image_coordinates(uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rerun counts v from the top row."""
-    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
 
 
 def _texture(material: Material) -> NDArray[np.uint8] | None:

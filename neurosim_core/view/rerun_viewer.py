@@ -19,14 +19,16 @@ import urllib.parse
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import end_with_parent, stop_at_signals
-from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream, import_rerun
 
 HOST = "127.0.0.1"
 _START_S = 20.0
 _END_S = 0.5
+_CLOSE_S = 0.3
 _POLL_S = 0.1
 _WINDOW_MEMORY = "2GB"
 _SERVER_MEMORY = "1GB"
@@ -38,6 +40,9 @@ class ViewerEnded(RuntimeError):
 
 class RerunViewer:
     """A viewer that recordings can be opened in. A context manager that ends it."""
+
+    compress = False
+    """Its pictures need not be small, but there at once."""
 
     def __init__(
         self,
@@ -88,7 +93,7 @@ class RerunViewer:
 
     def open(self, name: str) -> RerunStream:
         """Open a recording in the viewer, which shows it at once."""
-        stream = open_rerun(name=name)
+        stream = RerunStream(name=name)
         stream.recording.connect_grpc(self.data_url)
         return stream
 
@@ -97,10 +102,22 @@ class RerunViewer:
         """Whether the process is gone, because its window was closed or it failed."""
         return self._process.poll() is not None
 
-    def check(self) -> None:
-        """See whether the viewer is still there."""
+    def check(self) -> bool:
+        """Return whether the viewer is still there; False: its window was closed."""
         if self._process.poll():
             raise ViewerEnded(f"the viewer ended with status {self._process.poll()}:\n{self._last_words()}")
+        return not self.ended
+
+    def close_recording(self, logger: Any) -> None:
+        """Close the logger of a recording. A viewer that does not take it is not waited for."""
+
+        def close() -> None:
+            with contextlib.suppress(OSError):
+                logger.close()
+
+        closing = threading.Thread(target=close, name="close recording", daemon=True)
+        closing.start()
+        closing.join(_CLOSE_S)
 
     def close(self) -> None:
         """End the process."""
@@ -168,9 +185,8 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
             print(f"open {viewer.page_url}", flush=True)
             if open_browser and has_display():
                 webbrowser.open(viewer.page_url)
-        while not stop.is_set() and not viewer.ended:
+        while not stop.is_set() and viewer.check():
             time.sleep(_POLL_S)
-        viewer.check()
     return 130 if stop.is_set() else 0
 
 

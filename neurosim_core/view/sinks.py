@@ -13,9 +13,8 @@ from neurosim_core.packets import Odometry, Packet
 from neurosim_core.sinks import SinkContext
 from neurosim_core.view.overview import FlightSummary, Track
 from neurosim_core.view.overview_plot import save_overview
-from neurosim_core.view.rerun_batches import Table
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream, Table
 from neurosim_core.view.rerun_shapes import scene_shapes
 
 _CHECK_S = 1.0
@@ -35,7 +34,7 @@ class RerunSink:
         self._checked_s = 0.0
         self._closed = False
         self._logger = RerunLogger(
-            open_rerun(file),
+            RerunStream(file),
             vehicles={self._vehicle: context.header.sensors},
             scene=scene_shapes(model.scene, model.bodies),
         )

@@ -7,8 +7,18 @@ import pytest
 
 from neurosim_core.bench import dynamics, dynamics_oracle
 from neurosim_core.bench.dynamics import RKMK4
-from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, short_flight
-from neurosim_core.bench.dynamics_oracle import Equations, compare, make_reference, solve
+from neurosim_core.bench.dynamics_oracle import (
+    EXTREMES,
+    FLIGHTS,
+    HOLD_NS,
+    Equations,
+    Flight,
+    at_rest,
+    compare,
+    make_reference,
+    short_flight,
+    solve,
+)
 from neurosim_core.bench.engine import Multirotor, preset
 from neurosim_core.bench.options import Options
 

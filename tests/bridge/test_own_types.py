@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +22,7 @@ from cortex_ros2_bridge.convert import registry
 from cortex_ros2_bridge.convert.registry import load_converters, ros_type_of, share
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.typestore import typestore
+from neurosim_core.live import messages as live
 
 EXAMPLE = ROOT / "examples" / "ros2_custom_type"
 
@@ -117,6 +119,24 @@ def test_an_unknown_type_goes_out_field_by_field() -> None:
     assert (got.pose.tolist(), list(got.flags)) == ([1.0, 2.0, 3.0], [True, False])
     fields = [name for name, _ in typestore("humble").fielddefs["my_robot/msg/Arm"][1]]
     assert fields[:2] == ["header", "joints"]
+
+
+def test_a_sensor_of_an_outside_package_goes_out_from_its_packet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither its message nor its type in ROS is written anywhere: both follow from the packet's fields."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    proximity = importlib.import_module("custom_sensor").Proximity
+    kind = live.message_type(proximity)
+    reading = proximity(stamp_ns=3_000_000_007, sensor="prox", sequence=9, closed=True, height_m=0.25)
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/prox", kind)
+        (ros,) = rig.opens("/drone/prox")
+        assert ros.type_name == "neurosim/msg/Proximity"
+        with rig.listening(sent, "/drone/prox"):
+            sent.publish(live.to_message(reading, frame_id="drone/prox"))
+            wait_for(lambda: ros.sent)
+        got = ros.messages()[0]
+    assert (got.header.stamp.sec, got.header.stamp.nanosec, got.header.frame_id) == (3, 7, "drone/prox")
+    assert (got.closed, got.height_m) == (True, 0.25)
 
 
 def test_a_picture_of_any_type_goes_out_as_an_image_with_what_its_labels_mean() -> None:

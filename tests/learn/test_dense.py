@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -22,11 +21,9 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 
 from neurosim_core.learn import dense_train, dense_worlds  # noqa: E402
 from neurosim_core.learn.dense import DenseNet  # noqa: E402
-from neurosim_core.learn.dense_live import live_flights  # noqa: E402
 from neurosim_core.learn.dense_train import (  # noqa: E402
-    HEADS,
     DenseConfig,
-    WindowPool,
+    ReplayBuffer,
     evaluate,
     held_out_windows,
     load_dense,
@@ -34,7 +31,7 @@ from neurosim_core.learn.dense_train import (  # noqa: E402
     windows_of,
 )
 from neurosim_core.learn.dense_worlds import world_windows  # noqa: E402
-from neurosim_core.learn.heads import DepthErrorSums, depth_loss  # noqa: E402
+from neurosim_core.learn.heads import HEADS, depth_loss  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -52,10 +49,13 @@ def test_metrics_of_depth_are_those_of_the_formulas():
     found = depth * np.exp(random.normal(0.1, 0.3, depth.shape)).astype(np.float32)
     depth[0, 0, :4] = np.inf
     depth[1, 1, 0] = 100.0  # beyond what counts
-    sums = DepthErrorSums()
-    sums.add(torch.from_numpy(found[:1]).log(), torch.from_numpy(depth[:1]))
-    sums.add(torch.from_numpy(found[1:]).log(), torch.from_numpy(depth[1:]))
-    result = sums.result()
+    head, seen = HEADS["depth"], torch.zeros(1)
+    result = head.errors(
+        sum(
+            head.measure(torch.from_numpy(one).log(), torch.from_numpy(truth), seen)
+            for one, truth in zip(found, depth, strict=True)
+        )
+    )
     known = depth < 80.0
     d, f = depth[known].astype(np.float64), found[known].astype(np.float64)
     error = np.log(f / d)
@@ -102,25 +102,23 @@ def test_metrics_of_flow_and_of_future_events_are_those_of_the_formulas():
     flow[0, 0, 0, :3] = np.nan
     seen = (random.random((2, 1, 6, 8)) < 0.3).astype(np.float32)
     tensors = [torch.from_numpy(array) for array in (found, flow, seen)]
-    sums = HEADS["flow"].errors()
-    sums.add(*tensors)
+    sums = HEADS["flow"].measure(*tensors)
     off = np.linalg.norm(found - flow, axis=1)
     known, fired = np.isfinite(off), np.isfinite(off) & (seen[:, 0] > 0)
     expected = [f(off[k]) for k in (known, fired) for f in (np.mean, lambda o: np.mean(o > 3.0))]
-    assert sums.result() == pytest.approx(expected, rel=1e-5)
+    assert HEADS["flow"].errors(sums) == pytest.approx(expected, rel=1e-5)
     loss = HEADS["flow"].loss(*tensors[:2]).item()
     assert loss == pytest.approx(off[known].mean(), rel=1e-4)  # where errors are far above 0.001 px
 
     odds = random.normal(-1.0, 2.0, (2, 2, 6, 8))
     truth = (random.random(odds.shape) < 0.2).astype(np.float32)
-    sums = HEADS["pretrain"].errors()
-    sums.add(torch.from_numpy(odds), torch.from_numpy(truth), tensors[2])
+    sums = HEADS["pretrain"].measure(torch.from_numpy(odds), torch.from_numpy(truth), tensors[2])
     chance = 1.0 / (1.0 + np.exp(-odds))
     bits = -np.log2(np.where(truth > 0, chance, 1.0 - chance)).mean()
     hit, said = ((chance > 0.5) & (truth > 0)).sum(), (chance > 0.5).sum()
     precision, recall = hit / said, hit / truth.sum()
     f1 = 2.0 / (1.0 / precision + 1.0 / recall)
-    assert sums.result() == pytest.approx((bits, f1), rel=1e-6)
+    assert HEADS["pretrain"].errors(sums) == pytest.approx((bits, f1), rel=1e-6)
 
 
 def window(number, source, value):
@@ -133,13 +131,13 @@ def window(number, source, value):
 
 
 def test_a_pool_has_sequences_of_one_flight_without_gaps():
-    pool = WindowPool(length=2, room=6)
+    buffer = ReplayBuffer(length=2, capacity=6)
     mixed = [window(0, "a", 100), window(0, "b", 200), window(1, "a", 101), window(1, "b", 201)]
     gap = [window(2, "a", 102), window(4, "a", 104), window(5, "a", 105)]
     for sample in (*mixed, *gap):
-        pool.add(windows_of(collate([sample]), HEADS["depth"], 1))
-    assert (len(pool), pool.window_count) == (3, 7)
-    voxel, depth = pool.draw(64, np.random.default_rng(0))
+        buffer.add(windows_of(collate([sample]), HEADS["depth"], 1))
+    assert (len(buffer), buffer.window_count) == (3, 7)
+    voxel, depth = buffer.draw(64, np.random.default_rng(0))
     assert voxel.shape == (2, 64, 1, 8, 8)
     corners = {tuple(sorted((row[0].item(), row[-1].item()))) for row in depth[0, :, 0, 0]}
     assert corners == {(100, 107), (200, 207), (104, 111)}
@@ -147,17 +145,17 @@ def test_a_pool_has_sequences_of_one_flight_without_gaps():
     mirrored = depth[0, :, 0, 0, 0] > depth[0, :, 0, 0, -1]
     assert 10 < mirrored.sum() < 54
     for number in range(6, 14):  # the oldest go
-        pool.add(windows_of(collate([window(number, "a", number)]), HEADS["depth"], 1))
-    assert len(pool) == 3
-    assert pool.draw(64, np.random.default_rng(0))[1].max() <= 20
+        buffer.add(windows_of(collate([window(number, "a", number)]), HEADS["depth"], 1))
+    assert len(buffer) == 3
+    assert buffer.draw(64, np.random.default_rng(0))[1].max() <= 20
 
 
 def test_a_mirrored_flow_goes_the_other_way():
-    pool = WindowPool(length=1, room=1, mirrored=HEADS["flow"].mirrored)
+    buffer = ReplayBuffer(length=1, capacity=1, mirrored=HEADS["flow"].mirrored)
     sample = window(0, "a", 0)
     flow = np.stack([np.full((8, 8), 2.0), np.full((8, 8), 3.0)], -1).astype(np.float32)
-    pool.add(windows_of(collate([replace(sample, flow=flow)]), HEADS["flow"], 1))
-    _, drawn = pool.draw(64, np.random.default_rng(0))
+    buffer.add(windows_of(collate([replace(sample, flow=flow)]), HEADS["flow"], 1))
+    _, drawn = buffer.draw(64, np.random.default_rng(0))
     assert {tuple(pair) for pair in drawn[0, :, :, 0, 0].tolist()} == {(2.0, 3.0), (-2.0, 3.0)}
 
 
@@ -257,22 +255,6 @@ def test_worlds_give_the_windows_of_runs(scene):
     assert torch.equal(counts.target.sum((1, 2, 3)) > 0, counts.voxel.abs().sum((1, 2, 3)) > 0)
     with pytest.raises(ValueError, match="whole periods"):
         next(world_windows(config, HEADS["flow"], worlds=2, bins=5, window_s=0.0505))
-
-
-def test_live_flights_end_with_their_input(scene, monkeypatch):
-    """As it does when the process that learns from them is killed."""
-    begun = []
-    popen = subprocess.Popen
-
-    def begin(*arguments, **options):
-        begun.append(popen(*arguments, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", begin)
-    with live_flights(1, settings(scene)):
-        (process,) = begun
-        process.stdin.close()
-        assert process.wait(timeout=60.0) == 0
 
 
 def test_worlds_draw_thresholds_and_render_as_often_as_is_said(scene, monkeypatch):

@@ -23,8 +23,14 @@ torch = pytest.importorskip("torch", reason="needs the extra learn")
 import rank_process  # noqa: E402
 
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.evaluate import EPISODE_SEED, evaluate_policy, student_actor, teacher_actor  # noqa: E402
-from neurosim_core.learn.film import film_episode, film_sensors  # noqa: E402
+from neurosim_core.learn.evaluate import (  # noqa: E402
+    EPISODE_SEED,
+    evaluate_policy,
+    film_episode,
+    film_sensors,
+    student_actor,
+    teacher_actor,
+)
 from neurosim_core.learn.policies import EventPolicy  # noqa: E402
 from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
 from neurosim_core.learn.randomisation import NO_RANDOMISATION  # noqa: E402
@@ -330,7 +336,7 @@ def test_a_policy_sees_voxels_of_both_signs():
     policy = EventPolicy(channels=5, height=8, width=8, vector_size=3)
     voxels, vector = torch.full((2, 5, 8, 8), 3.0), torch.zeros(2, 3)
     voxels[1] = -3.0  # as many events, but darker
-    seen = policy.see(voxels, vector)
+    seen = policy.encode(voxels, vector)
     assert seen.isfinite().all()
     assert not torch.allclose(seen[0], seen[1])
 

@@ -49,7 +49,6 @@ def test_a_million_deadlines_at_333_hz_do_not_drift(factor, numerator, denominat
         stamp_ns = step * 1_000_000_000 // 333
         assert pacer.wait_until(stamp_ns) == 60_000
         assert clock.now_ns == START_NS + stamp_ns * denominator // numerator + 60_000
-    assert pacer.slipped_ns == 0
 
 
 @given(
@@ -83,7 +82,7 @@ def test_deadlines_are_exact_after_thirty_years():
     assert pacer.wall_ns(10**18 + 1) == START_NS + 10**18 + 1
 
 
-def test_slip_puts_off_what_follows_and_counts_it():
+def test_slip_puts_off_what_follows():
     clock = FakeClock()
     pacer = make_pacer(clock, 0.5)
     pacer.wait_until(10 * MS)
@@ -99,7 +98,6 @@ def test_slip_puts_off_what_follows_and_counts_it():
     assert pacer.lateness_ns(40 * MS) == -20 * MS
     clock.now_ns += 21 * MS
     assert pacer.slip(40 * MS) == MS
-    assert pacer.slipped_ns == 31 * MS
 
 
 def test_factor_0_never_waits():
@@ -110,7 +108,7 @@ def test_factor_0_never_waits():
         clock.now_ns += 5
         assert (pacer.slip(step * 10**9), pacer.lateness_ns(step)) == (0, 0)
         assert pacer.wall_ns(step) == clock.now_ns
-    assert (clock.sleeps_ns, pacer.slipped_ns) == ([], 0)
+    assert clock.sleeps_ns == []
 
 
 def test_start_lets_a_stamp_be_now():

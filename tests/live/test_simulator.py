@@ -35,8 +35,8 @@ from cortex.messages import (
 )
 from cortex.messages import Delivery as DeliveryMessage
 from neurosim_core.config import load_config
-from neurosim_core.live import cameras
-from neurosim_core.live.cameras import frame_counts
+from neurosim_core.live import streaming
+from neurosim_core.live.streaming import frame_counts
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Recording
 from neurosim_core.sim import Batch, Model, State, forget_controllers, make_state, observe, step
@@ -399,14 +399,14 @@ def test_the_fail_safe_ends_with_the_next_command():
 
 def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
     """Let the rendering of a batch with frames take longer."""
-    render = cameras.render_batch
+    render = streaming.render_batch
 
     def slow(model: Model, state: State, batch: Batch) -> Any:
         if frame_counts(state, batch):
             time.sleep(seconds)
         return render(model, state, batch)
 
-    monkeypatch.setattr(cameras, "render_batch", slow)
+    monkeypatch.setattr(streaming, "render_batch", slow)
 
 
 def test_slow_cameras_slow_time_down(monkeypatch: pytest.MonkeyPatch):
@@ -464,7 +464,7 @@ def test_what_is_left_out_at_the_end_is_counted(monkeypatch: pytest.MonkeyPatch,
 def test_the_end_of_a_run_waits_for_the_picture_in_work_for_a_limited_time(
     monkeypatch: pytest.MonkeyPatch, give_up_s: float, stamps_ms: list[int]
 ):
-    render, reached, told = cameras.render_batch, threading.Event(), []
+    render, reached, told = streaming.render_batch, threading.Event(), []
 
     def held(model: Model, state: State, batch: Batch) -> Any:
         if batch.until_ns == 20 * MS:
@@ -472,8 +472,8 @@ def test_the_end_of_a_run_waits_for_the_picture_in_work_for_a_limited_time(
             assert release.wait(SOON_S)
         return render(model, state, batch)
 
-    monkeypatch.setattr(cameras, "render_batch", held)
-    monkeypatch.setattr("neurosim_core.live.cameras.GIVE_UP_S", give_up_s)
+    monkeypatch.setattr(streaming, "render_batch", held)
+    monkeypatch.setattr("neurosim_core.live.streaming.GIVE_UP_S", give_up_s)
     with LiveRig(make_config()) as rig:
         release = rig.stop if give_up_s else threading.Event()
         rig.simulator.status.on_status = told.append
@@ -492,7 +492,7 @@ def test_cameras_that_fail_end_it(monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any) -> Any:
         raise ValueError("no picture")
 
-    monkeypatch.setattr(cameras, "render_batch", fail)
+    monkeypatch.setattr(streaming, "render_batch", fail)
     with LiveRig(make_config()) as rig:
         rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())

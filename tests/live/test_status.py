@@ -31,7 +31,7 @@ from cortex.messages import (
     VehicleStatus,
 )
 from neurosim_core.config import load_config
-from neurosim_core.live import cameras
+from neurosim_core.live import streaming
 from neurosim_core.live.serve import StatusLine, serve
 from neurosim_core.record import Recording
 
@@ -163,14 +163,14 @@ def test_the_line_names_who_holds_it_up():
 
 def test_pictures_that_come_late_are_said_to(monkeypatch: pytest.MonkeyPatch):
     """A camera that takes 30 ms for each look is late by about that; the IMU beside it is not."""
-    render = cameras.render_batch
+    render = streaming.render_batch
 
     def slow(*arguments: Any) -> Any:
         packets = render(*arguments)
         threading.Event().wait(0.03)
         return packets
 
-    monkeypatch.setattr(cameras, "render_batch", slow)
+    monkeypatch.setattr(streaming, "render_batch", slow)
     with LiveRig(make_config()) as rig:
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())

@@ -19,7 +19,7 @@ from processes import ROOT, SOON_S, processes_with, wait_for
 SUPERVISOR = """
 import json, sys
 from rich.console import Console
-from neurosim_core.live.supervisor import Part, run_together
+from neurosim_core.live.up import Part, run_together
 given = json.loads(sys.argv[1])
 parts = [Part(**part) for part in given.pop("parts")]
 sys.exit(run_together(parts, console=Console(highlight=False), **given))

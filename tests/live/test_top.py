@@ -8,7 +8,7 @@ from dataclasses import replace
 from rich.console import Console
 
 from cortex.messages import SensorStatus, SimulatorStatus
-from neurosim_core.live.top import Dashboard
+from neurosim_core.live.call import Dashboard
 
 STATUS = SimulatorStatus(
     stamp_ns=1_000_000_000,

@@ -11,7 +11,7 @@ import pytest
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live import up as up_module
-from neurosim_core.live.supervisor import Part
+from neurosim_core.live.up import Part
 
 
 @pytest.fixture

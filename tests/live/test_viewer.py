@@ -31,7 +31,7 @@ from neurosim_core.live.session import ViewOptions
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
 from neurosim_core.view.pictures import event_picture
-from neurosim_core.view.rerun_targets import FileTarget
+from neurosim_core.view.rerun_sdk import RerunFiles
 
 BODY = "/world/vehicles/drone"
 
@@ -59,7 +59,7 @@ class Watcher:
         to_the_end = options.pop("to_the_end", False)
         shown = ViewOptions(**options)
         with Node("viewer") as node:
-            outlet = FileTarget(path, self.said.append)
+            outlet = RerunFiles(path, self.said.append)
             return watch(node, outlet, shown, stop=self._stop, say=self.said.append, to_the_end=to_the_end)
 
     def wait_for(self, text: str) -> None:

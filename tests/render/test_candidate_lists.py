@@ -14,14 +14,13 @@ from small_room import room_scene
 
 from neurosim_core import run
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
+from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists, tile_bounds
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
+from neurosim_core.render.kernel_data import RenderTerms
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.ray_layers import ray_layers
 from neurosim_core.render.raycast import raycast_kernel
-from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_arrays import upload_scene
-from neurosim_core.render.tile_bounds import tile_bounds
 from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make_body_poses
 from neurosim_core.scene.scene import Material

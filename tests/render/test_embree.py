@@ -18,6 +18,7 @@ from neurosim_core.render import embree
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_caster, packet_width
+from neurosim_core.render.kernel_data import Hit
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.refine import refine
 from neurosim_core.render.scene_arrays import upload_scene
@@ -42,25 +43,13 @@ def make_embree_kernel(width):
         scene: wp.uint64,
         origins: wp.array[wp.vec3],
         rays: wp.array2d[wp.vec3],
-        face_out: wp.array2d[int],
-        t_out: wp.array2d[float],
-        u_out: wp.array2d[float],
-        v_out: wp.array2d[float],
-        normal_out: wp.array2d[wp.vec3],
+        hit_out: wp.array2d[Hit],
     ):
         packet = wp.tid()
-        cast_packet(
-            intersect,
-            scene,
-            origins[packet],
-            rays[packet],
-            1.0e9,
-            face_out[packet],
-            t_out[packet],
-            u_out[packet],
-            v_out[packet],
-            normal_out[packet],
-        )
+        origin = wp.zeros(shape=(16,), dtype=wp.vec3)
+        for lane in range(16):
+            origin[lane] = origins[packet]
+        cast_packet(intersect, scene, origin, rays[packet], 1.0e9, hit_out[packet])
 
     return embree_rays
 
@@ -70,28 +59,27 @@ def warp_rays(
     mesh: wp.uint64,
     origins: wp.array[wp.vec3],
     rays: wp.array2d[wp.vec3],
-    face_out: wp.array2d[int],
-    t_out: wp.array2d[float],
-    u_out: wp.array2d[float],
-    v_out: wp.array2d[float],
-    normal_out: wp.array2d[wp.vec3],
+    hit_out: wp.array2d[Hit],
 ):
     packet, lane = wp.tid()
     query = wp.mesh_query_ray(mesh, origins[packet], rays[packet, lane], 1.0e9)
-    face_out[packet, lane] = wp.where(query.result, query.face, -1)
-    t_out[packet, lane] = query.t
-    u_out[packet, lane] = query.u
-    v_out[packet, lane] = query.v
-    normal_out[packet, lane] = query.normal
+    hit = Hit()
+    hit.face = wp.where(query.result, query.face, -1)
+    hit.t = query.t
+    hit.u = query.u
+    hit.v = query.v
+    hit.normal = query.normal
+    hit_out[packet, lane] = hit
 
 
-def outputs(count):
-    return [wp.empty((count, 16), dtype=dtype, device="cpu") for dtype in (int, float, float, float, wp.vec3)]
+def columns(hits):
+    """Return face, t, u, v, normal."""
+    return [hits.numpy()[name] for name in ("face", "t", "u", "v", "normal")]
 
 
 def cast(tree, origins, rays, width, scene=None):
     """Cast 16 rays from each origin; return face, t, u, v, normal."""
-    got = outputs(len(origins))
+    got = wp.empty((len(origins), 16), dtype=Hit, device="cpu")
     wp.launch(
         make_embree_kernel(width),
         dim=len(origins),
@@ -101,17 +89,17 @@ def cast(tree, origins, rays, width, scene=None):
             wp.array(origins, dtype=wp.vec3, device="cpu"),
             wp.array(rays, dtype=wp.vec3, device="cpu"),
         ],
-        outputs=got,
+        outputs=[got],
         device="cpu",
     )
-    return [x.numpy() for x in got]
+    return columns(got)
 
 
 def cast_by_warp(vertices, faces, origins, rays):
     mesh = wp.Mesh(
         wp.array(vertices, dtype=wp.vec3, device="cpu"), wp.array(faces.reshape(-1), dtype=int, device="cpu")
     )
-    got = outputs(len(origins))
+    got = wp.empty((len(origins), 16), dtype=Hit, device="cpu")
     wp.launch(
         warp_rays,
         dim=(len(origins), 16),
@@ -120,10 +108,10 @@ def cast_by_warp(vertices, faces, origins, rays):
             wp.array(origins, dtype=wp.vec3, device="cpu"),
             wp.array(rays, dtype=wp.vec3, device="cpu"),
         ],
-        outputs=got,
+        outputs=[got],
         device="cpu",
     )
-    return [x.numpy() for x in got]
+    return columns(got)
 
 
 def unit(x):

@@ -15,10 +15,10 @@ from neurosim_core.frames import Q_FORWARD_OPTICAL
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, packet_width
+from neurosim_core.render.kernel_data import RenderTerms
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.pyrender_renderer import PyrenderError
 from neurosim_core.render.raycast import raycast_kernel
-from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.renderer import make_renderer, upload_scene
 from neurosim_core.render.warp_renderer import RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import (

@@ -8,8 +8,9 @@ import trimesh
 import warp as wp
 from render_scenes import UNSHADOWED, plane, scene_of
 
+from neurosim_core.render.kernel_data import RayTree
 from neurosim_core.render.ray_intersection import UNFUSED, intersect_face
-from neurosim_core.render.ray_tree import RayTree, intersect_tree, make_ray_tree
+from neurosim_core.render.ray_tree import intersect_tree, make_ray_tree
 from neurosim_core.render.scene_arrays import upload_scene
 
 FAR = 1.0e9

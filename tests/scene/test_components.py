@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse
 
-from neurosim_core.scene.components import connected_components
+from neurosim_core.scene.topology import connected_components
 
 
 @pytest.mark.parametrize("seed", range(5))

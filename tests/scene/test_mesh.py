@@ -20,8 +20,8 @@ from pydantic import ValidationError
 
 from neurosim_core.scene import gltf
 from neurosim_core.scene.mesh import MeshSceneConfig, SceneError, load_mesh_scene
-from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.topology import smooth_normals
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)

@@ -53,6 +53,9 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     with SceneReader({"scene": {"file": str(file)}}) as reader:
         geometry = reader.geometry(config)
         scene = reader.scene(config)
+        pairs = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
+        pictures = [one and (one.srgb, one.pack_levels()) for one, _ in pairs]
+        connections = scene.connections
     for name in ("vertices", "faces", "normals"):
         np.testing.assert_array_equal(getattr(geometry, name), getattr(loaded, name), strict=True)
     for name, values in arrays_of(loaded).items():
@@ -63,20 +66,19 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     assert len(mesh.faces) > len(loaded.faces)
     for found, expected in zip(mesh.corner_groups, wanted.corner_groups, strict=True):
         np.testing.assert_array_equal(found, expected, strict=True)
-    for found, expected in zip(scene.connections, loaded.connections, strict=True):
+    for found, expected in zip(connections, loaded.connections, strict=True):
         np.testing.assert_array_equal(found, expected, strict=True)
     assert refine(scene, 0.5) is mesh
     assert scene.notes == loaded.notes
     assert (scene.lights, scene.instance_names) == (loaded.lights, loaded.instance_names)
-    pairs = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
-    assert any(one is not None for one, _ in pairs)
-    for one, other in pairs:
-        assert (one is None) == (other is None)
-        if one is not None and other is not None:
-            np.testing.assert_array_equal(one.srgb, other.srgb)
-            levels = one.take_levels()
+    assert any(pictures)
+    for picture, (_, other) in zip(pictures, pairs, strict=True):
+        assert (picture is None) == (other is None)
+        if picture is not None and other is not None:
+            srgb, levels = picture
+            np.testing.assert_array_equal(srgb, other.srgb)
             assert len(levels) == 3  # of 4 x 4 texels
-            for found, expected in zip(levels, other.take_levels(), strict=True):
+            for found, expected in zip(levels, other.pack_levels(), strict=True):
                 np.testing.assert_array_equal(found, expected, strict=True)
 
 

@@ -11,7 +11,7 @@ from small_room import fly_in_room, room_scene, write_room
 import neurosim_core as ns
 from neurosim_core.live.messages import to_message, to_packet
 from neurosim_core.scene.bodies import BodyConfig, body_poses
-from neurosim_core.scene.corners import find_corners
+from neurosim_core.scene.topology import find_corners
 from neurosim_core.sensors.corners import Corners, CornersConfig
 
 W, H, F = 64, 48, 40.0

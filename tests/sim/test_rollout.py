@@ -20,7 +20,10 @@ from neurosim_core.control import Controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.render import launch
 from neurosim_core.runtime import cuda
-from neurosim_core.sim import render_group, render_job
+from neurosim_core.sim import render_group
+from neurosim_core.sim.cameras import plan_job, render
+from neurosim_core.sim.integrate import plan_batch
+from neurosim_core.sim.schedule import boundaries
 from neurosim_core.vehicle import DynamicsError
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
@@ -146,17 +149,14 @@ def test_batches_in_flight_share_no_list_of_slots(settings):
     model = sim.make_model(ns.load_config(settings))
     state = sim.make_state(model, in_flight=2)
     sim.start(model, state)
-    (group,) = state.groups
-    first, again, other = (
-        render_job.plan_render(
-            group, state.trace, [0, 0], [0, 2_000_000], buffer_index=index, wanted=frozenset(group.frames)
-        ).render()
-        for index in (0, 0, 1)
-    )
-    for mine, repeated, theirs, expected in zip(first, again, other, ([0, 0], [-1, -1]), strict=True):
+    batch = plan_batch(state, boundaries(model.schedule, 0, 4_000_000), closed_loop=True)
+    later = dataclasses.replace(batch, number=batch.number + 1)  # the same slots of the trace
+    first, again, other = (render(plan_job(state, each, 0, [0, 1])) for each in (batch, batch, later))
+    for mine, repeated, theirs in zip(first, again, other, strict=True):
         assert mine is repeated
         assert mine.ptr != theirs.ptr
-        assert mine.numpy().tolist()[:2] == theirs.numpy().tolist()[:2] == expected
+        assert mine.numpy().tolist() == theirs.numpy().tolist()
+    assert first[0].numpy().tolist() == [batch.slot, batch.slot + 1]
 
 
 @pytest.mark.parametrize("lane_count", [1, 2, 3])

@@ -15,12 +15,12 @@ from neurosim_core.sim.trace import (
     POSITION,
     ROTOR_SPEED,
     VELOCITY,
-    Fleet,
     Trace,
+    WorldArrays,
     make_surfaces,
 )
 from neurosim_core.vehicle import Multirotor, preset
-from neurosim_core.vehicle.status import STATUS_COLLISION
+from neurosim_core.vehicle.arrays import STATUS_COLLISION, allocate_arrays
 
 
 def floor_field(device, height_m):
@@ -38,85 +38,86 @@ def floor_field(device, height_m):
     return field, floor
 
 
-def surfaces_of(field, device, world_count, *, holds=False):
+def surfaces_of(field, device, world_count, *, stop_on_contact=False):
     return make_surfaces(
         wp.array([field], dtype=DistanceField, device=device),
         wp.zeros(world_count, dtype=int, device=device),
         radius_m=0.2,
         ground_height_m=None,
-        holds=holds,
+        stop_on_contact=stop_on_contact,
     )
 
 
-def fleet_of(position, device, **given):
-    """Return vehicles at some places; what is not given is 0."""
-    count = len(position)
-    fleet = Fleet()
-    values = {
-        "position": (position, wp.vec3d),
-        "velocity": (np.zeros((count, 3)), wp.vec3d),
-        "orientation": (np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), wp.quatd),
-        "body_rate": (np.zeros((count, 3)), wp.vec3d),
-        "rotor_speed": (np.zeros((count, 4)), wp.float64),
-        "rotor_speed_command": (np.zeros((count, 4)), wp.float64),
-        "active": (np.ones(count), wp.int32),
-        **{name: (np.zeros(count), wp.int64) for name in ("stamp_ns", "redone_count", "clock_ns")},
-        "evaluation_count": (np.zeros(count), wp.int64),
-        **{name: (np.zeros(count), wp.int32) for name in ("status", "collided")},
-    }
-    for name, (value, dtype) in values.items():
-        setattr(fleet, name, wp.array(given.get(name, value), dtype=dtype, device=device))
-    return fleet
+def worlds_of(vehicles, device, **given):
+    """Return worlds of vehicles; what is not given is 0, and all are active."""
+    worlds = WorldArrays()
+    worlds.vehicles = vehicles
+    count = len(vehicles.position)
+    for name, dtype in (("clock_ns", wp.int64), ("collided", wp.int32), ("active", wp.int32)):
+        value = given.get(name, np.full(count, int(name == "active")))
+        setattr(worlds, name, wp.array(value, dtype=dtype, device=device))
+    return worlds
+
+
+def vehicles_of(rotor_count, device, **given):
+    """Return vehicles in some state; what is not given is 0."""
+    vehicles = allocate_arrays(len(given["position"]), rotor_count, device)
+    vehicles.orientation.fill_((0.0, 0.0, 0.0, 1.0))
+    for name, value in given.items():
+        getattr(vehicles, name).assign(np.asarray(value))
+    return vehicles
 
 
 def test_camera_pose_is_body_pose_times_mount(device):
     rng = np.random.default_rng(0)
     position = rng.normal(size=(1, 3))
     orientation = Rotation.random(1, random_state=1).as_quat()
-    fleet = fleet_of(
-        position,
+    vehicles = vehicles_of(
+        6,
         device,
+        position=position,
         orientation=orientation,
         velocity=rng.normal(size=(1, 3)),
         body_rate=rng.normal(size=(1, 3)),
         rotor_speed=rng.normal(size=(1, 6)),
         status=[3],
-        clock_ns=[2**53],
         redone_count=[3],
     )
+    worlds = worlds_of(vehicles, device, clock_ns=[2**53])
     field, _floor = floor_field(device, np.full((4, 4, 4), 9.0, np.float32))
-    trace = Trace(capacity=3, world_count=1, rotor_count=6, device=device)
-    trace.bring_to_host()
-    trace.record(surfaces_of(field, device, 1), fleet, 2, 1, first=True, last=True)
+    trace = Trace(surfaces_of(field, device, 1), worlds, capacity=3, history_length=4)
+    trace.record(2, 1, first=True, last=True)
     trace.fetch(1, 2)
     wp.synchronize_device(device)
     rows = trace.numpy(1, 2)
     assert rows.status.tolist() == [[0], [3]]
     assert rows.redone.tolist() == [[0], [3]]
-    assert trace.stamps.numpy().tolist() == [[0], [0], [2**53 + 1]]
-    assert fleet.clock_ns.numpy().tolist() == [2**53 + 1]
+    assert worlds.clock_ns.numpy().tolist() == [2**53 + 1]
     state = rows.states[1, 0]
     for part, array in (
-        (POSITION, fleet.position),
-        (ORIENTATION, fleet.orientation),
-        (VELOCITY, fleet.velocity),
-        (BODY_RATE, fleet.body_rate),
-        (ROTOR_SPEED, fleet.rotor_speed),
+        (POSITION, vehicles.position),
+        (ORIENTATION, vehicles.orientation),
+        (VELOCITY, vehicles.velocity),
+        (BODY_RATE, vehicles.body_rate),
+        (ROTOR_SPEED, vehicles.rotor_speed),
     ):
         np.testing.assert_array_equal(state[part], array.numpy()[0])
 
     mount = Mount(position_m=(0.1, -0.2, 0.3), rpy_rad=(0.1, 0.2, 0.3))
     p_WC = wp.zeros(1, dtype=wp.vec3, device=device)
     q_WC = wp.zeros(1, dtype=wp.quat, device=device)
+    stamps = wp.zeros((1, 1), dtype=wp.int64, device=device)
     trace.camera_poses(
         wp.array([2], dtype=int, device=device),
+        wp.zeros(1, dtype=wp.int64, device=device),
         count=1,
         p_BC=wp.array([mount.position_m], dtype=wp.vec3d, device=device),
         q_BC=wp.array([mount.optical_quaternion()], dtype=wp.quatd, device=device),
         p_WC=p_WC,
         q_WC=q_WC,
-        stamps=wp.zeros((0, 1), dtype=wp.int64, device=device),
+        stamps=stamps,
     )
+    assert stamps.numpy().tolist() == [[2**53 + 1]]
     R_WB = Rotation.from_quat(orientation[0])
     R_WC = (
         R_WB
@@ -137,51 +138,51 @@ def test_optical_frame_looks_forward():
     np.testing.assert_allclose(down, [np.cos(0.5), 0.0, -np.sin(0.5)], atol=1e-15)
 
 
-@pytest.mark.parametrize("holds", [False, True])
-def test_who_touches_the_floor_is_marked_and_held_if_asked(device, holds):
+@pytest.mark.parametrize("stops", [False, True])
+def test_who_touches_the_floor_is_marked_and_held_if_asked(device, stops):
     """The room is the height less the radius; a world that is not active is left alone."""
     height_m = np.broadcast_to(0.5 * np.arange(4, dtype=np.float32), (4, 4, 4))
     field, _floor = floor_field(device, height_m)
-    fleet = fleet_of([[0, 0, 0.15], [0, 0, 0.6], [0, 0, 0.1]], device, active=[1, 1, 0])
-    trace = Trace(capacity=2, world_count=3, rotor_count=4, device=device)
-    trace.bring_to_host()
-    surfaces = surfaces_of(field, device, 3, holds=holds)
-    trace.record(surfaces, fleet, 1, 0, first=True, last=False)
+    vehicles = vehicles_of(4, device, position=[[0, 0, 0.15], [0, 0, 0.6], [0, 0, 0.1]])
+    worlds = worlds_of(vehicles, device, active=[1, 1, 0])
+    surfaces = surfaces_of(field, device, 3, stop_on_contact=stops)
+    trace = Trace(surfaces, worlds, capacity=2, history_length=3)
+    trace.record(1, 0, first=True, last=False)
     trace.fetch(0, 2)
     wp.synchronize_device(device)
     # float32
     np.testing.assert_allclose(trace.numpy(1, 1).clearance, [[-0.05, 0.4, -0.1]], atol=1e-6)
-    assert fleet.collided.numpy().tolist() == [1, 0, 0]
-    assert fleet.status.numpy().tolist() == [int(STATUS_COLLISION) if holds else 0, 0, 0]
-    fleet.position.fill_((0.0, 0.0, 0.6))
-    trace.record(surfaces, fleet, 0, 0, first=False, last=False)
-    assert fleet.collided.numpy().tolist() == [1, 0, 0], "a touch lasts as long as its batch"
-    trace.record(surfaces, fleet, 0, 0, first=True, last=False)
-    assert fleet.collided.numpy().tolist() == [int(holds), 0, 0]
+    assert worlds.collided.numpy().tolist() == [1, 0, 0]
+    assert vehicles.status.numpy().tolist() == [int(STATUS_COLLISION) if stops else 0, 0, 0]
+    vehicles.position.fill_((0.0, 0.0, 0.6))
+    trace.record(0, 0, first=False, last=False)
+    assert worlds.collided.numpy().tolist() == [1, 0, 0], "a touch lasts as long as its batch"
+    trace.record(0, 0, first=True, last=False)
+    assert worlds.collided.numpy().tolist() == [int(stops), 0, 0]
 
 
 def test_one_launch_flies_and_records_what_single_ones_do(device):
     """Bit for bit, also where a vehicle is held from the third of five spans on."""
     field, _floor = floor_field(device, np.broadcast_to(0.5 * np.arange(4, dtype=np.float32), (4, 4, 4)))
-    surfaces, found = surfaces_of(field, device, 2, holds=True), []
+    surfaces, found = surfaces_of(field, device, 2, stop_on_contact=True), []
     for joined in (False, True):
         vehicle = Multirotor(preset("hummingbird"), count=2, device=device)
         vehicle.reset(position=[[0.0, 0.0, 0.6], [0.0, 0.0, 0.2025]], velocity=[0.0, 0.0, -1.0])
-        fleet = fleet_of(np.zeros((2, 3)), device, clock_ns=[7, 9])
-        for name in set(Fleet.vars) & set(vars(vehicle.arrays)):
-            setattr(fleet, name, getattr(vehicle.arrays, name))
-        trace = Trace(capacity=6, world_count=2, rotor_count=4, device=device)
+        worlds = worlds_of(vehicle.arrays, device, clock_ns=[7, 9])
+        trace = Trace(surfaces, worlds, capacity=6, history_length=6)
         if joined:
-            trace.fly(vehicle, surfaces, fleet, 1, 0, 1_000_000, 5, first=True, last=True)
+            trace.fly(vehicle, 1, 0, 1_000_000, 5, first=True, last=True)
         for step in () if joined else range(5):
             vehicle.advance(1_000_000)
             elapsed_ns = 1_000_000 * (step + 1)
-            trace.record(surfaces, fleet, 1 + step, elapsed_ns, first=step == 0, last=step == 4)
-        arrays = (trace.states, trace.status, trace.stamps, trace.clearance, fleet.clock_ns, fleet.collided)
+            trace.record(1 + step, elapsed_ns, first=step == 0, last=step == 4)
+        rows = trace.arrays
+        stamps = rows.history.stamp_ns
+        arrays = (rows.states, rows.status, stamps, rows.clearance, worlds.clock_ns, worlds.collided)
         found.append([array.numpy() for array in arrays])
     for single, one in zip(*found, strict=True):
         np.testing.assert_array_equal(single, one)
     states, status, stamps, _, clock_ns, _ = found[1]
     assert status[:, 1].tolist() == [0, 0, 0, 0, *2 * [int(STATUS_COLLISION)]], "noted before it is held"
     assert len(np.unique(states[1:, 0, 2])) == 5
-    assert stamps[5].tolist() == clock_ns.tolist() == [5_000_007, 5_000_009]
+    assert stamps[:, 4].tolist() == clock_ns.tolist() == [5_000_007, 5_000_009]

@@ -13,11 +13,11 @@ from world_rig import RIG, UNSHADOWED, assert_same, commands_of, fly_alone, room
 
 import neurosim_core as ns
 from neurosim_core.packets import Collision, Events
-from neurosim_core.render import launch, warp_renderer
+from neurosim_core.render import launch, scene_arrays
 from neurosim_core.sensors import event_worlds
 from neurosim_core.sim import Simulation, StartState
 from neurosim_core.sim import simulation as worlds_module
-from neurosim_core.vehicle.status import STATUS_TERMS
+from neurosim_core.vehicle.arrays import STATUS_TERMS
 
 
 @pytest.fixture(scope="module")
@@ -138,10 +138,8 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel.
     """
     if form != "tiles":
-        ours = warp_renderer.with_candidate_lists
-        monkeypatch.setattr(
-            warp_renderer, "with_candidate_lists", lambda *a, **k: ours(*a, **k)._replace(by_tile=False)
-        )
+        ours = scene_arrays._terms_of
+        monkeypatch.setattr(scene_arrays, "_terms_of", lambda *a, **k: ours(*a, **k)._replace(by_tile=False))
     front = {**RIG["front"], "sampling_rate_hz": 600}  # 6 instants: 4 together, then 2
     rig = {"front": front, "rgb": RIG["rgb"]}
     limit = 2 if "too much" in form else 256

@@ -26,7 +26,7 @@ from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
 from neurosim_core.view.overview import FlightSummary
 from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream
 
 HEADER = RecordingHeader(config_yaml="", seed=0, version="")
 MS = 1_000_000
@@ -258,7 +258,7 @@ def view_names(path: Path) -> set[str]:
 
 def test_it_is_shown_in_rerun(tmp_path):
     packets = make_packets()
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": ()}) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles={"drone": ()}) as logger:
         for packet in packets:
             logger.log(packet)
     rows = read(tmp_path / "f.rrd")
@@ -304,7 +304,7 @@ def test_an_unknown_display_lists_the_known_ones(tmp_path):
         strength: float
 
     with (
-        RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": ()}) as logger,
+        RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles={"drone": ()}) as logger,
         pytest.raises(ValueError, match="unknown display 'odour', known: image, depth"),
     ):
         logger.log(Smell(strength=1.0, sensor="nose"))

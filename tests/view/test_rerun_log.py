@@ -25,7 +25,7 @@ from neurosim_core.scene.body_shapes import CheckerSurface, SphereShape
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.view.pictures import PALETTE, event_classes, event_picture
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream
 from neurosim_core.view.rerun_shapes import class_colors, encode_classes, encode_picture, scene_shapes
 
 MS = 1_000_000
@@ -96,7 +96,7 @@ def make_image(stamp_ns: int, sensor: str = "rgb") -> Image:
 def record(
     path: Path, packets: list[Packet], **options: Any
 ) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
-    with RerunLogger(open_rerun(path), vehicles={"drone": SENSORS}, **options) as logger:
+    with RerunLogger(RerunStream(path), vehicles={"drone": SENSORS}, **options) as logger:
         for packet in packets:
             logger.log(packet)
     return read(path)
@@ -149,7 +149,7 @@ def test_labels_and_flow_lie_over_a_colour_camera_with_the_same_view(tmp_path):
     packets = [make_image(0)]
     packets += [Image(sensor=name, data=labels, encoding="32SC1") for name in ("ids", "wide")]
     packets.append(Image(sensor="flow", data=flow, encoding="32FC2"))
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": tuple(sensors)}) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles={"drone": tuple(sensors)}) as logger:
         for packet in packets:
             logger.log(packet)
     rows = read(tmp_path / "f.rrd")
@@ -203,7 +203,7 @@ def test_image_rate_is_limited_per_sensor(tmp_path):
 
 def test_collisions_clearance_and_path(tmp_path):
     path = np.arange(9.0).reshape(3, 3)
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         logger.log_path(path)
         logger.log(
             Collision(stamp_ns=7, sensor="collision", position=np.array([1.0, 2.0, 3.0]), clearance_m=-0.1)
@@ -252,7 +252,7 @@ def test_pictures_for_a_viewer_are_not_compressed():
 def test_several_vehicles_are_kept_apart(tmp_path):
     """Each has its pose, plots and path; a packet without a vehicle is of the first."""
     vehicles = {"alpha": SENSORS, "beta": SENSORS}
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=vehicles) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles=vehicles) as logger:
         logger.log(make_odometry(1))
         logger.log(make_odometry(2), vehicle="beta")
         logger.log(make_events(0), vehicle="beta")
@@ -269,13 +269,13 @@ def test_several_vehicles_are_kept_apart(tmp_path):
     assert "/world/paths/alpha" not in rows
     assert "/world/paths/beta" in rows
     with pytest.raises(ValueError, match="at least one vehicle"):
-        RerunLogger(open_rerun(), vehicles={})
+        RerunLogger(RerunStream(), vehicles={})
 
 
 def test_the_pose_comes_from_one_sensor(tmp_path):
     """A second odometry, which a link may hold up, does not make the vehicle jump."""
     sensors = (*SENSORS, describe("late", "odometry"))
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": sensors}) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles={"drone": sensors}) as logger:
         for k in range(5):
             logger.log(make_odometry(k))
             logger.log(dataclasses.replace(make_odometry(k), sensor="late"))
@@ -288,7 +288,7 @@ def test_commands_are_plotted(tmp_path):
     """An attitude as angles: roll, then pitch, then yaw, as SciPy has them."""
     angles = np.array([0.3, -0.4, 2.0])
     attitude = Rotation.from_euler("ZYX", angles[::-1]).as_quat()
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         logger.log_command("attitude", 1, [5.0, *(3.0 * attitude)])
         logger.log_command("attitude", 2, [5.0, 0.0, 0.0, 0.0, 0.0])
         logger.log_command("motor_speeds", 3, np.arange(6))
@@ -305,7 +305,7 @@ def test_commands_are_plotted(tmp_path):
 
 def test_deliveries_are_plotted_as_delays(tmp_path):
     """In milliseconds, by link; what was lost is a gap."""
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         for stamp_ns, delivered_ns in ((10 * MS, 18 * MS), (20 * MS, -1)):
             logger.log(
                 Delivery(stamp_ns=stamp_ns, sensor="imu_link", delivered_ns=delivered_ns, size_bytes=40)
@@ -319,7 +319,7 @@ def test_live_is_sent_when_told_and_limited_by_the_wall_clock(tmp_path):
     """Rows wait for `send`, or for 1024 of their kind; pictures pass by wall-clock time, not by stamps."""
     now_ns = 0
     logger = RerunLogger(
-        open_rerun(tmp_path / "f.rrd", footer=False),
+        RerunStream(tmp_path / "f.rrd", footer=False),
         vehicles={"drone": SENSORS},
         image_rate_max_hz=10.0,
         live=True,
@@ -397,7 +397,7 @@ def test_bodies_move_with_the_stamps_of_the_first_vehicle(tmp_path):
 
 def test_memory_is_bounded(tmp_path):
     """Rows wait for at most 50 ms or 1024 rows."""
-    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(RerunStream(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         for k in range(3000):
             sample = make_imu(k)
             logger.log(
@@ -420,12 +420,12 @@ def test_wrong_input_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"no field of shape \[H, W\]"):
         encode_picture(make_imu(0))
     with pytest.raises(OSError, match=r"cannot write .*nowhere"):
-        open_rerun(tmp_path / "nowhere" / "f.rrd")
+        RerunStream(tmp_path / "nowhere" / "f.rrd")
 
 
 def test_missing_rerun_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for call in (open_rerun, lambda: class_colors(PALETTE, "1234")):
+    for call in (RerunStream, lambda: class_colors(PALETTE, "1234")):
         with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
             call()
 

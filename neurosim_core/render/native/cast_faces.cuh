@@ -1,3 +1,4 @@
+#include "pixel_block_names.cuh"
 #include "pixel_poses.cuh"
 auto origin_of = [&](int axis, int lane) { return position[axis][TIMED ? lane : 0]; };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_quick;

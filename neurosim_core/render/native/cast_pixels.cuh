@@ -1,6 +1,7 @@
 // CPU: radiance of those of 4 x 4 pixels that have a bit in `unresolved`, the mean of SAMPLES rays each, to `radiance_out`
 // [3][INSTANTS][64] at 16 times `block`. Four rays of 2 x 2 pixels are a packet. `rays` has the directions of pixels: centre and
 // spread, and the changes across and down.
+#include "pixel_block_names.cuh"
 #include "pixel_poses.cuh"
 #include "sample_points.cuh"
 const float width_of_ray = 1.0f / wp::sqrt((float)SAMPLES);

@@ -1,5 +1,6 @@
 // CUDA: what the first rays show in a block of 4 x 4 pixels, whose threads are 16 of a warp, and in the ring around it: the
 // same place as in `list_seen_faces.cuh`. 0: one surface; 1: several; 2: the sky; 3: a moving body. All threads of a warp call it.
+const int instant = at.instant, top = at.top, left = at.left, height = view.height, width = view.width;
 int kind = 0;
 #ifdef __CUDA_ARCH__
 const int lane = threadIdx.x % 16, shift = threadIdx.x & 16;

@@ -5,6 +5,8 @@
 // first of the thread and how many; how many of its points show none, -1: it has to be rendered by rays; whether the sky is
 // behind; where the pairs are. `position` is where the camera sees the pixel from: with TIMED each pixel has its own, else they
 // share one.
+const int instant = at.instant, top = at.top, left = at.left, height = view.height, width = view.width;
+const wp::vec3 position = rays.position, center = rays.center, across = rays.across, down = rays.down;
 wp::vec_t<6, int> result;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"

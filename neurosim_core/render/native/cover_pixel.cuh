@@ -1,3 +1,4 @@
+const int height = view.height, width = view.width;
 // The faces that a pixel shows, of those that first rays hit in and around its block of 4 x 4 pixels.
 const int top = row / 4 * 4, left = col / 4 * 4;
 #include "list_seen_faces.cuh"
@@ -17,16 +18,19 @@ for (int layer = 0; layer < layer_count; ++layer) {
     const wp::vec3 toward = center + middle[0][layer][0] * across + middle[1][layer][0] * down;
     const int part = part_of(layer, *wp::address(faces, instant, row, col), origin, toward);
 #include "meet_plane.cuh"
-    face_out.data[found] = part;
+    auto& hit = hit_out.data[found];
+    hit.face = part;
+    hit.t = length * near;
+    hit.u = corner[0] * near;
+    hit.v = corner[1] * near;
+    hit.normal = normal;
     number_out.data[found] = number[layer][0];
     ray_out.data[found] = toward / length;
-    hit_out.data[found] = wp::vec3(length * near, corner[0] * near, corner[1] * near);
-    slope_out.data[found] = wp::vec2(slope[0], slope[1]);
-    normal_out.data[found++] = normal;
+    slope_out.data[found++] = wp::vec2(slope[0], slope[1]);
     whole += (int)number[layer][0];
 }
 if (sky && whole < SAMPLES) {
-    face_out.data[found] = -1;
+    hit_out.data[found].face = -1;
     number_out.data[found++] = (float)(SAMPLES - whole);
 }
 return sky || 2 * whole >= SAMPLES ? found : -1;

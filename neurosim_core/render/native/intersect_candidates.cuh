@@ -1,3 +1,4 @@
+#include "list_of_tile.cuh"
 #include "candidate_test.cuh"
 float best[GROUP] = {}, next[GROUP] = {};
 int which[GROUP];

@@ -1,7 +1,9 @@
+#include "list_of_tile.cuh"
 #include "candidate_test.cuh"
 float best[64] = {}, next[64] = {}, ray_x[64], ray_y[64], ray_z[64];
 int which[64];
-const Axes axes = axes_of(q);
+const vec3 origin = p_WC.data[first];
+const Axes axes = axes_of(q_WC.data[first]);
 for (int pixel = 0; pixel < 64; ++pixel) {
     which[pixel] = UNRESOLVED;
     const vec3 ray = in_camera(axes, rays.data[pixel]);

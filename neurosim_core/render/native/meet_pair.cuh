@@ -1,6 +1,7 @@
 // CUDA: what a pixel sees of a surface, of the pairs that `cover_block.cuh` leaves: the number of points that show it; the width
 // of a ray [rad]; the part to shade (see `part_of` in `cover_lanes.cuh`), as bits; direction and origin. All threads of a warp
 // call it, with what is theirs of the pixels.
+const wp::vec3 position = rays.position, center = rays.center, across = rays.across, down = rays.down;
 wp::vec_t<9, float> met;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"

@@ -1,3 +1,8 @@
+#include "pixel_block_names.cuh"
+const wp::vec3 origin = *wp::address(view.p_WC, instant);
+const wp::quat q_WC = *wp::address(view.q_WC, instant);
+const auto& rays = view.rays;
+const int width = view.width;
 auto origin_of = [&](int axis, int) { return origin[axis]; };
 auto turn = [&](int, float x, float y, float z) { return wp::quat_rotate(q_WC, wp::vec3(x, y, z)); };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;

@@ -1,14 +1,14 @@
 alignas(64) float ray[3][N], normal[3][N], spread[N], ts[N], us[N], vs[N];
 alignas(64) int faces[N];
 for (int lane = 0; lane < N; ++lane) {
-    faces[lane] = hit_face.data[lane];
-    ts[lane] = hit_t.data[lane];
-    us[lane] = hit_u.data[lane];
-    vs[lane] = hit_v.data[lane];
+    faces[lane] = hits.data[lane].face;
+    ts[lane] = hits.data[lane].t;
+    us[lane] = hits.data[lane].u;
+    vs[lane] = hits.data[lane].v;
     spread[lane] = spreads.data[lane];
     for (int axis = 0; axis < 3; ++axis) {
         ray[axis][lane] = rays.data[lane][axis];
-        normal[axis][lane] = normals.data[lane][axis];
+        normal[axis][lane] = hits.data[lane].normal[axis];
     }
 }
 constexpr float slope[2][N] = {};

@@ -3,7 +3,8 @@
 // `unresolved_out` [INSTANTS][4] has a bit for each pixel of a block that has to be rendered by rays. Each face is shaded once per
 // pixel, at the middle of the points that show it. These pairs are collected, and then shaded 16 at a time: each stage is done for
 // all instants, so that its instructions stay in the cache. With TIMED each pixel has a pose of its own.
-const int width = view.width, height = view.height;
+const int width = view.width, height = view.height, first_ray = tile.first_ray;
+const int first_instant = tile.instant, tile_top = tile.top, tile_left = tile.left;
 constexpr int LANES = 16, N = 16, BLOCKS = 4 * INSTANTS;
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 struct alignas(64) Pairs { // of a pixel, `owner`, and a surface that it shows

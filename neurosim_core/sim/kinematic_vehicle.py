@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,assignment,no-untyped-def"
-"""What carries the sensors where no vehicle does: a body that follows a motion exactly.
+"""The vehicle of a motion that is prescribed: a rigid body that follows it exactly, without dynamics.
 
 With phi the rotation vector of a piece and t its length, R_WB = R(knot) exp(phi), and with the right Jacobian
 of SO(3)
@@ -20,10 +20,10 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
+from neurosim_core.runtime.cuda import RecordedLaunch
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, find_place, upload_paths
-from neurosim_core.vehicle import MultirotorConfig, MultirotorState
-from neurosim_core.vehicle.arrays import allocate_arrays
-from neurosim_core.vehicle.integrator import Batch
+from neurosim_core.vehicle import MultirotorArrays, MultirotorConfig
+from neurosim_core.vehicle.arrays import BLOCK_DIM, allocate_arrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -99,7 +99,7 @@ def _evaluate_turn(path: PathArrays, attitude: AttitudeArrays, index: int, stamp
 
 
 @wp.kernel
-def _carry(
+def _move(
     # Model:
     path: PathArrays,
     attitude: AttitudeArrays,
@@ -108,7 +108,7 @@ def _carry(
     mask: wp.array[wp.int32],
     duration_ns: wp.int64,
     # In/out:
-    body: Batch,
+    body: MultirotorArrays,
 ) -> None:
     world = wp.tid()
     if mask.shape[0] > 0:
@@ -131,11 +131,11 @@ def _carry(
     body.angular_acceleration[world] = turn.acceleration
 
 
-class Carrier:
+class KinematicVehicle:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
-    `config` of the vehicle that is not there IMUs need gravity.
+    They are what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
+    `config` IMUs need gravity.
     """
 
     terms: tuple[str, ...] = ()
@@ -153,9 +153,6 @@ class Carrier:
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
-        self._body = Batch()
-        for name, array in vars(self.arrays).items():
-            setattr(self._body, name, array)
         attitudes = [path.attitude for path in paths if path.attitude is not None]
         knots = np.concatenate([attitude.knots for attitude in attitudes])
         vectors_of_pieces = np.concatenate([attitude.rotation_vectors for attitude in attitudes])
@@ -165,32 +162,15 @@ class Carrier:
         worlds: Any = wp.array(list(path_of_world), dtype=int, device=self.device)
         self._motion = [upload_paths(paths, self.device), attitude, worlds]
         self._nobody = wp.zeros(0, dtype=wp.int32, device=self.device)
+        self._move = RecordedLaunch(_move, self.device, block_dim=BLOCK_DIM)
 
     def advance(self, duration_ns: int) -> None:
         """Move all bodies on; launches only."""
-        self._launch(self._nobody, duration_ns)
+        self._move.launch(self.count, [*self._motion, self._nobody, duration_ns, self.arrays])
 
     def begin(self, mask: Any) -> None:
         """Put some bodies where their stamp says, device array of int32, shape [N]; launches only."""
-        self._launch(mask, 0)
+        self._move.launch(self.count, [*self._motion, mask, 0, self.arrays], key="begin")
 
     def accelerate(self) -> None:
         """Accelerations are always those of the stamp."""
-
-    def check(self) -> None:
-        """A motion that is prescribed cannot fail."""
-
-    @property
-    def state(self) -> MultirotorState:
-        """A copy of the state on the host; waits for the device."""
-        names = ("position", "velocity", "orientation", "body_rate", "rotor_speed")
-        return MultirotorState(*(np.array(getattr(self.arrays, name).numpy()) for name in names))
-
-    def _launch(self, mask: Any, duration_ns: int) -> None:
-        wp.launch(
-            _carry,
-            dim=self.count,
-            inputs=[*self._motion, mask, duration_ns],
-            outputs=[self._body],
-            device=self.device,
-        )

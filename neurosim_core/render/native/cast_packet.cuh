@@ -1,2 +1,0 @@
-auto origin_of = [&](int axis, int) { return origin[axis]; };
-#include "cast_lanes.cuh"
