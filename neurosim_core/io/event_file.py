@@ -402,9 +402,9 @@ def choose_topic(path: Path, cameras: list[str], sensor: str) -> str:
 
 def gather_blocks(parts: Iterable[Any]) -> Iterator[EventArrays]:
     """Yield events, or what has their columns, together until they are a million."""
-    pending: list[Any] = []
+    pending: list[EventArrays] = []
     for part in parts:
-        pending.append(part)
+        pending.append(EventArrays(part.t, part.x, part.y, part.polarity))
         if sum(len(each.t) for each in pending) >= BLOCK_EVENTS:
             yield join_events(pending)
             pending = []

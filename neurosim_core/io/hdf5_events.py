@@ -30,7 +30,7 @@ from neurosim_core.io.event_file import (
     in_microseconds,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
-from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, recording
 from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
@@ -38,6 +38,11 @@ from neurosim_core.record.header import SensorDescription
 _NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
 _PLACES = ("events", "prophesee/left", "CD/events")
 _SPAN_MAX_US = 30 * 24 * 3_600_000_000
+
+
+def damage_of(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Turn what h5py raises on a damaged file into an EventFileError."""
+    return recording.damage_of(path, EventFileError)
 
 
 def open_hdf5(path: Path) -> Any:
@@ -182,15 +187,3 @@ def _parts_of(found: Any) -> set[str]:
 
 def _class(recording: Recording, sensor: str) -> type[Packet]:
     return packet_class(recording.schema(sensor))
-
-
-@contextlib.contextmanager
-def damage_of(path: Path) -> Iterator[None]:
-    """Turn what h5py raises on a damaged file into an EventFileError."""
-    try:
-        yield
-    except EventFileError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError) as error:
-        plugin = "; DSEC compresses with Blosc: pip install hdf5plugin" if "filter" in str(error) else ""
-        raise EventFileError(f"{path} is damaged: {error}{plugin}") from None

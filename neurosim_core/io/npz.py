@@ -30,13 +30,12 @@ class NpzSource(EventSource):
     def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
         super().__init__(path)
         self.knows_unit = unit_us is not None
-        with open(path, "rb"):
-            pass  # an OSError from here on comes of what is in it
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                found = {name: archive[name] for name in archive.files if name in _NAMES}
-        except Exception as error:  # what NumPy raises for damage is not listed anywhere
-            raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
+        with open(path, "rb") as file:
+            try:
+                with np.load(file, allow_pickle=False) as archive:
+                    found = {name: archive[name] for name in archive.files if name in _NAMES}
+            except Exception as error:  # what NumPy raises for damage is not listed anywhere
+                raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         columns = []
         for name, others in _OTHER_NAMES.items():
             key = next((n for n in (name, *others) if n in found), None)
