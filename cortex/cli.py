@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments and arguments[0] in _OWN_ARGUMENTS:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # it closes what it has opened
         try:
             return int(importlib.import_module(_OWN_ARGUMENTS[arguments[0]]).main(arguments[1:]))
         except KeyboardInterrupt:

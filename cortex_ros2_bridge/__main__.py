@@ -1,10 +1,18 @@
-"""`python -m cortex_ros2_bridge` is `cortex-ros2-bridge`."""
+"""The command `cortex-ros2-bridge`, also as `python -m cortex_ros2_bridge`: quiet at Ctrl-C."""
 
-from __future__ import annotations
-
+import os
+import signal
 import sys
 
-from cortex_ros2_bridge.cli import main
+
+def main() -> int:
+    """Run the command line, see `cli.main`; Ctrl-C during its imports ends the process with status 130."""
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    from cortex_ros2_bridge.cli import main as run
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # `run` ends with 130, and closes what is open
+    return run()
+
 
 if __name__ == "__main__":
     sys.exit(main())

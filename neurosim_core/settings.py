@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, get_args
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
-from pydantic_core import CoreSchema, PydanticKnownError, SchemaValidator, core_schema
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic_core import (
+    CoreSchema,
+    InitErrorDetails,
+    PydanticCustomError,
+    PydanticKnownError,
+    SchemaValidator,
+    core_schema,
+)
 
 from neurosim_core.docstrings import field_docs
 from neurosim_core.registry import find, kinds
 from neurosim_core.settings_file import merge
+
+_NO_NUMBER = PydanticCustomError("no_number", "must be a number")
 
 
 class Settings(BaseModel):
@@ -28,6 +37,35 @@ class Settings(BaseModel):
         allow_inf_nan=False,
         validate_default=True,
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, given: Any) -> Any:
+        """Refuse true and false where numbers are wanted: pydantic takes them as 1 and 0."""
+        errors = [
+            InitErrorDetails(type=_NO_NUMBER, loc=(key,), input=value)
+            for key, value in (given.items() if isinstance(given, Mapping) else ())
+            if any(isinstance(item, bool) for item in (value if isinstance(value, list | tuple) else [value]))
+            and key in cls.model_fields
+            and _is_number(cls.model_fields[key].annotation)
+        ]
+        if errors:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        return given
+
+
+def _is_number(annotation: Any) -> bool:
+    """Return whether numbers may be there, and no truth values."""
+    parts = [*_parts(annotation)]
+    truth = any(part is bool or part is Any or isinstance(part, bool) for part in parts)
+    return not truth and any(part is int or part is float for part in parts)
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """Yield the types that an annotation is made of; of a literal its values."""
+    yield annotation
+    for part in get_args(annotation):
+        yield from _parts(part)
 
 
 class OfKind:

@@ -26,6 +26,7 @@ from neurosim_core.packets import Events
 from neurosim_core.record import Recording
 from neurosim_core.scene.hall import HallConfig
 
+ROOT = Path(__file__).resolve().parents[1]
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
 SETTINGS = {
     "duration_s": 0.3,
@@ -431,3 +432,32 @@ def test_sensors_that_are_absent_are_said_first(tmp_path, monkeypatch, capsys):
     assert "apartment with 1 room, seed" in first
     assert "Absent of the default sensors: events, rgb, depth, odometry." in first
     assert max(map(len, first.splitlines())) > 80  # lines are not broken for a pipe as for a narrow terminal
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("neurosim", "argparse"),
+        ("neurosim", "yaml"),
+        ("neurosim", "neurosim_core.cli"),
+        ("cortex", "cortex.cli"),
+        ("cortex-ros2-bridge", "cortex_ros2_bridge.cli"),
+    ],
+)
+def test_ctrl_c_while_a_command_is_imported_ends_it_quietly(name, module):
+    """From the first line of the module that the command is in."""
+    tomllib = pytest.importorskip("tomllib")
+    home = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"][name]
+    program = f"""
+import signal, sys
+class Interrupts:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupts())
+sys.modules.pop({module!r}, None)
+from {home.partition(":")[0]} import main
+sys.exit(main())
+"""
+    done = subprocess.run([sys.executable, "-c", program, "--help"], capture_output=True, timeout=60.0)
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -391,6 +392,23 @@ json = st.recursive(
     ),
     max_leaves=5,
 )
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("duration_s", "yes", "duration_s: must be a number, got True"),
+        ("seed", "off", "seed: must be a number, got False"),
+        ("sensors.e", "{kind: imu, mount: {position_m: [0, on, 0]}}",
+         "sensors.e.mount.position_m: must be a number, got [0, True, 0]"),
+        ("sensors.e", "{kind: event_camera, pixel: {threshold_on: true}}",
+         "sensors.e.pixel.threshold_on: must be a number, got True"),
+    ],
+)  # fmt: skip
+def test_a_truth_value_is_no_number(key, value, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        load_config(overrides={key: yaml.safe_load(value)})
+    assert load_config(overrides={"live.run_on": True}).live.run_on
 
 
 @given(st.sampled_from(sorted(SimulationConfig.model_fields)), json)

@@ -7,6 +7,7 @@ of its type's definition.
 from __future__ import annotations
 
 import logging
+import sqlite3
 import struct
 import threading
 from collections.abc import Callable
@@ -30,6 +31,7 @@ _CLOCK = "rosgraph_msgs/msg/Clock"
 _TIME = "builtin_interfaces/msg/Time"
 _AHEAD_NS = 1_000_000_000
 """Furthest that a message may be ahead of the clock; what claims more, has another clock."""
+_DISK_ERRORS = (OSError, sqlite3.Error)
 _UNLIMITED = QosTime(9223372036, 854775807)
 
 
@@ -65,7 +67,7 @@ class BagBackend:
             # Version 8 of the metadata is what all distributions read, Humble to Jazzy and later.
             writer = Writer(self.directory, version=8, storage_plugin=StoragePlugin[storage.upper()])
             writer.open()
-        except (WriterError, OSError) as error:
+        except (WriterError, *_DISK_ERRORS) as error:
             raise BackendError(f"the bag {self.directory} cannot be made: {error}") from error
         self._writer = writer
 
@@ -101,7 +103,7 @@ class BagBackend:
                 return
             try:
                 writer.close()
-            except OSError as error:
+            except _DISK_ERRORS as error:
                 writer.abort()
                 raise BackendError(f"the bag {self.directory} cannot be completed: {error}") from error
         size_mb = sum(file.stat().st_size for file in self.directory.iterdir()) / 1e6
@@ -119,7 +121,7 @@ class BagBackend:
             data = message if isinstance(message, (bytes, memoryview)) else bytes(message)
             try:
                 self._writer.write(connection, came_ns, data)
-            except OSError as error:
+            except _DISK_ERRORS as error:
                 raise BackendError(f"the bag {self.directory} cannot be written: {error}") from error
 
 

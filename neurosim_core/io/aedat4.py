@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,20 +10,19 @@ from typing import Any
 import numpy as np
 
 from neurosim_core.install import need
-from neurosim_core.io.event_file import EventFileError, events_of, split_blocks
+from neurosim_core.io.event_file import EventFileError, EventSource, events_of, split_blocks
 from neurosim_core.packets import EventArrays
 
 _PACKET_EVENTS = 8192
 _SIZE_MAX = 1 << 15
 
 
-class Aedat4Source:
+class Aedat4Source(EventSource):
     """Reads the first stream of events of an AEDAT4 file."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self._faery = _import_faery()
-        self._path = path
-        self.notes: list[str] = []
         with open(path, "rb") as file:
             if file.read(14) != b"#!AER-DAT4.0\r\n":
                 raise EventFileError(f"{path} is not an AEDAT4 file")
@@ -30,16 +30,13 @@ class Aedat4Source:
         if not tracks:
             raise EventFileError(f"{path} holds no events")
         self._track = tracks[0].id
-        self.size: tuple[int, int] | None = tracks[0].dimensions
+        self.size = tracks[0].dimensions
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
         for track, events in _whole(self._path, self._decoder()):
             if track.id == self._track and len(events):
                 yield _columns(events)
-
-    def close(self) -> None:
-        """Nothing is open between blocks."""
 
     def _decoder(self) -> Any:
         try:
@@ -48,19 +45,18 @@ class Aedat4Source:
             raise _damage(self._path, error) from None
 
 
-class EsSource:
+class EsSource(EventSource):
     """Reads a file of Event Stream (loris, expelliarmus), of a DVS or an ATIS; their y counts from below."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__(path)
         faery = _import_faery()
-        self._path = path
-        self.notes: list[str] = []
         with open(path, "rb") as file:
             if file.read(12) != b"Event Stream":
                 raise EventFileError(f"{path} is not a file of Event Stream")
         try:
             self._stream = faery.events_stream_from_file(path, file_type="es")
-            self.size: tuple[int, int] | None = self._stream.dimensions()
+            self.size = self._stream.dimensions()
         except BaseException as error:
             raise _damage(path, error) from None
 
@@ -69,9 +65,6 @@ class EsSource:
         for events in _whole(self._path, iter(self._stream)):
             if len(events):
                 yield _columns(events)
-
-    def close(self) -> None:
-        """Nothing is open between blocks."""
 
 
 class Aedat4Sink:
@@ -90,8 +83,9 @@ class Aedat4Sink:
         stream = {"compression": "LZ4", "originalOutputName": "events", "typeIdentifier": "EVTS"}
         attributes = {name: attribute("string", value) for name, value in stream.items()}
         tree = [node("outInfo", place, {}, [node("0", f"{place}0/", attributes, [info])])]
-        self._encoder: Any = faery.aedat.Encoder(path, tree, faery.aedat.LZ4_DEFAULT)
-        self._encoder.__enter__()
+        with _disk_errors():
+            self._encoder: Any = faery.aedat.Encoder(path, tree, faery.aedat.LZ4_DEFAULT)
+            self._encoder.__enter__()
 
     def write(self, events: EventArrays) -> None:
         """See `EventSink.write`."""
@@ -101,13 +95,22 @@ class Aedat4Sink:
             records = np.empty(len(block.t), self._dtype)
             for name, column in zip(records.dtype.names or (), block, strict=True):
                 records[name] = column
-            self._encoder.write(0, records)
+            with _disk_errors():
+                self._encoder.write(0, records)
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if self._encoder is not None:
-            encoder, self._encoder = self._encoder, None
-            encoder.__exit__(None, None, None)
+        """Complete the file."""
+        with _disk_errors():
+            self._encoder.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def _disk_errors() -> Iterator[None]:
+    """Turn what faery raises on a full disk into an OSError."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(str(error)) from None
 
 
 def _whole(path: Path, blocks: Iterator[Any]) -> Iterator[Any]:

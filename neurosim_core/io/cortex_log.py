@@ -6,17 +6,17 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from neurosim_core.io.event_file import EventFileError, gather_blocks
+from neurosim_core.io.event_file import EventFileError, EventSource, gather_blocks
 from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet
 
 
-class LogSource:
+class LogSource(EventSource):
     """Reads the sensors of one vehicle from a log."""
 
     def __init__(self, path: Path, *, sensor: str = "") -> None:
         from cortex.log import LogError, open_log
 
-        self._path = path
+        super().__init__(path)
         try:
             self._log = open_log(path)
         except LogError as error:
@@ -36,7 +36,7 @@ class LogSource:
         self._topic = chosen[0]
         self._vehicle = self._topic.rpartition("/")[0]
         first = next((packet for packet in self.packets() if isinstance(packet, Events)), None)
-        self.size: tuple[int, int] | None = (first.width, first.height) if first else (1, 1)
+        self.size = (first.width, first.height) if first else (1, 1)
 
     def packets(self) -> Iterator[Packet]:
         """Yield the packets of the camera's vehicle, in the order in which they arrived.

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from neurosim_core.io.event_file import (
     UNITS_US,
     EventFileError,
+    EventSource,
     NoEventsError,
     are_seconds,
     events_of,
@@ -38,25 +39,17 @@ _HEADER_LINES_MAX = 100
 _UNIT = re.compile(r"\[([^]]*)\]|\(([^)]*)\)")
 
 
-class CsvSource:
+class CsvSource(EventSource):
     """Reads events from text."""
 
     def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
-        self._path = path
-        self.notes: list[str] = []
+        super().__init__(path)
         self._columns: tuple[str, ...] = ("t", "x", "y", "p")
         self._skip, self._delimiter = 0, ","
         self._kind: type = np.int64  # read twice as fast as others
         self._unit_us = unit_us
         self.size = self._read_header()
-
-    @property
-    def knows_unit(self) -> bool:
-        """Whether the header or the user says in which unit times are."""
-        return self._unit_us is not None
-
-    def close(self) -> None:
-        """Nothing is open between blocks."""
+        self.knows_unit = self._unit_us is not None
 
     def _read_header(self) -> tuple[int, int] | None:
         size = None

@@ -16,6 +16,7 @@ import numpy as np
 
 from neurosim_core.io.event_file import (
     EventFileError,
+    EventSource,
     events_of,
     read_header,
     read_words,
@@ -29,11 +30,11 @@ _KINDS = (0x00, 0x0C)
 """Event2d and EventCD: the same layout."""
 
 
-class DatSource:
+class DatSource(EventSource):
     """Reads a DAT file."""
 
     def __init__(self, path: Path) -> None:
-        self.notes: list[str] = []
+        super().__init__(path)
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
         try:
             header = read_header(self._file)

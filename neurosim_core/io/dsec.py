@@ -20,7 +20,7 @@ import yaml
 from numpy.typing import NDArray
 
 from neurosim_core.install import need
-from neurosim_core.io.event_file import EventFileError, events_of
+from neurosim_core.io.event_file import EventFileError, EventSource, events_of
 from neurosim_core.io.hdf5_events import Hdf5Source, damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, Packet
 
@@ -31,11 +31,11 @@ _DISPARITY_STEPS = 256.0
 _FLOW_ZERO, _FLOW_STEPS = 2.0**15, 128.0
 
 
-class DsecSource:
+class DsecSource(EventSource):
     """Reads a sequence of DSEC."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path)
         self._events = Hdf5Source(path / EVENTS)
         self.notes = self._events.notes
         try:
@@ -45,7 +45,7 @@ class DsecSource:
             if found.ndim != 3 or found.shape[2] != 2:
                 raise EventFileError(f"{file}: rectify_map has shape {found.shape}, not [height, width, 2]")
             self._rectified = np.rint(found).astype(np.int64)
-            self.size: tuple[int, int] | None = (found.shape[1], found.shape[0])
+            self.size = (found.shape[1], found.shape[0])
         except BaseException:
             self._events.close()
             raise

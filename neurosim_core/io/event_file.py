@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, join_events
+from neurosim_core.record.disk import naming_file
 
 BLOCK_EVENTS = 1_000_000
 """Events that are read, and held in memory, at a time."""
@@ -45,13 +46,24 @@ def check_new(path: Path, *, overwrite: bool) -> None:
         raise FileExistsError(f"{path} is already there: add --overwrite, or name another file")
 
 
-class EventSource(Protocol):
-    """What a format has to read the events of one camera; made of the path of a file."""
+class EventSource:
+    """What a format has to read the events of one camera.
 
-    size: tuple[int, int] | None
-    """Width and height of the sensor [px], where the file says them."""
-    notes: list[str]
-    """What a user should know about the file; more may come while it is read."""
+    Attributes:
+        size: Width and height of the sensor [px], where the file says them.
+        knows_unit: Whether the file, its format or the user says in which unit times are.
+        notes: What a user should know about the file; more may come while it is read.
+        packets: Yields what is there besides events, in the order of time; None: nothing ever is.
+    """
+
+    size: tuple[int, int] | None = None
+    knows_unit = True
+    packets: Callable[[], Iterator[Packet]] | None = None
+
+    def __init__(self, path: Path) -> None:
+        """Begin to read a file."""
+        self._path = path
+        self.notes: list[str] = []
 
     def read(self) -> Iterator[EventArrays]:
         """Yield all events from the first on, as they are in the file, about a million at a time.
@@ -59,9 +71,10 @@ class EventSource(Protocol):
         Raises:
             EventFileError: The file is damaged.
         """
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Close the file."""
+        """Close what is open between blocks."""
 
 
 class EventSink(Protocol):
@@ -76,7 +89,7 @@ class EventSink(Protocol):
         """
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
+        """Complete the file; called once."""
 
 
 class EventReader:
@@ -86,7 +99,6 @@ class EventReader:
         path: The file.
         source: It, opened; closed here.
         size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
-        knows_unit: Whether somebody says in which unit times are.
 
     Attributes:
         width: Of the sensor [px].
@@ -95,18 +107,9 @@ class EventReader:
         packets: Yields what is there besides events, in the order of time; None: nothing ever is.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        source: EventSource,
-        size: tuple[int, int] | None = None,
-        *,
-        knows_unit: bool = True,
-    ) -> None:
-        self._path, self._source, self.notes = path, source, source.notes
-        self._knows_unit = knows_unit
+    def __init__(self, path: Path, source: EventSource, size: tuple[int, int] | None = None) -> None:
+        self._path, self._source, self.notes, self.packets = path, source, source.notes, source.packets
         self._first_notes = [*source.notes]
-        self.packets: Callable[[], Iterator[Packet]] | None = getattr(source, "packets", None)
         try:
             self.width, self.height = size or source.size or _find_size(source.read())
         except BaseException:
@@ -143,7 +146,7 @@ class EventReader:
                 yield checker.check(held)
             held = events
         yield checker.check(held)
-        if not self._knows_unit and checker.rate_hz < _RATE_MIN_HZ:
+        if not self._source.knows_unit and checker.rate_hz < _RATE_MIN_HZ:
             self.notes.append(
                 f"a pixel has an event every {1.0 / checker.rate_hz:.0f} s: if times are nanoseconds, "
                 "`neurosim convert --time-unit ns` says so"
@@ -168,8 +171,10 @@ class EventWriter:
     """
 
     def __init__(self, path: Path, sink: EventSink, *, width: int, height: int) -> None:
-        self._sink, self._checker = sink, BlockChecker(path, width=width, height=height)
-        self.write_packet: Callable[[Packet], None] | None = getattr(sink, "write_packet", None)
+        self._path, self._sink, self._closed = path, sink, False
+        self._checker = BlockChecker(path, width=width, height=height)
+        keep: Callable[[Packet], None] | None = getattr(sink, "write_packet", None)
+        self.write_packet = None if keep is None else naming_file(path)(keep)
 
     def write(self, events: EventArrays) -> None:
         """Append events, sorted by time.
@@ -180,11 +185,15 @@ class EventWriter:
         """
         checked = self._checker.check(events)
         if len(checked.t):
-            self._sink.write(checked)
+            with naming_file(self._path):
+                self._sink.write(checked)
 
     def close(self) -> None:
         """Complete the file. Closing twice is allowed."""
-        self._sink.close()
+        if not self._closed:
+            self._closed = True
+            with naming_file(self._path):
+                self._sink.close()
 
 
 class BlockChecker:

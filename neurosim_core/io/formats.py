@@ -6,8 +6,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neurosim_core.io.event_file import UNITS_US, EventFileError, EventReader, EventWriter
+from neurosim_core.io.event_file import UNITS_US, EventFileError, EventReader, EventSource, EventWriter
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+from neurosim_core.record.disk import naming_file
 from neurosim_core.record.hdf5 import FORMAT
 
 
@@ -129,8 +130,7 @@ def open_events(
         if name not in _UNITLESS:
             raise EventFileError(f"{path}: times of {name} have a unit, it cannot be {time_unit}")
         more["unit_us"] = UNITS_US[time_unit]
-    source = _open(name, path, **more)
-    return EventReader(path, source, size, knows_unit=name not in _UNITLESS or source.knows_unit)
+    return EventReader(path, _open(name, path, **more), size)
 
 
 def is_recording(path: Path) -> bool:
@@ -148,8 +148,9 @@ def _format_in(path: Path) -> str:
     return name
 
 
-def _open(name: str, path: Path, **options: Any) -> Any:
-    return _load(FORMATS[name], FORMATS[name].source)(path, **options)
+def _open(name: str, path: Path, **options: Any) -> EventSource:
+    source: EventSource = _load(FORMATS[name], FORMATS[name].source)(path, **options)
+    return source
 
 
 def create_events(path: str | Path, *, width: int, height: int, format: str | None = None) -> EventWriter:
@@ -171,7 +172,8 @@ def create_events(path: str | Path, *, width: int, height: int, format: str | No
     known = FORMATS[name]
     if not known.sink:
         raise EventFileError(f"{path}: {name} is only read; write .h5")
-    sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
+    with naming_file(path):
+        sink = _load(known, known.sink)(path, width=width, height=height, **known.options)
     return EventWriter(path, sink, width=width, height=height)
 
 

@@ -22,6 +22,7 @@ from neurosim_core.io.event_file import (
     BLOCK_EVENTS,
     PACKET_US,
     EventFileError,
+    EventSource,
     NoEventsError,
     PacketCutter,
     are_seconds,
@@ -52,12 +53,12 @@ def open_hdf5(path: Path) -> Any:
         raise EventFileError(f"{path} is not a readable HDF5 file: {error}") from None
 
 
-class Hdf5Source:
+class Hdf5Source(EventSource):
     """Reads the events of a recording, or of a file of DSEC."""
 
     def __init__(self, path: Path, *, sensor: str = "", unit_us: float | None = None) -> None:
-        self._path, self._unit_us = path, unit_us
-        self.notes: list[str] = []
+        super().__init__(path)
+        self._unit_us = unit_us
         self._file = open_hdf5(path)
         try:
             with damage_of(path):
@@ -159,7 +160,6 @@ class RecordingSink:
             config_yaml="conversion: {}\n", seed=0, version=__version__, sensors=(described,)
         )
         self._writer = RecordingWriter(path, header, flush_interval_s=float("inf"))
-        self._closed = False
         self._packets = PacketCutter(self._writer.write, width=width, height=height, sensor=sensor)
 
     def write(self, events: EventArrays) -> None:
@@ -176,10 +176,7 @@ class RecordingSink:
         self._writer.write(packet)
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if self._closed:
-            return
-        self._closed = True
+        """Complete the file."""
         self._packets.end()
         self._writer.close()
 

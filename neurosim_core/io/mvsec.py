@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, NoEventsError, events_of
+from neurosim_core.io.event_file import BLOCK_EVENTS, EventFileError, EventSource, NoEventsError, events_of
 from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import EventArrays, Image, ImuSample, Odometry, Packet
+from neurosim_core.record.disk import Disk
 from neurosim_core.record.hdf5 import import_h5py
 
 _GROUP = "davis/left"
@@ -28,12 +29,11 @@ _ROWS = {"depth": "depth_image_raw", "pose": "pose", "image": "image_raw", "imu"
 """Name of each sensor and of its array; `ARRAY_ts` has its times."""
 
 
-class MvsecSource:
+class MvsecSource(EventSource):
     """Reads a file of MVSEC."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.notes: list[str] = []
+        super().__init__(path)
         truth = path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
         self._files = [open_hdf5(path)]
         try:
@@ -111,11 +111,8 @@ class MvsecSink:
     """Writes a file of MVSEC: of each kind of packets those of the first sensor that sends them."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        self._path = path
-        try:
-            self._file: Any = import_h5py().File(path, "w")
-        except OSError as error:
-            raise OSError(f"cannot write {path}: {error}") from error
+        self._disk = Disk(path)  # on a full disk HDF5's own file would end the process
+        self._file: Any = import_h5py().File(self._disk, "w")
         self._group = self._file.create_group(_GROUP)
         self._sensors: dict[str, str] = {}
         self._append("events", np.zeros((0, 4)))
@@ -137,10 +134,14 @@ class MvsecSink:
         self._append(f"{_ROWS[name]}_ts", np.array([packet.stamp_ns * 1e-9]))
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if self._file and "image_raw_ts" in self._group:
+        """Complete the file."""
+        if "image_raw_ts" in self._group:
             self._append("image_raw_event_inds", self._last_events(self._group["image_raw_ts"][:]))
         self._file.close()
+        try:
+            self._disk.seal()
+        finally:
+            self._disk.close()
 
     def _last_events(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the number of the last event before each of some times; -1 if there is none."""
@@ -166,6 +167,7 @@ class MvsecSink:
         array.resize(len(array) + len(rows), axis=0)
         if len(rows):
             array[-len(rows) :] = rows
+        self._disk.seal()
 
 
 def _row(packet: Packet) -> tuple[str, NDArray[Any] | None]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from neurosim_core.io.event_file import (
     EventFileError,
+    EventSource,
     NoEventsError,
     events_of,
     in_microseconds,
@@ -24,11 +25,11 @@ _OTHER_NAMES = {"t": ("ts", "timestamps"), "x": (), "y": (), "p": ("polarity",)}
 _NAMES = {"width", "height", *_OTHER_NAMES, *(other for others in _OTHER_NAMES.values() for other in others)}
 
 
-class NpzSource:
+class NpzSource(EventSource):
     """Reads an NPZ file; `polarity` and `ts` or `timestamps` are other names for p and t."""
 
     def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
-        self.notes: list[str] = []
+        super().__init__(path)
         self.knows_unit = unit_us is not None
         with open(path, "rb"):
             pass  # an OSError from here on comes of what is in it
@@ -66,9 +67,6 @@ class NpzSource:
         """See `EventSource.read`."""
         yield from split_blocks(self._events)
 
-    def close(self) -> None:
-        """Nothing is open."""
-
 
 class NpzSink:
     """Writes an NPZ file when it is closed."""
@@ -76,7 +74,6 @@ class NpzSink:
     def __init__(self, path: Path, *, width: int, height: int) -> None:
         self._path, self._size = path, {"width": np.array(width), "height": np.array(height)}
         self._blocks: list[EventArrays] = []
-        self._closed = False
         path.touch()  # says now that it cannot be written
 
     def write(self, events: EventArrays) -> None:
@@ -84,10 +81,7 @@ class NpzSink:
         self._blocks.append(events)
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if self._closed:
-            return
-        self._closed = True
+        """Complete the file."""
         t, x, y, p = join_events(self._blocks)
         arrays = {**self._size, "t": t, "x": x, "y": y, "p": p}
         with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from neurosim_core.io.event_file import (
     EventFileError,
+    EventSource,
     events_of,
     read_header,
     read_words,
@@ -40,12 +41,11 @@ _HIGH_MAX = (1 << _HIGH_BITS) - 1
 _LOW_BITS = 6
 
 
-class RawSource:
+class RawSource(EventSource):
     """Reads a RAW file."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self.notes: list[str] = []
+        super().__init__(path)
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
         try:
             header = read_header(self._file)
@@ -109,11 +109,10 @@ class RawSink:
             self._file.write(words.data)
 
     def close(self) -> None:
-        """Complete the file. Closing twice is allowed."""
-        if not self._file.closed:
-            if self._encoder is None:
-                self._begin(0)
-            self._file.close()
+        """Complete the file."""
+        if self._encoder is None:
+            self._begin(0)
+        self._file.close()
 
     def _begin(self, first_us: int) -> None:
         if first_us < 0:

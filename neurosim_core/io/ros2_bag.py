@@ -7,6 +7,7 @@ wanted.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -29,13 +30,13 @@ def open_mcap(path: Path, *, sensor: str = "") -> EventSource:
     return BagSource(path, sensor=sensor) if is_bag else LogSource(path, sensor=sensor)
 
 
-class BagSource:
+class BagSource(EventSource):
     """Reads a bag: events of one camera, and pictures, inertial measurements and odometry."""
 
     def __init__(self, path: Path, *, sensor: str = "") -> None:
+        super().__init__(path)
         bags = _bridge()
-        self._path, self._error = path, bags.BagError
-        self.notes: list[str] = []
+        self._error = bags.BagError
         try:
             self._bag = bags.BagReader(path)
         except bags.BagError as error:
@@ -43,7 +44,7 @@ class BagSource:
         try:
             self._choose(sensor, bags.EVENT_TYPES)
             found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
-            self.size: tuple[int, int] | None = next(found, (1, 1))
+            self.size = next(found, (1, 1))
         except BaseException:
             self._bag.close()
             raise
@@ -96,13 +97,10 @@ class BagSink:
 
     def __init__(self, path: Path, *, width: int, height: int, storage: str = "mcap") -> None:
         bags = _bridge()
-        self._errors = bags.ConvertError, bags.BackendError
-        try:
+        self._bags = bags
+        with self._errors():
             self._bag = bags.BagWriter(path, storage=storage)
-        except bags.BackendError as error:
-            raise OSError(str(error)) from None
         self._packets = PacketCutter(self.write_packet, width=width, height=height, sensor=_EVENTS)
-        self._closed = False
 
     def write(self, events: EventArrays) -> None:
         """See `EventSink.write`."""
@@ -118,18 +116,24 @@ class BagSink:
             message = to_message(packet, frame_id=body if is_body else f"{_VEHICLE}/{packet.sensor}")
         except TypeError:  # no message can carry it
             return
-        try:
+        with self._errors():
             self._bag.write(f"/{_VEHICLE}/{packet.sensor}", message, frame_id=f"{_VEHICLE}/{packet.sensor}")
-        except self._errors as error:
-            raise EventFileError(str(error)) from None
 
     def close(self) -> None:
-        """Complete the bag. Closing twice is allowed."""
-        if self._closed:
-            return
-        self._closed = True
+        """Complete the bag."""
         self._packets.end()
-        self._bag.close()
+        with self._errors():
+            self._bag.close()
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turn the errors of the bridge into those of a sink."""
+        try:
+            yield
+        except self._bags.ConvertError as error:
+            raise EventFileError(str(error)) from None
+        except self._bags.BackendError as error:
+            raise OSError(str(error)) from None
 
 
 def _bridge() -> Any:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from neurosim_core.io.event_file import EventFileError
 from neurosim_core.io.formats import FORMATS, create_events, format_of, is_recording, open_events
 from neurosim_core.packets import Events
 
@@ -98,6 +99,11 @@ def transfer(
         if out.is_dir():  # a bag
             shutil.rmtree(out)
         part.replace(out)
+    except (EventFileError, OSError) as error:  # the user knows the file by its later name
+        text = str(error).replace(str(folder), str(out.parent))
+        if text == str(error):
+            raise
+        raise type(error)(text) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         reader.close()

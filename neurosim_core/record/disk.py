@@ -1,9 +1,22 @@
-"""The file below HDF5: a program that is killed leaves the state of the last seal."""
+"""Files that are written: the one below HDF5, which keeps the state of the last seal, and what errors say."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
+
+
+@contextlib.contextmanager
+def naming_file(path: str | Path) -> Iterator[None]:
+    """Name a file in the errors of a block that writes it, unless they do."""
+    try:
+        yield
+    except OSError as error:
+        if str(path) in str(error.strerror or error):
+            raise
+        raise type(error)(f"cannot write {path}: {error.strerror or error}") from error
 
 
 class Disk:
@@ -18,7 +31,8 @@ class Disk:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
+        with naming_file(path):
+            self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
         self._error: OSError | None = None
         self.taken_bytes = 0
         """What the disk took so far [bytes]."""
@@ -28,12 +42,17 @@ class Disk:
         self._held: dict[tuple[int, int], bytes] = {}
 
     def seal(self) -> None:
-        """Bring what was held back to disk."""
+        """Bring what was held back to disk.
+
+        Raises:
+            OSError: Something could not be written since the file was opened.
+        """
         for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
             self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
         self._held.clear()
         if self._error is not None:
-            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
+            with naming_file(self._path):
+                raise self._error
         self._sealed_size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:

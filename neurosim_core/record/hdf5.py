@@ -37,7 +37,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import logging
 import os
 import queue
@@ -66,8 +65,8 @@ FORMAT = "neurosim.flight"
 FORMAT_VERSION = 2
 _FIRST_FLUSH_BYTES = 65536
 _DEFLATE_MAX = 8
-_EXIT_S = 5.0
-"""When the interpreter ends, a disk that takes nothing for so long is given up [s]."""
+_QUIET_S = 5.0
+"""A disk that takes nothing for so long is said to be waited for; when the interpreter ends, given up [s]."""
 
 
 class _Flush(NamedTuple):
@@ -139,28 +138,23 @@ class RecordingWriter:
         """Whether the failure was raised."""
         self._flushed_bytes = 4 * _FIRST_FLUSH_BYTES
         self._flushed_s = time.monotonic()
-        try:
-            self._disk = Disk(self._path)
-        except OSError as error:
-            raise OSError(f"cannot write {self._path}: {error.strerror}") from error
+        self._disk = Disk(self._path)
         # The oldest format: many programs read it, and no mark "open for writing" bars a killed file. Freed
         # space is never reused: what is on disk stays valid until the next flush is complete.
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"), fs_strategy="none")
-        try:
-            self._described = _write_header(self._file, header)
-            self._file.flush()
-            self._disk.seal()
-        except BaseException:
-            self._file.close()
-            self._disk.close()
-            raise
         cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
         self._root_camera = cameras[0] if cameras else None
         # A daemon, which works until the interpreter has called all its exit handlers.
         threading.Thread(target=self._write_flushes, name="recording", daemon=True).start()
-        self._close_at_exit = functools.partial(self.close, complete=False, patience_s=_EXIT_S)
+        self._is_exiting = False
         atexit.register(self._close_at_exit)
         disown_when_forked(self)
+        try:
+            self._described = _write_header(self._file, header)
+            self.flush()
+        except BaseException:
+            self.close(complete=False)
+            raise
 
     @property
     def pending_bytes(self) -> int:
@@ -198,13 +192,14 @@ class RecordingWriter:
         self._begin_flush()
         self._finish_flush()
 
-    def close(self, *, complete: bool = True, patience_s: float | None = None) -> None:
+    def close(self, *, complete: bool = True) -> None:
         """Write what is left, and mark the file as complete unless it is not. Closing twice is allowed.
+
+        Where the disk takes nothing for some seconds, this is logged. Ctrl-C ends the waiting, and when the
+        interpreter ends, so does the process: a thread that hangs in HDF5 would never let it.
 
         Args:
             complete: All that was to be recorded was written.
-            patience_s: If the disk takes nothing for so long, end the process at once, and say what is lost:
-                a thread that hangs in HDF5 would never let it end [s]; None: wait.
 
         Raises:
             OSError: The disk is full or gone.
@@ -212,19 +207,34 @@ class RecordingWriter:
         if self._closed:
             return
         self._closed = True
-        atexit.unregister(self._close_at_exit)
         try:
             if not self._is_told:  # a failure is reported once
-                self._finish_flush(patience_s)
+                self._finish_flush()
                 for stream in self._streams.values():
                     stream.finish()
                 self._begin_flush(complete)
-                self._finish_flush(patience_s)
+                self._finish_flush()
         finally:
-            self._flushes.put(None)
-            self._pool.shutdown()
-            self._file.close()
-            self._disk.close()
+            if self._is_idle.is_set():  # else Ctrl-C came: the thread is in HDF5, which lets no other in
+                self._release()
+
+    def _close_at_exit(self) -> None:
+        self._is_exiting = True
+        try:
+            if not self._closed:
+                self.close(complete=False)
+            else:  # Ctrl-C came while `close` waited
+                self._finish_flush()
+                self._release()
+        except KeyboardInterrupt:
+            os._exit(130)
+
+    def _release(self) -> None:
+        atexit.unregister(self._close_at_exit)
+        self._flushes.put(None)
+        self._pool.shutdown()
+        self._file.close()
+        self._disk.close()
 
     def disown(self) -> None:
         """Leave the file to the process that this one was forked from."""
@@ -253,15 +263,17 @@ class RecordingWriter:
         self._is_idle.clear()
         self._flushes.put(_Flush([*self._streams.values()], self._newest_ns, complete))
 
-    def _finish_flush(self, patience_s: float | None = None) -> None:
+    def _finish_flush(self) -> None:
         """Wait for the flush that is under way, and raise what went wrong."""
         taken_bytes = self._disk.taken_bytes
-        while not self._is_idle.wait(patience_s):
+        while not self._is_idle.wait(_QUIET_S):
             if self._disk.taken_bytes == taken_bytes:
-                kept = f"it is kept up to {self.kept_ns / NS_PER_S:.3f} s"
-                log.error("%s: the disk took nothing for %g s; %s", self._path, patience_s, kept)
-                sys.stdout.flush()
-                os._exit(1)
+                left = f"{1e-6 * self.pending_bytes:.1f} MB wait for it"
+                kept = f"the file is kept up to {self.kept_ns / NS_PER_S:.3f} s"
+                log.warning("%s: the disk took nothing for %g s; %s; %s", self._path, _QUIET_S, left, kept)
+                if self._is_exiting:
+                    sys.stdout.flush()
+                    os._exit(1)
             taken_bytes = self._disk.taken_bytes
         self._flushing_bytes = 0
         if self._failure is not None:

@@ -92,7 +92,7 @@ def _describe(name: str, sensor: Any) -> SensorDescription:
     position, orientation = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     if mount is not None:
         position = np.array(mount.position_m)
-        orientation = mount.rotation().as_quat() if lens is None else mount.optical_quaternion()
+        orientation = mount.quaternion() if lens is None else mount.optical_quaternion()
     intrinsics = None
     if lens is not None:
         intrinsics = Intrinsics(

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
 from neurosim_core.record.compressors import Compressors
+from neurosim_core.record.disk import naming_file
 from neurosim_core.record.forked import disown_when_forked, forked_error
 from neurosim_core.record.frames import connect, receive_frame, send_frame
 from neurosim_core.record.hdf5 import RecordingWriter, deflate_count, import_h5py
@@ -98,10 +99,8 @@ class RecordingProcess:
         Raises:
             OSError: The file cannot be created.
         """
-        try:
+        with naming_file(path):
             path.open("wb").close()
-        except OSError as error:
-            raise OSError(f"cannot write {path}: {error.strerror}") from error
         self._path = path
         self.kept_ns: int | None = None
         """When writing has failed: the file holds the packets up to this stamp [ns]; None: unknown."""
@@ -160,6 +159,9 @@ class RecordingProcess:
     def close(self, *, complete: bool = True) -> None:
         """Wait until all is written, and mark the file as complete unless it is not. Again: does nothing.
 
+        Where the disk takes nothing for some seconds, the process says so. Ctrl-C ends the waiting; what is
+        not written yet is lost unless the disk comes back.
+
         Args:
             complete: All that was to be recorded was written.
 
@@ -167,6 +169,7 @@ class RecordingProcess:
             OSError: The disk is full or gone, or the process has ended.
         """
         if not self._closed:
+            self._closed = True
             self._put(complete)
             self._queue.put(None)
             self._thread.join()
@@ -209,11 +212,15 @@ class RecordingProcess:
 
     def _wait(self) -> None:
         """Wait until there is room in the queue."""
-        while True:
-            self._progress.clear()
-            if self._put_bytes - self._sent_bytes <= _QUEUE_BYTES or not self._is_sending:
-                return
-            self._progress.wait()
+        try:
+            while True:
+                self._progress.clear()
+                if self._put_bytes - self._sent_bytes <= _QUEUE_BYTES or not self._is_sending:
+                    return
+                self._progress.wait()
+        except KeyboardInterrupt:
+            self._closed = True  # `close` would only wait again
+            raise
 
     def _end(self, *, early: bool = False) -> None:
         """Wait for the end of the process, and raise what went wrong; always if that is `early`."""

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import logging
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 UNLABELLED = "unlabelled"
 """Class 0: what no class is known of."""
 
+_log = logging.getLogger(__name__)
+
+_SHOWN_MAX = 1000
 _NUMBER = re.compile(r"[ _.#-]*[0-9]+$")
 
 
@@ -40,15 +45,39 @@ def label_scenes(scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | N
     return Labels(known, tuple(tuple((name, index[label]) for name, label in row) for row in found))
 
 
+def warn_of_patterns(sensor: str, scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | None) -> None:
+    """Log each pattern of a sensor that no instance of any scene matches, and what there is."""
+    names = {
+        name: _label_of(name, scene.scene.instance_labels)
+        for scene in scenes
+        for name in scene.instance_names
+    }
+    for kind, patterns in (classes or {}).items():
+        for pattern in patterns:
+            if not any(_matches(pattern, name, label) for name, label in names.items()):
+                known = ", ".join(sorted({*names.values()}))
+                _log.warning(
+                    f"sensor {sensor}: nothing is called {pattern!r}, as class {kind!r} says; there are: "
+                    f"{textwrap.shorten(known, _SHOWN_MAX, placeholder=' ...')}"
+                )
+
+
 def _class_of(name: str, labels: Mapping[str, str], classes: Mapping[str, Sequence[str]] | None) -> str:
-    label = labels.get(name) or _NUMBER.sub("", name).strip().lower() or UNLABELLED
+    label = _label_of(name, labels)
     if classes is None:
         return label
     for kind, patterns in classes.items():
-        for pattern in patterns:
-            if any(fnmatch.fnmatchcase(text.lower(), pattern.lower()) for text in (name, label)):
-                return kind
+        if any(_matches(pattern, name, label) for pattern in patterns):
+            return kind
     return UNLABELLED
+
+
+def _label_of(name: str, labels: Mapping[str, str]) -> str:
+    return labels.get(name) or _NUMBER.sub("", name).strip().lower() or UNLABELLED
+
+
+def _matches(pattern: str, *texts: str) -> bool:
+    return any(fnmatch.fnmatchcase(text.lower(), pattern.lower()) for text in texts)
 
 
 def describe_labels(labels: Labels) -> str:

@@ -29,7 +29,7 @@ from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
 from neurosim_core.runtime.cuda import BufferPool, PooledBuffer, size_class
 from neurosim_core.scene.bodies import Motion, body_orientation, body_position, velocity_on_body
-from neurosim_core.scene.labels import label_scenes
+from neurosim_core.scene.labels import label_scenes, warn_of_patterns
 from neurosim_core.sensors.base import FrameContext
 from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
 from neurosim_core.vehicle.history import History, motion_at
@@ -224,6 +224,7 @@ class EventLabels:
             model.motions, model.body_mesh = context.motions, bodies.mesh
             model.body_sphere, model.body_face = bodies.data.sphere, bodies.data.first_face
         if {"instance", "semantic"} & self._geometry:
+            warn_of_patterns(context.name, [scene], classes)
             known = label_scenes([scene], classes)
             numbers = np.array([number for _, number in known.instances[0]], np.int32)
             model.class_of = wp.array(numbers, dtype=int, device=device)
@@ -239,7 +240,16 @@ class EventLabels:
             wp.copy(self._flown, self._history.count)
 
     def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
-        """Launch the search for the truth of events, and its copy to the host; see `Labeller.launch`."""
+        """Launch the search for the truth of events, and its copy to the host.
+
+        Args:
+            count: How many events there are.
+            t: Their times [us], int64, shape [>= count].
+            x: Their columns [px], uint16, from `first_x` on.
+            y: Their rows [px], uint16, from `first_y` on.
+            first_x: Where the columns begin in `x`.
+            first_y: Where the rows begin in `y`.
+        """
         self._count, self._taken = count, 0
         if not self._geometry or count == 0:
             return

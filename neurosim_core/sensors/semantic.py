@@ -11,7 +11,7 @@ import warp as wp
 from pydantic import Field
 
 from neurosim_core.registry import register
-from neurosim_core.scene.labels import describe_labels, label_scenes
+from neurosim_core.scene.labels import describe_labels, label_scenes, warn_of_patterns
 from neurosim_core.sensors.base import ImageSensorConfig, PictureContext
 from neurosim_core.sensors.instance import LabelImage
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
@@ -43,6 +43,7 @@ class SemanticSensorConfig(ImageSensorConfig):
 
     def make_process(self, context: PictureContext) -> PixelProcess:
         """Return what makes classes of instances."""
+        warn_of_patterns(context.name, context.scenes, self.classes)
         instances = label_scenes(context.scenes, self.classes).instances
         table = np.zeros((len(instances), max(map(len, instances))), np.int32)
         for row, labels in zip(table, instances, strict=True):

@@ -14,6 +14,7 @@ from PIL import ImageDraw
 from neurosim_core.config import load_config
 from neurosim_core.packets import Events, Image, Odometry
 from neurosim_core.record import Recording
+from neurosim_core.record.disk import naming_file
 from neurosim_core.scene.scene import Scene
 from neurosim_core.view.pictures import event_picture
 from neurosim_core.view.plan import cut_plan
@@ -57,9 +58,10 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
                 panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
             frames.append(_beside(panels))
     options: dict[str, Any] = {"quality": 60} if out.suffix == ".webp" else {}
-    frames[0].save(
-        out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
-    )
+    with naming_file(out):
+        frames[0].save(
+            out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
+        )
 
 
 def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:

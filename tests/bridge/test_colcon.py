@@ -126,7 +126,7 @@ def test_programs_are_those_of_pip():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
     (loop,) = calls("foreach")
     programs = dict(argument.split() for argument in loop[1:])
-    assert {name: f"{module}.cli:main" for name, module in programs.items()} == scripts
+    assert {name: f"{module}.__main__:main" for name, module in programs.items()} == scripts
 
 
 def test_commands_are_in_an_order_that_works():

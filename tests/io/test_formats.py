@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -556,3 +557,25 @@ print(count, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) // 1024
         count, grown_mb = map(int, done.stdout.split())
         assert count == 10_000_000
         assert grown_mb < 250  # a block of a million in hand, with the arrays of the encoder
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_a_full_disk_is_told_with_the_name_of_the_file(name, tmp_path):
+    """A limit on the size of files acts like a full disk; one format after the other once crashed."""
+    pytest.importorskip("faery") if name == "aedat4" else None
+    pytest.importorskip("rosbags") if FORMATS[name].module == "ros2_bag" else None
+    write(tmp_path / "in.npz", draw(100_000, span_us=1_000_000))
+    code = """
+import resource, sys
+from neurosim_core.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+sys.exit(main(["convert", *sys.argv[1:]]))
+"""
+    out = path_of(tmp_path, name)
+    command = [sys.executable, "-c", code, str(tmp_path / "in.npz"), str(out), "--to", name]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert re.fullmatch(f"neurosim: .*{re.escape(str(out.with_suffix('')))}.*\n", done.stderr)
+    assert ".part" not in done.stderr
+    assert re.search("File too large|disk I/O error", done.stderr)
+    assert [file.name for file in tmp_path.iterdir()] == ["in.npz"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -417,7 +418,7 @@ def test_a_program_that_does_not_close_leaves_all_that_it_wrote(tmp_path, then, 
 DISK = """
 import os, time
 from neurosim_core.record import hdf5
-hdf5._EXIT_S = 1.0
+hdf5._QUIET_S = 1.0
 wait_s, write = 0.0, os.pwrite
 def late(*arguments):
     time.sleep(wait_s)
@@ -436,7 +437,34 @@ def test_a_program_that_ends_waits_for_a_slow_disk(tmp_path):
 def test_a_program_that_ends_does_not_wait_for_a_disk_that_hangs(tmp_path):
     status, _, errors = run_child(tmp_path / "f.h5", "wait_s = 1e6", first=DISK)
     assert status == 1
-    assert "f.h5: the disk took nothing for 1 s; it is kept up to 0.1" in errors
+    assert re.search(r"f.h5: the disk took nothing for 1 s; \d.\d MB wait for it; .* kept up to 0.1", errors)
+    with Recording(tmp_path / "f.h5") as flight:
+        assert len(list(flight.packets())) == 50
+
+
+def test_a_disk_that_hangs_is_said_and_ctrl_c_ends_the_waiting(tmp_path):
+    """Not the file: a thread is still in it, as long as the process lives."""
+    then = """
+import logging
+class Interrupt(logging.Handler):
+    def emit(self, record):
+        said.append(record.getMessage())
+        if len(said) <= 2:
+            os.kill(os.getpid(), signal.SIGINT)
+said = []
+logging.getLogger().addHandler(Interrupt())
+wait_s = 1e6
+for wait in writer.flush, writer.close:
+    try:
+        wait()
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+print(said[0], flush=True)
+"""
+    status, found, _ = run_child(tmp_path / "f.h5", then, first=f"import signal{DISK}")
+    assert status == 1  # given up at the end
+    assert found.startswith("interrupted\ninterrupted\n")
+    assert re.search(r"f.h5: the disk took nothing for 1 s; 0\.\d MB wait for it", found)
     with Recording(tmp_path / "f.h5") as flight:
         assert len(list(flight.packets())) == 50
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -244,6 +245,41 @@ def test_writing_waits_for_a_process_that_stands_still(tmp_path):
     writer.close()
     with Recording(tmp_path / "f.h5") as flight:
         assert flight.packet_count("rgb") == 30
+
+
+def test_a_disk_that_hangs_is_said_and_ctrl_c_ends_the_waiting(tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, time\n"
+        "write = os.pwrite\n"
+        "os.pwrite = lambda *a: time.sleep(1e6 if os.path.exists(os.environ['HANGS']) else 0) or write(*a)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setenv("HANGS", str(tmp_path / "hangs"))
+    code = """
+while not os.path.getsize(sys.argv[1]):
+    time.sleep(0.01)
+print(writer._process.popen.pid, flush=True)
+open(os.environ["HANGS"], "w").close()
+for packet in PACKETS:
+    writer.write(packet)
+try:
+    writer.close()
+except KeyboardInterrupt:
+    writer.close()
+    print("interrupted")
+"""
+    with run(code, tmp_path / "f.h5") as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        writer = int(process.stdout.readline())
+        try:
+            said = process.stderr.readline()
+            assert re.search(r"f.h5: the disk took nothing for 5 s; 0\.\d MB wait for it", said)
+            process.send_signal(signal.SIGINT)
+            assert process.stdout.readline() == "interrupted\n"
+            assert process.wait(60.0) == 0
+        finally:
+            os.kill(writer, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("end", ["kill", "leave", "fork"])

@@ -71,6 +71,16 @@ def test_classes_come_from_patterns_or_the_file_or_names(tmp_path, extras, class
     assert first.data.dtype == np.int32
 
 
+def test_a_pattern_of_nothing_is_said_with_the_names_there_are(tmp_path, caplog):
+    """An event camera tells which class an event is of, by the same patterns."""
+    classes = {"seat": ["chair*", "sofa_*"], "walls": ["walls"]}
+    events = {"kind": "event_camera", "lens": LENS, "labels": ["semantic"], "classes": classes}
+    sensors = {"camera": {"kind": "semantic", "classes": classes, **CAMERA}, "events": events}
+    fly_in_room(write_scene(tmp_path), sensors)
+    said = "nothing is called 'sofa_*', as class 'seat' says; there are: chair, walls, x"
+    assert sorted(caplog.messages) == [f"sensor camera: {said}", f"sensor events: {said}"]
+
+
 def test_instances_say_their_names_and_classes(tmp_path):
     bodies = {"ball_1": {"shape": {"kind": "sphere", "radius_m": 0.2}, "motion": {"position_m": [1, 0, 1.5]}}}
     sensors = {"instance": {"kind": "instance", **CAMERA}, "semantic": {"kind": "semantic", **CAMERA}}
